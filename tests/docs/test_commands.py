@@ -123,9 +123,7 @@ def test_options_in_the_text_of_pages_exist() -> None:
     assert not unknown, "\n".join(unknown)
 
 
-def test_the_quick_commands_of_the_pages_run_as_they_stand(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_quick_commands_of_pages_run_as_they_stand(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for run in ("latest", "A", "B"):
         shutil.copytree(recorded, tmp_path / "runs" / run)
     monkeypatch.chdir(tmp_path)

@@ -35,7 +35,7 @@ def run(command: list[str], folder: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_the_blocks_of_a_page_run_in_their_order(page: Path, tmp_path: Path) -> None:
+def test_blocks_of_page_run_in_order(page: Path, tmp_path: Path) -> None:
     executed: list[str] = []  # the Python blocks of a page are one session
     for kind, text, reason in blocks(page):
         if kind == "sh" and not reason:
@@ -47,13 +47,13 @@ def test_the_blocks_of_a_page_run_in_their_order(page: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_each_block_of_a_page_is_run_or_says_why_not(page: Path) -> None:
+def test_each_block_of_page_is_run_or_says_why_not(page: Path) -> None:
     assert blocks(page)
     assert all(kind in EXECUTED for kind, _, _ in blocks(page))
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs_and_is_stored_without_its_output(notebook: Path, tmp_path: Path) -> None:
+def test_notebook_runs_and_stored_without_output(notebook: Path, tmp_path: Path) -> None:
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
     code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
     assert code
@@ -91,5 +91,5 @@ def test_the_site_loads_nothing_from_another_host(site: Path) -> None:
     assert [page.name for page in (REPOSITORY / "docs").rglob("*.md") if "```mermaid" in page.read_text(encoding="utf-8")] == []
 
 
-def test_the_reference_of_parameters_is_that_of_the_classes() -> None:
+def test_reference_of_parameters_is_that_of_classes() -> None:
     assert parameters.PAGE.read_text(encoding="utf-8") == parameters.page(), "python -m tools.parameters writes it again"

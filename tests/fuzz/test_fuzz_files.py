@@ -29,7 +29,7 @@ CORPUS = REPOSITORY / "tests" / "corpus"
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_the_corpus_is_read_or_rejected_in_bounded_time_and_memory(target: str) -> None:
+def test_corpus_read_or_rejected_in_bounded_time_and_memory(target: str) -> None:
     files = sorted(str(path) for path in (CORPUS / target).iterdir())
     assert files
     command = [sys.executable, "-m", "benchmarks.fuzz", target, "--replay", *files]
@@ -129,7 +129,7 @@ INPUTS = {
 @pytest.mark.parametrize("target", TARGETS)
 @few
 @given(st.data())
-def test_a_damaged_log_or_a_file_of_other_values_is_read_or_rejected(target: str, tmp_path: Path, data: st.DataObject) -> None:
+def test_damaged_log_or_file_of_other_values_read_or_rejected(target: str, tmp_path: Path, data: st.DataObject) -> None:
     TARGETS[target](data.draw(INPUTS[target]), tmp_path)
 
 
@@ -160,7 +160,7 @@ def test_malicious_yaml_is_rejected(target: str, text: str, tmp_path: Path) -> N
     TARGETS[target](text.encode(), tmp_path)
 
 
-def test_a_file_that_is_too_large_and_a_pipe_are_rejected(tmp_path: Path) -> None:
+def test_file_that_is_too_large_and_pipe_rejected(tmp_path: Path) -> None:
     TARGETS["scenario"](b"# " + b"x" * (2 << 20), tmp_path)
     (tmp_path / "run").mkdir()
     for name in ("run_0.mcap", "metadata.yaml"):
@@ -218,12 +218,12 @@ FLIGHTS = flights(channels(find_scenario("osprey_gust")))
 @few
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
-def test_a_flight_of_any_values_has_a_summary_or_is_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+def test_flight_of_any_values_has_summary_or_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
     reported(read_flight, messages)
 
 
 @settings(few, max_examples=5)  # each page takes half a second
 @given(FLIGHTS)
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_a_flight_of_any_values_has_a_page_or_is_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
+def test_flight_of_any_values_has_page_or_rejected(reported: Report, messages: list[tuple[str, str, bytes]]) -> None:
     reported(write_report, messages)

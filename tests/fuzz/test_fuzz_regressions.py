@@ -45,7 +45,7 @@ def constant_flight(scenario: Scenario, value: float = 0.0, name: str = "osprey_
 
 
 @pytest.mark.parametrize("name", BOMBS)
-def test_a_chunk_is_decompressed_to_its_declared_size_and_64_mb_at_most(name: str) -> None:
+def test_chunk_decompressed_to_declared_size_and_64_mb_at_most(name: str) -> None:
     scan = Scan(CORPUS / "mcap" / name)
     tracemalloc.start()
     try:
@@ -70,7 +70,7 @@ def test_a_chunk_inside_a_chunk_is_damaged(read: Callable[[Scan], Iterator[objec
     assert scan.damaged == 1
 
 
-def test_an_lz4_chunk_with_changed_bytes_is_skipped(tmp_path: Path) -> None:
+def test_lz4_chunk_with_changed_bytes_skipped(tmp_path: Path) -> None:
     changed = bytearray(log(Y, CompressionType.LZ4))
     frame = changed.index(b"\x04\x22\x4d\x18")  # the magic number of LZ4 frames
     changed[frame + 4] ^= 0xFF  # the flags of the first of several chunks
@@ -79,11 +79,11 @@ def test_an_lz4_chunk_with_changed_bytes_is_skipped(tmp_path: Path) -> None:
     assert scan.damaged == 1
 
 
-def test_an_index_beyond_the_end_of_the_file_is_harmless() -> None:
+def test_index_beyond_end_of_file_is_harmless() -> None:
     assert list(Scan(CORPUS / "mcap" / "index_beyond_the_file").records()) is not None
 
 
-def test_a_channel_with_an_invalid_quality_of_service_is_repaired(tmp_path: Path) -> None:
+def test_channel_with_invalid_quality_of_service_repaired(tmp_path: Path) -> None:
     run = write_run(tmp_path, log(Y).replace(b"- depth: 1\n", b"[: \x01 depth:"))
     assert repair(run).wrote_metadata
     information = yaml.safe_load((run / METADATA).read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
@@ -91,7 +91,7 @@ def test_a_channel_with_an_invalid_quality_of_service_is_repaired(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["run_0.mcap", "metadata.yaml", "", "..", "../../x.yaml", "a\x00.yaml", "x" * 300 + ".yaml"])
-def test_a_scenario_in_a_log_is_extracted_without_overwriting_the_log(name: str, tmp_path: Path, osprey_gust: Scenario) -> None:
+def test_scenario_in_log_extracted_without_overwriting_log(name: str, tmp_path: Path, osprey_gust: Scenario) -> None:
     log_before = constant_flight(osprey_gust, name=name)
     run = write_run(tmp_path, log_before)
     recorded_scenario(run)
@@ -102,13 +102,13 @@ def test_a_scenario_in_a_log_is_extracted_without_overwriting_the_log(name: str,
 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf"), -1e300])
-def test_with_an_invalid_flight_time_the_first_sample_is_at_0(t: float, tmp_path: Path) -> None:
+def test_with_invalid_flight_time_first_sample_is_at_0(t: float, tmp_path: Path) -> None:
     run = write_run(tmp_path, log([*Y[3:], ("/truth", JOINT_STATE, vector(50_000_000, ("t",), (t,)))]))
     assert read_run(run).tape.start_ns == 30_000_000
     assert read_playback(run).start_ns == read_playback(run).messages[0].due_ns
 
 
-def test_a_truncated_u_or_one_of_another_type_has_no_latency(tmp_path: Path) -> None:
+def test_truncated_u_or_one_of_another_type_has_no_latency(tmp_path: Path) -> None:
     assert read_run(write_run(tmp_path, log([*Y, ("/u", JOINT_STATE, b"\x00\x01")]))).latency is None
     assert read_run(write_run(tmp_path, log([*Y, ("/u", "std_msgs/msg/String", b"\x00\x01\x00\x00")]))).latency is None
 
@@ -143,7 +143,7 @@ def test_exponential_and_recursive_aliases_are_rejected() -> None:
     assert parse_yaml("{a: &b [1, 2], c: *b}", "x", "y") == {"a": [1, 2], "c": [1, 2]}
 
 
-def test_the_notes_of_a_log_contain_no_terminal_control_codes(tmp_path: Path) -> None:
+def test_notes_of_log_contain_no_terminal_control_codes(tmp_path: Path) -> None:
     hostile = [("/\x1b[2Jz", JOINT_STATE, vector(k, (name,), (1.0,))) for k, name in ((1, "a"), (2, "b"))]
     notes = read_run(write_run(tmp_path, log([*Y, *hostile]))).tape.notes
     assert r"\x1b[2Jz: 1 samples with other names refused" in notes
@@ -157,7 +157,7 @@ def test_an_error_is_one_printable_sentence() -> None:
     assert len(message) <= MAX_LENGTH + 10
 
 
-def test_text_of_a_log_cannot_end_the_script_of_the_page() -> None:
+def test_text_of_log_cannot_end_script_of_page() -> None:
     hostile = "</script><!--<script>"
     assert "<" not in script_json({"name": hostile})
     assert json.loads(script_json({"name": hostile})) == {"name": hostile}
@@ -165,7 +165,7 @@ def test_text_of_a_log_cannot_end_the_script_of_the_page() -> None:
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
 @pytest.mark.parametrize("value", [1e300, float("nan"), float("-inf")])
-def test_a_value_of_the_summary_that_is_not_finite_is_null(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
+def test_value_of_summary_that_is_not_finite_is_null(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
     summary = read_flight(write_run(tmp_path, constant_flight(osprey_gust, value))).summary
     json.dumps(summary, allow_nan=False)
     assert summary["errors"]["q"]["whole"]["rms"] in (None, 0.0)

@@ -54,7 +54,7 @@ def osprey(step_ms: float = 2.0, **actuators: list[float]) -> PlantParams:
 
 
 @given(position=st.floats(-1e3, 1e3), command=st.floats(-1e3, 1e3), dt=st.floats(1e-4, 0.1))
-def test_an_ideal_actuator_passes_the_command_on_to_the_last_bit(position: float, command: float, dt: float) -> None:
+def test_ideal_actuator_passes_command_on_to_last_bit(position: float, command: float, dt: float) -> None:
     assert positions([command], dt, actuator(), start=position) == [command]
 
 
@@ -67,13 +67,13 @@ def test_no_lag_is_exact_in_float32_too() -> None:
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.01, 0.05])
-def test_the_step_response_is_the_exact_first_order_response_for_any_dt(dt: float) -> None:
+def test_step_response_is_exact_first_order_response_for_any_dt(dt: float) -> None:
     # p(t) = c (1 - exp(-t / lag)): no error of integration, only rounding
     history = positions([0.3] * 20, dt, actuator(lag=0.02))
     assert history == pytest.approx([0.3 * (1.0 - math.exp(-dt * (k + 1) / 0.02)) for k in range(20)], rel=1e-13)
 
 
-def test_a_rate_limit_gives_a_straight_ramp_that_ends_on_the_command() -> None:
+def test_rate_limit_gives_straight_ramp_that_ends_on_command() -> None:
     # 2 /s over 0.1 s: 0.2 a step, the last one only as far as the command
     assert positions([0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([0.2, 0.4, 0.6, 0.7, 0.7], abs=1e-15)
     assert positions([-0.7] * 5, 0.1, actuator(rate=2.0)) == pytest.approx([-0.2, -0.4, -0.6, -0.7, -0.7], abs=1e-15)
@@ -84,7 +84,7 @@ def test_position_saturation_does_not_wind_up() -> None:
     assert positions([9.0, 9.0, -0.1, -9.0], 0.1, actuator(lower=-0.3, upper=0.5)) == [0.5, 0.5, -0.1, -0.3]
 
 
-def test_lag_comes_before_the_rate_limit_and_the_end_stop_last() -> None:
+def test_lag_comes_before_rate_limit_and_end_stop_last() -> None:
     # Command 1 from 0 over 0.1 s: the lag alone would reach 1 - 1/e = 0.632, the rate allows 0.2, the stop 0.05.
     moved = step(np.zeros(6), np.ones(6), np.array(0.1), SIX)
     assert moved == pytest.approx([1.0, 1.0 - math.exp(-1.0), 0.2, 0.2, 0.5, 0.05], abs=1e-15)
@@ -92,7 +92,7 @@ def test_lag_comes_before_the_rate_limit_and_the_end_stop_last() -> None:
     assert step(np.zeros(6), np.full(6, 0.1), np.array(0.1), SIX)[3] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)), abs=1e-15)
 
 
-def test_a_dead_zone_gives_zero_inside_and_the_excess_outside() -> None:
+def test_dead_zone_gives_zero_inside_and_excess_outside() -> None:
     # input = c - clip(c, -w, w), w = 0.1
     params = Actuators(dead_zone=np.array([0.1]))
     commands = [0.0, 0.05, 0.1, 0.3, -0.1, -0.25]
@@ -100,7 +100,7 @@ def test_a_dead_zone_gives_zero_inside_and_the_excess_outside() -> None:
 
 
 @given(command=st.floats(-1.0, 1.0), further=st.floats(0.0, 1e-3), width=st.floats(0.0, 0.5))
-def test_a_dead_zone_has_no_jump_and_never_reverses_a_command(command: float, further: float, width: float) -> None:
+def test_dead_zone_has_no_jump_and_never_reverses_command(command: float, further: float, width: float) -> None:
     first, second = positions([command, command + further], 0.01, Actuators(dead_zone=np.array([width])))
     assert -1e-15 <= second - first <= further + 1e-15
     assert first * command >= 0.0
@@ -122,7 +122,7 @@ def position_history(times_ms: range, command: float, **actuators: list[float]) 
     return np.array(history)
 
 
-def test_a_stuck_surface_stays_where_it_is_from_its_instant_on() -> None:
+def test_stuck_surface_stays_where_it_is_from_instant_on() -> None:
     # Lag 20 ms, elevator stuck at 50 ms: it moves normally until then and keeps its position.
     lag, never = [0.02] * 4, math.inf
     healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
@@ -133,11 +133,11 @@ def test_a_stuck_surface_stays_where_it_is_from_its_instant_on() -> None:
     assert stuck[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5)))
 
 
-def test_a_surface_stuck_from_the_start_is_in_trim() -> None:
+def test_surface_stuck_from_start_is_in_trim() -> None:
     assert (position_history(range(0, 30, 10), 0.2, stuck_at=[0.0] * 4) == 0.0).all()
 
 
-def test_a_lost_surface_is_in_trim_from_its_instant_on_even_if_it_was_stuck() -> None:
+def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
     never = math.inf
     lost = position_history(range(0, 80, 10), 0.2, lost_at=[0.05, 0.06, never, never], stuck_at=[never, 0.03, 0.03, never])
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
@@ -145,11 +145,11 @@ def test_a_lost_surface_is_in_trim_from_its_instant_on_even_if_it_was_stuck() ->
     assert lost[:, 2:].tolist() == [[0.2, 0.2]] * 8  # one stuck where it was commanded, one healthy
 
 
-def test_a_fault_within_a_step_acts_from_the_next_step_on() -> None:
+def test_fault_within_step_acts_from_next_step_on() -> None:
     assert position_history(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
 
 
-def test_a_lost_aileron_acts_like_a_zero_column_of_b() -> None:
+def test_lost_aileron_acts_like_zero_column_of_b() -> None:
     params, u = osprey(lost_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
     without = osprey()
     without = without._replace(aircraft=without.aircraft._replace(B=without.aircraft.B * [1.0, 1.0, 0.0, 1.0]))
@@ -158,13 +158,13 @@ def test_a_lost_aileron_acts_like_a_zero_column_of_b() -> None:
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 1), st.floats(0.01, 100), st.floats(0.01, 1))
-def test_the_rate_and_the_stops_hold_for_any_command(commands: list[float], lag: float, rate: float, stop: float) -> None:
+def test_rate_and_stops_hold_for_any_command(commands: list[float], lag: float, rate: float, stop: float) -> None:
     history = np.array([0.0, *positions(commands, 0.01, actuator(lag, -stop, stop, rate))])
     assert np.abs(history).max() <= stop
     assert np.abs(np.diff(history)).max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-15
 
 
-def test_a_scenario_without_actuators_integrates_the_command_to_the_last_bit() -> None:
+def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
     params, u = osprey(), np.array([0.01, 0.1, -0.02, 0.03])
     x: FloatArray = np.linspace(-0.1, 0.1, 8)
     state = advance(0, AircraftState(x, np.zeros(4)), u, 10 * MS, params)
@@ -207,7 +207,7 @@ def travelled(commands: list[float], tick: float, dt: float, params: Actuators) 
 COMMANDS = (0.2 * np.random.default_rng(1).normal(size=30)).tolist()
 
 
-def test_the_mean_position_of_a_lag_is_exact_for_any_dt() -> None:
+def test_mean_position_of_lag_exact_for_any_dt() -> None:
     exact = continuous(COMMANDS, 0.05, 0.02, math.inf, math.inf)
     for dt in (0.05, 0.01, 0.001):
         # 1e-9: the error of SciPy's integrator at this tolerance.
@@ -217,7 +217,7 @@ def test_the_mean_position_of_a_lag_is_exact_for_any_dt() -> None:
 @pytest.mark.parametrize(
     ("rate", "stop"), [(2.0, math.inf), (math.inf, 0.1), (2.0, 0.1)], ids=["rate limit", "end stops", "both"]
 )
-def test_the_mean_position_at_a_limit_is_right_to_second_order(rate: float, stop: float) -> None:
+def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: float) -> None:
     exact = continuous(COMMANDS, 0.05, 0.02, rate, stop)
     params = actuator(0.02, -stop, stop, rate)
     errors = [np.abs(travelled(COMMANDS, 0.05, dt, params) - exact).max() for dt in (0.01, 0.00125)]
@@ -227,7 +227,7 @@ def test_the_mean_position_at_a_limit_is_right_to_second_order(rate: float, stop
     assert errors[1] < 5e-6  # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
 
 
-def test_a_20_ms_servo_delays_by_20_ms_at_a_step_of_5_ms() -> None:
+def test_20_ms_servo_delays_by_20_ms_at_step_of_5_ms() -> None:
     # Long after a step of u, the integral of the position is u (t - lag). That of the positions at the ends of the steps is
     # delayed by dt / (exp(dt / lag) - 1) = lag - dt / 2 + dt^2 / (12 lag) alone, a geometric series: 2.4 ms too early.
     t = 0.5
@@ -237,18 +237,14 @@ def test_a_20_ms_servo_delays_by_20_ms_at_a_step_of_5_ms() -> None:
 
 
 @given(position=st.floats(-1e3, 1e3), command=st.floats(-1e3, 1e3), dt=st.floats(1e-4, 0.1))
-def test_the_mean_position_of_an_ideal_actuator_is_the_command_to_the_last_bit(
-    position: float, command: float, dt: float
-) -> None:
+def test_mean_position_of_ideal_actuator_is_command_to_last_bit(position: float, command: float, dt: float) -> None:
     for params in (actuator(), Actuators()):
         _, mean = move(0.0, np.array([position]), np.array([command]), dt, params)
         assert mean.tolist() == [command]
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 1), st.floats(0.01, 100), st.floats(0.01, 1))
-def test_the_mean_position_is_between_both_ends_of_its_step(
-    commands: list[float], lag: float, rate: float, stop: float
-) -> None:
+def test_mean_position_is_between_both_ends_of_step(commands: list[float], lag: float, rate: float, stop: float) -> None:
     params, position = actuator(lag, -stop, stop, rate), np.zeros(1)
     for command in commands:
         new, mean = move(0.0, position, np.array([command]), 0.01, params)
@@ -265,7 +261,7 @@ def test_the_mean_positions_of_faulty_actuators() -> None:
     assert 0.1 < mean[2] < new[2]
 
 
-def test_mean_positions_of_a_fleet_are_those_of_each_aircraft() -> None:
+def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
     position, command = np.linspace(-0.04, 0.04, 12).reshape(6, 2), np.linspace(0.3, -0.3, 12).reshape(6, 2)
     columns = Actuators(*(None if value is None else value[:, None] for value in SIX))
     with enable_x64():
@@ -276,7 +272,7 @@ def test_mean_positions_of_a_fleet_are_those_of_each_aircraft() -> None:
             assert np.asarray(whole)[:, k] == pytest.approx(part, abs=1e-15)
 
 
-def test_the_plant_behind_a_lag_follows_its_continuous_model_to_second_order() -> None:
+def test_plant_behind_lag_follows_continuous_model_to_second_order() -> None:
     # Against SciPy's integrator of lags and plant together, with u held.
     u, lag, params = np.array([0.02, 0.0, 0.03, 0.01]), np.array([0.02, 0.1, 0.02, 0.02]), osprey()
 
@@ -290,7 +286,7 @@ def test_the_plant_behind_a_lag_follows_its_continuous_model_to_second_order() -
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)  # half the step, a quarter of the error
 
 
-def test_a_limit_may_be_infinite_on_one_channel() -> None:
+def test_limit_may_be_infinite_on_one_channel() -> None:
     upper = osprey(upper=[0.5, math.inf, 0.5, 0.5]).actuators.upper
     assert upper is not None
     assert upper.tolist() == [0.5, math.inf, 0.5, 0.5]
@@ -327,7 +323,7 @@ def test_error_through_servos_with_sensor_noise() -> None:
     assert (np.round(rms(simulate(find_scenario("osprey_servo"))) * [10, 1000, 10, 10]) <= [76, 88, 99, 64]).all()
 
 
-def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario, gusty: Tape) -> None:
+def test_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario, gusty: Tape) -> None:
     rest = gusty.time("u") > 55.0  # gusts and commands end before 50 s
     # The literal sign would keep moving every input by beta: 15 deg/s, 60 %/s. Here the slow spiral mode is left.
     slew = np.abs(np.diff(gusty["u"].values[rest], axis=0)).mean(axis=0) / 0.01
@@ -337,13 +333,13 @@ def test_the_softened_sign_leaves_no_limit_cycle_behind_servos(servo: Scenario, 
     assert np.abs(e.values[(e.stamp_ns - gusty.start_ns) > 55 * 10**9]).max() < 5e-4
 
 
-def test_without_the_sign_term_the_same_gains_have_twice_the_error(servo: Scenario) -> None:
+def test_without_sign_term_same_gains_have_twice_error(servo: Scenario) -> None:
     # beta -> 0 leaves a PI controller. Measured 13.6, 0.178, 22.0, 14.2; the prototype: 13.7, 0.178, 22.2, 14.0.
     pi = rms(simulate(servo.vary(controller={"beta": [1e-9] * 4})))
     assert pi == pytest.approx([13.7, 0.178, 22.2, 14.0], rel=0.05)
 
 
-def test_the_actuators_stay_inside_their_limits_in_flight(servo: Scenario, gusty: Tape) -> None:
+def test_actuators_stay_inside_limits_in_flight(servo: Scenario, gusty: Tape) -> None:
     positions = gusty["truth"].group("actuator").values
     limits = servo.aircraft.actuators
     assert (positions >= limits.lower).all()

@@ -37,7 +37,7 @@ def final_state(x: FloatArray, u: FloatArray, duration_ns: int, step_ns: int, ai
 
 
 @pytest.mark.equation(1)
-def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
+def test_without_f_plant_follows_matrix_exponential() -> None:
     # x(t) = exp([[A, B], [0, 0]] t) [x0; u] exactly for a held u. Runge-Kutta with 2 ms and poles up to 13 rad/s leaves
     # (0.026)^5 / 120 a step, about 1e-9 over a second.
     aircraft = osprey()
@@ -48,7 +48,7 @@ def test_without_f_the_plant_follows_the_matrix_exponential() -> None:
     assert final_state(x_0, u, NANOSECONDS, 2 * MS, aircraft) == pytest.approx(exact, abs=1e-8)
 
 
-def test_halving_the_step_divides_the_integration_error_by_sixteen() -> None:
+def test_halving_step_divides_integration_error_by_sixteen() -> None:
     aircraft = osprey()
     x_0, u = np.linspace(-0.2, 0.2, 8), np.zeros(4)
     finest = final_state(x_0, u, NANOSECONDS, MS // 4, aircraft)
@@ -56,7 +56,7 @@ def test_halving_the_step_divides_the_integration_error_by_sixteen() -> None:
     assert errors[0] / errors[1] == pytest.approx(16.0, rel=0.15)  # fourth order
 
 
-def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
+def test_plant_agrees_with_adaptive_integrator_through_gust() -> None:
     aircraft = osprey(vertical={"start": 0.2, "speed": 10.12, "length": 15.24})
     u = np.array([0.01, 0.0, 0.02, 0.0])
     reference = solve_ivp(
@@ -69,7 +69,7 @@ def test_the_plant_agrees_with_an_adaptive_integrator_through_a_gust() -> None:
 
 @pytest.mark.equation("Assumption 2")
 @given(speed=st.floats(-20, 20), length=st.floats(1, 100), t=st.floats(0, 100))
-def test_gust_stays_between_zero_and_its_speed_with_bounded_derivative(speed: float, length: float, t: float) -> None:
+def test_gust_stays_between_zero_and_speed_with_bounded_derivative(speed: float, length: float, t: float) -> None:
     gusts = Gusts(np.array([10.0]), np.array([speed]), np.array([length]))
     w = [float(one_minus_cosine(t + dt, gusts, np.array(25.0))[0]) for dt in (0.0, 1e-4)]
     assert min(0.0, speed) - 1e-12 <= w[0] <= max(0.0, speed) + 1e-12
@@ -77,7 +77,7 @@ def test_gust_stays_between_zero_and_its_speed_with_bounded_derivative(speed: fl
     assert abs(w[1] - w[0]) <= 1e-4 * abs(speed) / 2 * math.pi * 25.0 / length + 1e-12
 
 
-def test_a_gust_of_speed_zero_is_exactly_no_gust() -> None:
+def test_gust_of_speed_zero_is_exactly_no_gust() -> None:
     undisturbed, zero = osprey(), osprey(vertical={"start": 0.0, "speed": 0.0, "length": 15.24})
     x = np.linspace(-0.1, 0.1, 8)
     assert (dynamics.f(0.5, x, zero) == dynamics.f(0.5, x, undisturbed)).all()
@@ -92,7 +92,7 @@ def test_gravity_and_lateral_coupling_enter_as_published() -> None:
     assert f == pytest.approx([-9.81 * math.sin(0.1), 0, 0, 0, 0.39 * math.sin(-0.2), 0, 0, 0], abs=1e-15)
 
 
-def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
+def test_inputs_of_airframe_converted_to_si_once() -> None:
     airframe = load_airframe("osprey")
     B = airframe.matrix_b()
     # 0.98 rad/s^2 per degree of elevator; 0.06 m/s^2 per percent of thrust
@@ -100,7 +100,7 @@ def test_inputs_of_the_airframe_are_converted_to_si_once() -> None:
     assert B[0, 1] == pytest.approx(6.0)
 
 
-def test_truth_holds_the_state_the_disturbance_and_the_actuators() -> None:
+def test_truth_holds_state_disturbance_and_actuators() -> None:
     parameters = aircraft_parameters(gusts={"vertical": {"start": 0.0, "speed": 2.0, "length": 10.0}})
     names = truth.names(parameters.load()[0])
     state = AircraftState(np.arange(8.0) / 100, np.array([0.1, 0.2, 0.3, 0.4]))
@@ -148,7 +148,7 @@ def test_steps_with_precomputed_forcing_are_runge_kutta_steps_of_equation_1() ->
     assert np.asarray(end.turbulence).tobytes() == np.asarray(z).tobytes()
 
 
-def test_equation_1_is_the_sum_of_its_parts() -> None:
+def test_equation_1_is_sum_of_parts() -> None:
     aircraft = aircraft_parameters(rate=25.0, **EVERYTHING).load()[1]
     x, u, turbulent = np.linspace(-0.3, 0.3, 8), np.array([0.01, 0.1, 0.02, 0.03]), np.array([0.5, -1.0, 2.0])
     x_dot = dynamics.x_dot(0.3, x, u, aircraft, turbulent)
@@ -167,6 +167,6 @@ def test_f_of_states_in_columns_is_f_of_each_state() -> None:
         assert f[:, k] == pytest.approx(dynamics.f(0.3, columns[:, k], single), abs=1e-14)
 
 
-def test_a_step_that_does_not_divide_the_time_is_refused() -> None:
+def test_step_that_does_not_divide_time_refused() -> None:
     with pytest.raises(ParameterError, match=r"step: found 0\.003 s, expected a whole fraction of the duration \(0\.01 s\)"):
         final_state(np.zeros(8), np.zeros(4), 10 * MS, 3 * MS, osprey())

@@ -68,19 +68,19 @@ def airframe(request: pytest.FixtureRequest) -> Airframe:
     return load_airframe(request.param)
 
 
-def test_the_library_is_the_nine_airframes_of_the_table() -> None:
+def test_library_is_nine_airframes_of_table() -> None:
     assert tuple(PUBLISHED) == NAMES
     assert tuple(facts.name for facts in library()) == NAMES  # each file carries its own name
 
 
-def test_every_airframe_states_its_source_and_its_signs(airframe: Airframe) -> None:
+def test_every_airframe_states_source_and_signs(airframe: Airframe) -> None:
     assert "memory" in airframe.source or "computed" in airframe.source
     directions = {"nose up", "nose down", "nose left", "nose right", "roll left", "roll right"}
     for inputs in airframe.inputs.values():
         assert inputs.positive in directions or inputs.positive.startswith("more thrust")
 
 
-def test_the_sign_in_words_is_the_sign_of_the_diagonal_of_omega(airframe: Airframe) -> None:
+def test_sign_in_words_is_sign_of_diagonal_of_omega(airframe: Airframe) -> None:
     down = {"nose down", "nose left", "roll left"}
     expected = [-1.0 if entry.positive in down else 1.0 for entry in airframe.inputs.values()]
     np.testing.assert_array_equal(np.sign(np.diag(airframe_facts(airframe).Omega)), expected)
@@ -95,7 +95,7 @@ def test_poles_are_the_published_ones(name: str) -> None:
 
 
 @pytest.mark.equation("Remark 1")
-def test_d_of_the_published_signs_matches_the_table(airframe: Airframe) -> None:
+def test_d_of_published_signs_matches_table(airframe: Airframe) -> None:
     np.testing.assert_array_equal(airframe_facts(airframe).D, PUBLISHED[airframe.name].D)
 
 
@@ -122,7 +122,7 @@ def test_coupling_depends_on_the_unit_of_speed(name: str, published: float, si: 
     assert airframe_facts(airframe).coupling == pytest.approx(si, abs=1e-3)
 
 
-def test_every_airframe_is_in_the_theorem_with_zero_dynamics_that_only_an_outer_loop_bounds(airframe: Airframe) -> None:
+def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bounds(airframe: Airframe) -> None:
     # theta (longitudinal) and phi (lateral) integrate the rates. Each gives a zero at the origin: never strictly stable.
     facts = airframe_facts(airframe)
     angles = [state for state in airframe.states if state in ("theta", "phi")]
@@ -237,7 +237,7 @@ def test_zero_dynamics_are_classified_by_their_zeros(k: float, zero: float, kind
     assert facts.in_theorem is (kind is not ZeroDynamics.UNSTABLE)
 
 
-def test_zeros_on_the_imaginary_axis_are_marginal_and_no_zeros_are_stable() -> None:
+def test_zeros_on_imaginary_axis_are_marginal_and_no_zeros_are_stable() -> None:
     pair: ComplexArray = np.array([-1j, 1j])
     assert zero_dynamics(pair) is ZeroDynamics.MARGINAL
     assert zero_dynamics(pair[:0]) is ZeroDynamics.STABLE
@@ -250,7 +250,7 @@ def test_an_uncontrollable_airframe_is_outside_the_theorem() -> None:
     assert not facts.in_theorem
 
 
-def test_an_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
+def test_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
     osprey = load_airframe("osprey")
     doubled = tuple((*row[:3], row[2]) for row in osprey.B)  # the rudder does what the aileron does
     facts = airframe_facts(osprey.model_copy(update={"B": doubled}))
@@ -260,7 +260,7 @@ def test_an_airframe_without_s_d_u_has_no_d_and_no_remedy() -> None:
     assert not facts.in_theorem
 
 
-def test_an_input_that_drives_another_output_gets_a_new_pairing() -> None:
+def test_input_that_drives_another_output_gets_new_pairing() -> None:
     osprey = load_airframe("osprey")
     swapped = [[row[0], row[1], row[3], row[2]] for row in osprey.B]
     swapped[osprey.index("p")][2] = 0.0  # the input named aileron only yaws
@@ -269,7 +269,7 @@ def test_an_input_that_drives_another_output_gets_a_new_pairing() -> None:
     assert facts.remedy == "pair q-elevator, V-thrust, p-rudder, r-aileron"
 
 
-def test_zeros_do_not_depend_on_the_coordinates_of_the_state() -> None:
+def test_zeros_do_not_depend_on_coordinates_of_state() -> None:
     generator = np.random.default_rng(7)
     airframe = load_airframe("osprey")
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()

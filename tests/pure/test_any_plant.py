@@ -146,7 +146,7 @@ settle = settings(max_examples=10, deadline=None, derandomize=True)
 
 @settle
 @given(task=TASKS)
-def test_the_signs_of_omega_are_those_from_which_it_was_built(task: Task) -> None:
+def test_signs_of_omega_are_those_from_which_it_was_built(task: Task) -> None:
     assert (signs(task.aircraft.C @ task.aircraft.B) == task.D).all()
     assert abscissa(task.aircraft.A) < 0.0
 
@@ -173,7 +173,7 @@ def test_the_ultimate_bound_falls_with_dt(sign: Sign, largest: float, low: float
 
 @settle
 @given(task=TASKS)
-def test_the_error_decreases_from_engagement_to_the_ultimate_bound(task: Task) -> None:
+def test_error_decreases_from_engagement_to_ultimate_bound(task: Task) -> None:
     # Largest errors in the first second, in the third, and after 5 s. exp(-Lambda t) is 0.018 at 2 s, and the sign term is
     # faster: measured with 150 aircraft at most 0.005 in the third second, often the ultimate bound, and 0.006 after 5 s.
     errors = np.abs(fly(task, gains(task, Sign.IMPLICIT), DT)).max(axis=1)

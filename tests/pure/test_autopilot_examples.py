@@ -19,9 +19,7 @@ EXAMPLES = {"arduplane": "ardupilot", "px4_airplane": str(REPOSITORY / "examples
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_has_the_signs_and_the_limits_of_its_map_and_tracks_in_simulation(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(REPOSITORY)  # the path of an airframe counts from the working folder
     scenario = find_scenario(str(REPOSITORY / "examples" / name / "scenario.yaml"), 15.0)
     autopilot = find_autopilot(EXAMPLES[name], dry_run=False)
@@ -33,7 +31,7 @@ def test_an_example_has_the_signs_and_the_limits_of_its_map_and_tracks_in_simula
         assert abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max() < largest, output
 
 
-def test_limits_of_u_beyond_those_of_the_map_are_refused_before_a_flight_that_sends() -> None:
+def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:
     """The bridge would clip u, and the integrals of the law would go on."""
     scenario = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
     wide = replace(scenario, controller=scenario.controller.model_copy(update={"upper": (0.13, 0.14, 0.13, 0.202)}))
@@ -44,7 +42,7 @@ def test_limits_of_u_beyond_those_of_the_map_are_refused_before_a_flight_that_se
     require_limits(find_autopilot(EXAMPLES["px4_airplane"], dry_run=True), wide)
 
 
-def test_a_controller_that_holds_u_while_it_is_inactive_is_refused_before_a_flight_that_sends() -> None:
+def test_controller_that_holds_u_while_it_is_inactive_refused_before_flight_that_sends() -> None:
     """The bridge deactivates it before an engagement, which needs a u near trim."""
     shipped = find_scenario(str(REPOSITORY / "examples" / "px4_airplane" / "scenario.yaml"))
     scenario = shipped.vary(controller={"on_deactivate": "hold"})

@@ -43,7 +43,7 @@ from flight_view.flight import Flight
 pytestmark = pytest.mark.package("flight_log")
 
 
-def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
+def test_written_tape_read_back_bit_by_bit(tape: Tape, recorded: Path) -> None:
     back = read_run(recorded).tape
     assert set(back.signals) == set(tape.signals)
     assert back.notes == ()
@@ -53,7 +53,7 @@ def test_a_written_tape_is_read_back_bit_by_bit(tape: Tape, recorded: Path) -> N
         assert back[name].values.tobytes() == signal.values.tobytes()
 
 
-def test_a_log_has_the_bytes_that_the_library_writes_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_has_bytes_that_library_writes_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages = [(k % 3, NANOSECONDS + (7919 * k) % 1000, k, bytes(k % 5) * k) for k in range(3000)]  # not in order of time
     logs = []
     for name in ("ours", "library"):
@@ -70,7 +70,7 @@ def test_a_log_has_the_bytes_that_the_library_writes_by_itself(tmp_path: Path, m
     assert logs[0] == logs[1]
 
 
-def test_the_memory_of_a_long_recording_does_not_grow(tmp_path: Path) -> None:
+def test_memory_of_long_recording_does_not_grow(tmp_path: Path) -> None:
     with BagWriter(tmp_path) as bag:
         channels = [bag.add_topic(f"/{k}", JOINT_STATE, "") for k in range(9)]
         tracemalloc.start()
@@ -130,7 +130,7 @@ def test_mcap_ros2_support_reads_every_message(tape: Tape, recorded: Path) -> No
     assert list(last.position) == tape["u"].values[-1].tolist()
 
 
-def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(recorded: Path) -> None:
+def test_file_is_ros2_profile_with_installed_definitions_and_hashes(recorded: Path) -> None:
     summary = summary_of(recorded / "run_0.mcap")
     assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
     hashes = {channel.metadata["topic_type_hash"] for channel in summary.channels.values()}
@@ -142,7 +142,7 @@ def test_the_file_is_a_ros2_profile_with_installed_definitions_and_hashes(record
 
 
 @pytest.mark.parametrize("fraction", [0.4, 0.55, 0.6, 0.75, 0.9])
-def test_a_truncated_file_is_read_up_to_its_last_complete_chunk(fraction: float, tape: Tape, run: Path) -> None:
+def test_truncated_file_read_up_to_last_complete_chunk(fraction: float, tape: Tape, run: Path) -> None:
     truncate(run, fraction)
     back = read_run(run).tape
     assert 0 < len(back["y"].stamp_ns) <= len(tape["y"].stamp_ns)
@@ -152,7 +152,7 @@ def test_a_truncated_file_is_read_up_to_its_last_complete_chunk(fraction: float,
     assert back.notes[1] == f"metadata.yaml is missing: rise-di repair {run}"
 
 
-def test_the_note_on_a_truncated_file_gives_the_missing_time_by_metadata_yaml(tape: Tape, run: Path) -> None:
+def test_note_on_truncated_file_gives_missing_time_by_metadata_yaml(tape: Tape, run: Path) -> None:
     file = run / "run_0.mcap"
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     back = read_run(run).tape  # metadata.yaml holds the time of the last message
@@ -163,7 +163,7 @@ def test_the_note_on_a_truncated_file_gives_the_missing_time_by_metadata_yaml(ta
 
 @pytest.mark.parametrize("opcode", [None, Opcode.DATA_END, Opcode.FOOTER], ids=["content", "opcode of an end", "of a footer"])
 @pytest.mark.parametrize("number", [0, 1])
-def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, opcode: Opcode | None, tape: Tape, run: Path) -> None:
+def test_damaged_chunk_left_out_and_all_others_read(number: int, opcode: Opcode | None, tape: Tape, run: Path) -> None:
     file = run / "run_0.mcap"
     chunks = sorted(summary_of(file).chunk_indexes, key=lambda chunk: chunk.chunk_start_offset)
     assert len(chunks) > 2
@@ -182,7 +182,7 @@ def test_a_damaged_chunk_is_left_out_and_all_others_are_read(number: int, opcode
     assert len(kept) < len(stamps)
 
 
-def test_a_file_with_changed_bytes_gives_recorded_samples_or_is_rejected(tape: Tape, recorded: Path, tmp_path: Path) -> None:
+def test_file_with_changed_bytes_gives_recorded_samples_or_rejected(tape: Tape, recorded: Path, tmp_path: Path) -> None:
     file, generator = tmp_path / "run_0.mcap", np.random.default_rng(1)
     content, read = (recorded / "run_0.mcap").read_bytes(), 0
     samples = set(zip(tape["y"].stamp_ns.tolist(), map(bytes, tape["y"].values), strict=True))
@@ -201,7 +201,7 @@ def test_a_file_with_changed_bytes_gives_recorded_samples_or_is_rejected(tape: T
     assert read > 10  # of 60: the samples are in two chunks, and three changed bytes sometimes leave one of them intact
 
 
-def test_the_memory_for_chunks_of_few_bytes_that_hold_much_is_bounded(tmp_path: Path) -> None:
+def test_memory_for_chunks_of_few_bytes_that_hold_much_bounded(tmp_path: Path) -> None:
     size, count = 8 << 20, 30
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
@@ -220,7 +220,7 @@ def test_the_memory_for_chunks_of_few_bytes_that_hold_much_is_bounded(tmp_path: 
 
 
 @pytest.mark.parametrize("wrong", [0, 7, 2**60])
-def test_a_wrong_count_of_messages_in_the_index_changes_no_sample(
+def test_wrong_count_of_messages_in_index_changes_no_sample(
     wrong: int, tape: Tape, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def read(stream: ReadDataStream) -> Statistics:
@@ -235,7 +235,7 @@ def test_a_wrong_count_of_messages_in_the_index_changes_no_sample(
     }
 
 
-def test_a_file_that_grows_while_it_is_read_is_read_up_to_its_first_size(tmp_path: Path) -> None:
+def test_file_that_grows_while_it_read_read_up_to_first_size(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     for number, message in enumerate(SAMPLES):
@@ -258,7 +258,7 @@ def test_two_bags_in_a_folder_are_rejected(run: Path) -> None:
         read_run(run)
 
 
-def test_a_tape_whose_first_signal_has_no_sample_is_written(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_tape_whose_first_signal_has_no_sample_written(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     empty = {"y": tape["y"].until(-1), "u": tape["u"]}
     write_run(Tape(empty), tmp_path / "run", LogAttachments(osprey_gust.path))
     assert list(read_run(tmp_path / "run").tape.signals) == ["u"]
@@ -314,7 +314,7 @@ def record(
 SAMPLES = [vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k)) for k in range(50)]
 
 
-def test_a_flight_that_rosbag2_recorded_is_read_with_the_scenario_beside_it(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_flight_that_rosbag2_recorded_read_with_scenario_beside_it(osprey_gust: Scenario, tmp_path: Path) -> None:
     """As the launch files leave it: a log without messages, and the bag in a folder of its own."""
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(osprey_gust.path), 1)
@@ -336,7 +336,7 @@ def test_bags_of_other_recorders_are_read(storage: StoragePlugin, compression: C
     assert back["y"]["q"].tolist() == [0.1 * k for k in range(50)]
 
 
-def test_the_scenario_of_a_log_keeps_a_name_with_spaces(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_scenario_of_log_keeps_name_with_spaces(tape: Tape, osprey_gust: Scenario, tmp_path: Path) -> None:
     path = tmp_path / "my plane (2).yaml"
     path.write_bytes(osprey_gust.path.read_bytes())
     run = write_run(Tape({"y": tape["y"]}), tmp_path / "run", LogAttachments(path)).parent
@@ -349,7 +349,7 @@ def test_compressed_messages_are_not_played(tmp_path: Path) -> None:
         read_playback(tmp_path / "bag")
 
 
-def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
+def test_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
     # more than ten, so that the order of numbers is not that of names
     for part in range(12):
         record(tmp_path / f"part{part}", {"/y": SAMPLES[4 * part : 4 * part + 4]}, StoragePlugin.MCAP)
@@ -364,7 +364,7 @@ def test_a_bag_in_several_files_is_one_flight(tmp_path: Path) -> None:
     assert back["y"]["V"].tolist() == [-float(k) for k in range(48)]
 
 
-def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path) -> None:
+def test_two_aircraft_in_one_bag_selected_by_namespace(tmp_path: Path) -> None:
     topics = {"/one/y": SAMPLES, "/fleet/two/y": SAMPLES[:7], "/fleet/two/gps/speed": SAMPLES[:3], "/one/u": SAMPLES[1:6]}
     record(tmp_path / "bag", topics, StoragePlugin.MCAP)
     found = "bag: found aircraft in the namespaces /fleet/two, /one, expected"
@@ -379,18 +379,18 @@ def test_two_aircraft_in_one_bag_are_selected_by_their_namespace(tmp_path: Path)
         assert (back.latency is not None) == ("u" in counts)
 
 
-def test_an_aircraft_at_the_root_excludes_those_in_namespaces(tmp_path: Path) -> None:
+def test_aircraft_at_root_excludes_those_in_namespaces(tmp_path: Path) -> None:
     record(tmp_path / "bag", {"/y": SAMPLES, "/two/y": SAMPLES[:7], "/arm/joints": SAMPLES[:2]}, StoragePlugin.MCAP)
     assert set(read_run(tmp_path / "bag", "/").tape.signals) == {"y", "arm/joints"}
     assert set(read_run(tmp_path / "bag", "two").tape.signals) == {"y"}
 
 
-def test_one_aircraft_in_a_namespace_needs_no_name(tmp_path: Path) -> None:
+def test_one_aircraft_in_namespace_needs_no_name(tmp_path: Path) -> None:
     record(tmp_path / "bag", {"/two/y": SAMPLES[:7], "/joints": SAMPLES}, StoragePlugin.MCAP)
     assert set(read_run(tmp_path / "bag").tape.signals) == {"y"}
 
 
-def test_a_folder_with_only_a_metadata_yaml_is_rejected(tmp_path: Path) -> None:
+def test_folder_with_only_metadata_yaml_rejected(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {version: 9}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match="expected a bag of rosbag2"):
         read_run(tmp_path)
@@ -449,7 +449,7 @@ def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_a_wrong_message_index_changes_nothing_that_is_read(data: st.DataObject, recorded: Path) -> None:
+def test_wrong_message_index_changes_nothing_that_read(data: st.DataObject, recorded: Path) -> None:
     """The index saves the steps from message to message: it must agree with them, or they are taken."""
     chunk, places = first_chunk((recorded / "run_0.mcap").read_bytes())
     by_steps = messages_of(chunk, b"")
@@ -484,12 +484,12 @@ def test_messages_with_codes_are_decoded_together() -> None:
     assert samples.values.tolist() == [[0.1 * k] for k in range(5)]
 
 
-def test_the_types_of_a_joint_state_are_those_of_ros_2() -> None:
+def test_types_of_joint_state_are_those_of_ros_2() -> None:
     ours = joint_state_types().fielddefs
     assert {name: ours[name] for name in JOINT_STATE_TYPES} == {name: STORE.fielddefs[name] for name in JOINT_STATE_TYPES}
 
 
-def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> None:
+def test_other_types_have_no_decoder_and_malformed_messages_counted() -> None:
     assert decoder("rcl_interfaces/msg/Log") is None
     decode = decoder(JOINT_STATE)
     assert decode is not None
@@ -498,7 +498,7 @@ def test_other_types_have_no_decoder_and_malformed_messages_are_counted() -> Non
     assert [len(samples.stamp_ns) for one in decoded for samples in one.samples] == [1]
 
 
-def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_their_reason(tmp_path: Path) -> None:
+def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_path: Path) -> None:
     """Reports come at each change and once a second. The messages are written by the library rosbags."""
     kind = "diagnostic_msgs/msg/KeyValue"
     bag = BagWriter(tmp_path / "run")
@@ -520,7 +520,7 @@ def test_the_engagements_of_a_log_begin_with_the_phase_engaged_and_end_with_thei
     ]  # when they were sent
 
 
-def test_engagements_after_a_step_of_the_clock_have_the_time_of_the_stamps(tmp_path: Path) -> None:
+def test_engagements_after_step_of_clock_have_time_of_stamps(tmp_path: Path) -> None:
     kind, step_ns = "diagnostic_msgs/msg/KeyValue", 5 * NANOSECONDS
     bag = BagWriter(tmp_path / "run")
     y, report = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/bridge/engagement", kind, "")
@@ -539,7 +539,7 @@ def test_engagements_after_a_step_of_the_clock_have_the_time_of_the_stamps(tmp_p
     assert engagement.stop_ns == pytest.approx(17 * NANOSECONDS, abs=40_000_000)
 
 
-def test_a_publisher_with_the_channels_in_another_order_is_read_by_their_names(tmp_path: Path) -> None:
+def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) -> None:
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
         for k in range(20):
@@ -551,7 +551,7 @@ def test_a_publisher_with_the_channels_in_another_order_is_read_by_their_names(t
     assert tape["y"].values.tolist() == [[k, 50.0] for k in range(20)]
 
 
-def test_samples_of_two_publishers_at_the_same_time_are_noted(tmp_path: Path) -> None:
+def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
     spans = {
         "/y": ("/aircraft#1", "/aircraft#2"),
@@ -568,7 +568,7 @@ def test_samples_of_two_publishers_at_the_same_time_are_noted(tmp_path: Path) ->
     assert read_run(tmp_path / "run").tape.notes == (both,)
 
 
-def test_without_truth_flight_time_counts_from_the_first_y_m(tmp_path: Path) -> None:
+def test_without_truth_flight_time_counts_from_first_y_m(tmp_path: Path) -> None:
     """A bridge publishes y before the reference model starts, and commands count from its start."""
     bag = BagWriter(tmp_path / "run")
     for name, first in (("y", 3), ("y_m", 5)):

@@ -73,7 +73,7 @@ def with_silence(neutral: float, release: float) -> ChannelMap:
     return ChannelMap.validate_mapping(content, "map")
 
 
-def test_only_the_service_engages_and_only_with_fresh_y_and_u() -> None:
+def test_only_service_engages_and_only_with_fresh_y_and_u() -> None:
     bridge = new_bridge()
     for reason, receive in (("q, p, r not received yet", receive_outputs), ("u not received yet", receive_u)):
         assert reason in bridge.engage(at(0.0))
@@ -84,7 +84,7 @@ def test_only_the_service_engages_and_only_with_fresh_y_and_u() -> None:
     assert bridge.step(at(0.0)) is Phase.ENGAGED
 
 
-def test_engagement_with_stale_inputs_is_refused_with_the_reason() -> None:
+def test_engagement_with_stale_inputs_refused_with_reason() -> None:
     bridge = new_bridge()
     receive_outputs(bridge, 0.0)
     receive_u(bridge, 0.3)
@@ -93,14 +93,14 @@ def test_engagement_with_stale_inputs_is_refused_with_the_reason() -> None:
     assert bridge.engage(at(0.6)) == "u is 0.30 s old"
 
 
-def test_a_dry_run_computes_but_never_sends_or_engages() -> None:
+def test_dry_run_computes_but_never_sends_or_engages() -> None:
     bridge = ready_bridge(0.1, dry_run=True)
     assert bridge.engage(at(0.0)).startswith("dry_run")
     assert not bridge.sends("joy", at(0.0))
     assert bridge.raw_u()[0] == pytest.approx(0.1 / 0.523599)
 
 
-def test_a_dry_run_says_what_else_would_refuse_an_engagement() -> None:
+def test_dry_run_says_what_else_would_refuse_engagement() -> None:
     bridge = new_bridge(dry_run=True)
     receive_outputs(bridge, 0.0)
     assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent; u not received yet"
@@ -108,7 +108,7 @@ def test_a_dry_run_says_what_else_would_refuse_an_engagement() -> None:
     assert bridge.refusal(at(0.0)) == "dry_run is true: nothing is sent"
 
 
-def test_engagement_with_u_away_from_trim_is_refused() -> None:
+def test_engagement_with_u_away_from_trim_refused() -> None:
     bridge = ready_bridge(0.05)  # above a tenth of 0.26 rad
     assert bridge.engage(at(0.0)).startswith("u.elevator is 0.05 from trim")
 
@@ -121,7 +121,7 @@ def test_u_stays_inside_its_limits_around_trim() -> None:
         assert bridge.raw() == pytest.approx([to_raw(row.trim + getattr(row, limit), row.line) for row in rows])
 
 
-def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
+def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
     bridge = engaged_bridge(with_silence(neutral=0.3, release=0.5))
     phases = []
     for t in np.arange(0.0, 1.2, 0.01).tolist():
@@ -139,7 +139,7 @@ def test_a_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None
     assert bridge.reason == "u is 0.20 s old"
 
 
-def test_a_u_of_a_played_log_is_refused_by_its_stamp() -> None:
+def test_u_of_played_log_refused_by_stamp() -> None:
     bridge = new_bridge()
     receive_outputs(bridge, 0.0)
     for t, reason in ((-60.0, "stamp 60 s old"), (60.0, "stamp 60 s ahead of the clock")):
@@ -148,7 +148,7 @@ def test_a_u_of_a_played_log_is_refused_by_its_stamp() -> None:
     assert bridge.engage(at(0.0)) == "u not received yet"
 
 
-def test_the_bridge_does_not_re_engage_by_itself() -> None:
+def test_bridge_does_not_re_engage_by_itself() -> None:
     bridge = engaged_bridge(with_silence(neutral=1.0, release=1.0))
     receive_outputs(bridge, 0.3)
     assert bridge.step(at(0.3)) is Phase.NEUTRAL
@@ -166,7 +166,7 @@ def test_a_timeout_of_y_releases_the_channels() -> None:
     assert bridge.step(at(0.76)) is Phase.DISENGAGED
 
 
-def test_a_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
+def test_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
     bridge = engaged_bridge()
     bridge.take_override("gamepad", 0.0, at(0.01))
     assert bridge.step(at(0.01)) is Phase.ENGAGED
@@ -177,7 +177,7 @@ def test_a_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
     assert bridge.engage(at(0.05)) == ""
 
 
-def test_an_override_of_a_bit_field_counts_its_masked_bits() -> None:
+def test_override_of_bit_field_counts_masked_bits() -> None:
     """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 flag missing commands."""
     bridge = new_bridge(named_map("rosflight"))
     bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
@@ -193,7 +193,7 @@ def test_times_of_zero_skip_neutral_and_release_values() -> None:
     assert bridge.step(at(0.3)) is Phase.DISENGAGED
 
 
-def test_a_conflicting_publisher_of_u_is_refused_until_the_first_one_times_out() -> None:
+def test_conflicting_publisher_of_u_refused_until_first_one_times_out() -> None:
     bridge = new_bridge()
     receive_u(bridge, 0.0)
     with pytest.raises(ChannelError, match="conflicting publisher second ignored: already receiving from controller"):
@@ -201,7 +201,7 @@ def test_a_conflicting_publisher_of_u_is_refused_until_the_first_one_times_out()
     receive_u(bridge, 0.3, sender="second")
 
 
-def test_while_engaged_no_other_publisher_of_u_takes_over_and_the_timeout_releases() -> None:
+def test_while_engaged_no_other_publisher_of_u_takes_over_and_timeout_releases() -> None:
     # A hot standby: its u may be anywhere, and would move all surfaces at once.
     bridge = engaged_bridge()
     receive_outputs(bridge, 0.21)
@@ -213,7 +213,7 @@ def test_while_engaged_no_other_publisher_of_u_takes_over_and_the_timeout_releas
     receive_u(bridge, 0.22, sender="standby")
 
 
-def test_a_second_publisher_of_a_topic_of_the_autopilot_ends_the_engagement_and_blocks_another() -> None:
+def test_second_publisher_of_topic_of_autopilot_ends_engagement_and_blocks_another() -> None:
     bridge = engaged_bridge()
     bridge.conflict = "/ap/twist/filtered has 2 publishers"
     assert bridge.step(at(0.01)) is Phase.RELEASE
@@ -222,7 +222,7 @@ def test_a_second_publisher_of_a_topic_of_the_autopilot_ends_the_engagement_and_
     assert bridge.engage(at(0.03)) == ""
 
 
-def test_an_engagement_says_which_pilot_override_has_no_effect() -> None:
+def test_engagement_says_which_pilot_override_has_no_effect() -> None:
     bridge = engaged_bridge()
     silent = "a pilot override has no effect: no message on /joy for 1 s"
     assert bridge.reason == silent
@@ -235,7 +235,7 @@ def test_an_engagement_says_which_pilot_override_has_no_effect() -> None:
         assert bridge.reason == reason
 
 
-def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
+def test_y_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
     bridge = new_bridge()
     bridge.take_output("q", 0.5, at(0.0), at(0.01))
     assert bridge.y(at(0.01)) is None
@@ -250,7 +250,7 @@ def test_y_is_returned_once_per_rate_sample_and_only_while_all_channels_are_fres
     assert bridge.y(at(0.25)) is None
 
 
-def test_a_low_pass_answers_a_step_as_first_order_does_at_any_spacing_of_samples() -> None:
+def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -> None:
     content = CHANNEL_MAP.model_dump()
     content["outputs"]["q"]["low_pass"] = 0.05
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
@@ -263,7 +263,7 @@ def test_a_low_pass_answers_a_step_as_first_order_does_at_any_spacing_of_samples
         assert step == pytest.approx([1.0 - np.exp(-t / 0.05), 1.0])
 
 
-def test_stamps_of_another_clock_and_samples_out_of_order_are_refused() -> None:
+def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
     bridge = new_bridge(named_map("mavros"))
     with pytest.raises(ChannelError, match="stamp: arrival") as refused:
         bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # time since boot
@@ -296,7 +296,7 @@ def sent(bridge: Bridge, t: float) -> set[str]:
 
 
 @pytest.mark.parametrize("lost", ["the mode is not offboard", "two autopilots"])
-def test_neutral_values_end_with_a_lost_condition_or_a_conflicting_publisher(lost: str) -> None:
+def test_neutral_values_end_with_lost_condition_or_conflicting_publisher(lost: str) -> None:
     content = unlimited("px4").model_dump()
     content["silence"] = {"max_age": 0.2, "neutral": 5.0, "release": 0.5}
     bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
@@ -313,7 +313,7 @@ def test_neutral_values_end_with_a_lost_condition_or_a_conflicting_publisher(los
     assert lost in bridge.reason
 
 
-def test_engagement_requests_the_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
+def test_engagement_requests_mode_sends_setpoints_in_it_and_requests_hold_after_it() -> None:
     bridge = px4_bridge()
     assert sent(bridge, 0.0) == set()  # no heartbeat before the request: without it PX4 leaves offboard
     assert bridge.engage(at(0.0)) == ""
@@ -330,7 +330,7 @@ def test_engagement_requests_the_mode_sends_setpoints_in_it_and_requests_hold_af
     assert bridge.step(at(0.71)) is Phase.DISENGAGED
 
 
-def test_an_engagement_without_the_awaited_mode_ends_after_its_time_with_the_reason() -> None:
+def test_engagement_without_awaited_mode_ends_after_time_with_reason() -> None:
     bridge = px4_bridge()
     assert bridge.engage(at(0.0)) == ""
     refresh(bridge, 4.9)
@@ -341,7 +341,7 @@ def test_an_engagement_without_the_awaited_mode_ends_after_its_time_with_the_rea
     assert sent(bridge, 5.1) == set()
 
 
-def test_an_engagement_is_refused_with_the_sentence_of_the_condition() -> None:
+def test_engagement_refused_with_sentence_of_condition() -> None:
     bridge = new_bridge(unlimited("px4"))
     assert bridge.engage(at(0.0)) == "armed: arming_state not received yet (/fmu/out/vehicle_status_v1)"
     bridge = px4_bridge(armed=1.0)
@@ -356,7 +356,7 @@ def test_an_engagement_is_refused_with_the_sentence_of_the_condition() -> None:
         ({"offboard": 5.0}, "the mode is not offboard (nav_state is 5)"),
     ],
 )
-def test_a_lost_condition_ends_an_engagement_with_its_sentence(status: dict[str, float], reason: str) -> None:
+def test_lost_condition_ends_engagement_with_sentence(status: dict[str, float], reason: str) -> None:
     bridge = px4_bridge(offboard=14.0)
     assert bridge.engage(at(0.0)) == ""
     assert bridge.phase is Phase.ENGAGED
@@ -365,7 +365,7 @@ def test_a_lost_condition_ends_an_engagement_with_its_sentence(status: dict[str,
     assert bridge.reason == reason
 
 
-def test_a_condition_that_is_not_reported_any_more_ends_an_engagement() -> None:
+def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
     bridge = px4_bridge(offboard=14.0)
     assert bridge.engage(at(0.0)) == ""
     for t in np.arange(0.1, 1.7, 0.1).tolist():
@@ -375,7 +375,7 @@ def test_a_condition_that_is_not_reported_any_more_ends_an_engagement() -> None:
     assert bridge.reason.startswith("armed: arming_state is 1.60 s old")
 
 
-def test_a_captured_output_is_zero_until_engagement_and_then_its_change() -> None:
+def test_captured_output_is_zero_until_engagement_and_then_change() -> None:
     bridge = px4_bridge(offboard=14.0)
     samples = [bridge.y(at(0.0))]
     assert bridge.engage(at(0.0)) == ""
@@ -400,7 +400,7 @@ def ardupilot_bridge(t: float = 0.0, sticks: dict[str, float] = STICKS) -> Bridg
     return bridge
 
 
-def test_each_trim_is_captured_from_its_own_stick_at_engagement_and_kept() -> None:
+def test_each_trim_captured_from_own_stick_at_engagement_and_kept() -> None:
     """-1 to 1 over 1000 to 2000 us, 30 deg and half of the throttle at 1."""
     bridge = ardupilot_bridge()
     assert bridge.engage(at(0.0)) == ""
@@ -418,31 +418,31 @@ def test_each_trim_is_captured_from_its_own_stick_at_engagement_and_kept() -> No
         ("flying", 0.0, "the aircraft does not fly (flying is 0)"),
     ],
 )
-def test_ardupilot_is_engaged_in_manual_armed_and_flying_alone(condition: str, raw: float, sentence: str) -> None:
+def test_ardupilot_engaged_in_manual_armed_and_flying_alone(condition: str, raw: float, sentence: str) -> None:
     bridge = ardupilot_bridge()
     bridge.take_condition(condition, raw, at(0.0))
     assert bridge.engage(at(0.0)) == sentence
 
 
-def test_ardupilot_is_not_engaged_while_the_pilots_switch_is_on() -> None:
+def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
     bridge = ardupilot_bridge()
     bridge.take_override("switch", 1800.0, at(0.0))
     assert bridge.engage(at(0.0)) == "pilot override active: switch"
 
 
-def test_an_engagement_needs_the_sources_of_the_trims() -> None:
+def test_engagement_needs_sources_of_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))
     receive_u(bridge, 0.6)
     assert bridge.engage(at(0.6)).startswith("trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s")
 
 
-def test_an_engagement_whose_limits_leave_the_range_around_the_trim_is_refused() -> None:
+def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})  # 90 % of throttle, upper limit 30 % above
     assert bridge.engage(at(0.0)) == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
 
 
-def test_u_that_times_out_sends_the_captured_trim_where_the_map_says_so() -> None:
+def test_u_that_times_out_sends_captured_trim_where_map_says_so() -> None:
     content = unlimited("ardupilot").model_dump()
     content["silence"] = {"max_age": 0.2, "neutral": 0.3, "release": 0.5}
     bridge = ardupilot_bridge()
@@ -454,7 +454,7 @@ def test_u_that_times_out_sends_the_captured_trim_where_the_map_says_so() -> Non
 
 
 @pytest.mark.parametrize("earlier", [0.7, 0.1], ids=["where it is", "elsewhere a minute ago"])
-def test_an_override_by_a_stick_counts_its_way_since_engagement(earlier: float) -> None:
+def test_override_by_stick_counts_way_since_engagement(earlier: float) -> None:
     content = CHANNEL_MAP.model_dump()
     content["overrides"]["gamepad"] |= {"above": None, "moved": 0.2}
     bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
@@ -468,14 +468,14 @@ def test_an_override_by_a_stick_counts_its_way_since_engagement(earlier: float) 
     assert bridge.reason == "pilot override by gamepad"
 
 
-def test_an_override_by_a_switch_in_a_bit_field_counts_its_own_bit_since_engagement() -> None:
+def test_override_by_switch_in_bit_field_counts_own_bit_since_engagement() -> None:
     content = CHANNEL_MAP.model_dump()
     content["overrides"]["gamepad"] |= {"above": None, "moved": 0.5, "bits": 4}
     row = ChannelMap.validate_mapping(content, "map").overrides["gamepad"]
     assert [row.is_active(raw, at_engagement=5.0) for raw in (5.0, 6.0, 1.0)] == [False, False, True]
 
 
-def test_an_override_whose_topic_has_ended_does_not_block_an_engagement() -> None:
+def test_override_whose_topic_has_ended_does_not_block_engagement() -> None:
     bridge = new_bridge()
     bridge.take_override("gamepad", 1.0, at(0.0))
     receive_outputs(bridge, 0.9)
@@ -501,7 +501,7 @@ def enveloped_bridge() -> Bridge:
 
 
 @pytest.mark.parametrize(("name", "raw", "channel"), [("phi", 0.81, 0.81), ("theta", 0.41, -0.41), ("V", 33.1, 8.1)])
-def test_leaving_the_envelope_releases_the_channels_with_a_sentence(name: str, raw: float, channel: float) -> None:
+def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float, channel: float) -> None:
     bridge = enveloped_bridge()
     inside = {"phi": -0.79, "theta": -0.49, "V": 32.9}
     receive_outputs(bridge, 0.02, (name,), inside[name])
@@ -512,7 +512,7 @@ def test_leaving_the_envelope_releases_the_channels_with_a_sentence(name: str, r
     assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
 
 
-def test_an_envelope_whose_channel_is_stale_releases_the_channels() -> None:
+def test_envelope_whose_channel_is_stale_releases_channels() -> None:
     bridge = enveloped_bridge()
     receive_outputs(bridge, 0.15)
     receive_outputs(bridge, 0.16, ("V",), raw=25.0)
@@ -521,7 +521,7 @@ def test_an_envelope_whose_channel_is_stale_releases_the_channels() -> None:
     assert bridge.reason.startswith("phi, theta are 0.25 s old (/ap/pose/filtered)")
 
 
-def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:
+def test_pose_has_fresh_channels_and_stamp_of_first_row() -> None:
     bridge = new_bridge()
     receive_outputs(bridge, 0.0, ("theta", "climb"), 0.1)
     assert bridge.pose(at(0.0)) is None
@@ -536,7 +536,7 @@ def test_a_pose_has_the_fresh_channels_and_the_stamp_of_its_first_row() -> None:
     assert names == ("phi",)  # the others are 0.3 s old
 
 
-def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alone_changes() -> None:
+def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:
     reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
     waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
     processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: None if waiting else "the end")
@@ -546,7 +546,7 @@ def test_a_flight_announces_each_reason_once_without_those_in_which_a_number_alo
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
 
 
-def test_an_experiment_without_an_engagement_ends_when_too_little_time_is_left() -> None:
+def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
     processes = SimpleNamespace(started=time.monotonic() - 0.3, ended_early=lambda: None)
     monitor = SimpleNamespace(engagement=list, newest=lambda: None)
@@ -556,7 +556,7 @@ def test_an_experiment_without_an_engagement_ends_when_too_little_time_is_left()
     assert outcome == "not engaged within 0.2 s"
 
 
-def test_a_step_of_the_system_clock_does_not_end_a_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(["", "", "the end"])
     processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: next(calls) or None)
     monitor = SimpleNamespace(engagement=list, newest=lambda: None)
@@ -566,7 +566,7 @@ def test_a_step_of_the_system_clock_does_not_end_a_flight(monkeypatch: pytest.Mo
     assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, lambda line: None, np.inf) == "the end"
 
 
-def test_a_second_signal_does_not_interrupt_the_clean_up_after_the_first() -> None:
+def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
     """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its nodes without end."""
     before, clean = signal.getsignal(signal.SIGINT), False
     with suppress(KeyboardInterrupt), handle_signals(_interrupt):

@@ -82,7 +82,7 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     return Identified(response, models, join(MAP, response, models))
 
 
-def test_the_channels_of_an_unknown_aircraft_are_identified(identified: Identified) -> None:
+def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None:
     response, channels = identified.response, identified.channels
     rows = [OSPREY.outputs.index(name) for name in response.outputs]
     columns = [list(OSPREY.inputs).index(name) for name in response.inputs]
@@ -96,7 +96,7 @@ def test_the_channels_of_an_unknown_aircraft_are_identified(identified: Identifi
     assert (np.abs(channels.lag + channels.delay - expected) < np.where(lag > 0.05, 0.05, 0.02)).all()
 
 
-def test_the_written_scenario_flies_the_aircraft_and_tracks(identified: Identified, tmp_path: Path) -> None:
+def test_written_scenario_flies_aircraft_and_tracks(identified: Identified, tmp_path: Path) -> None:
     found = flying_scenario(MAP, identified.channels, SPEED, str(tmp_path / "flight_airframe.yaml"))
     assert found.controller.D == (1, 1, 1, 1)
     tape = simulate(loaded(tmp_path, "flight", found.airframe, found.scenario))
@@ -127,7 +127,7 @@ def channels_of_first_order(stiff: str, damping: float, stiffness: float, zero: 
     )  # fmt: skip
 
 
-def test_a_stiff_channel_gets_an_integral_by_which_its_loop_crosses_one_at_its_bandwidth(tmp_path: Path) -> None:
+def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(tmp_path: Path) -> None:
     # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its derivative
     damping, stiffness, zero = 39.0, 1000.0, 25.0
     found = channels_of_first_order(stiff="q", damping=damping, stiffness=stiffness, zero=zero)
@@ -140,7 +140,7 @@ def test_a_stiff_channel_gets_an_integral_by_which_its_loop_crosses_one_at_its_b
     assert abs(loop) == pytest.approx(1.0, rel=1e-6)
 
 
-def test_the_feedforward_of_a_coordinated_turn_needs_no_rudder_against_a_sideslip(tmp_path: Path) -> None:
+def test_feedforward_of_coordinated_turn_needs_no_rudder_against_sideslip(tmp_path: Path) -> None:
     """Rates of a steady turn, without sideslip: the rudder of the feedforward is N_r r / N_rudder, closed form."""
     found = channels_of_first_order(stiff="r", damping=22.0, stiffness=470.0, zero=2.0)
     model = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller.feedforward
@@ -149,7 +149,7 @@ def test_the_feedforward_of_a_coordinated_turn_needs_no_rudder_against_a_sidesli
     np.testing.assert_allclose(np.reshape(model.A, (n, n))[r], np.where(np.arange(n) == r, -20.0, 0.0))
 
 
-def test_a_command_of_speed_needs_half_of_the_thrust_in_the_end(tmp_path: Path) -> None:
+def test_command_of_speed_needs_half_of_thrust_in_end(tmp_path: Path) -> None:
     """V_dot = Omega u - damping V rests at Omega u / damping: 5 m/s^2 per 1 of thrust, half of its limit, 2 1/s."""
     found = channels_of_first_order(stiff="V", damping=2.0, stiffness=0.0, zero=0.0)
     content = yaml.safe_load(flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).scenario)
@@ -158,7 +158,7 @@ def test_a_command_of_speed_needs_half_of_the_thrust_in_the_end(tmp_path: Path) 
     assert content["/**/reference_model"]["ros__parameters"]["pulses"]["V"]["value"] == [pytest.approx(expected)]
 
 
-def test_a_channel_of_which_nothing_is_certain_is_refused(identified: Identified) -> None:
+def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
     response, models, _ = identified
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))
     unusable = [*models[:1], None, *models[2:]]
@@ -202,9 +202,7 @@ class Known(NamedTuple):
 
 
 @pytest.mark.parametrize("lag", [0.03, 0.4])
-def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
-    lag: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_model_of_channel_is_that_of_own_simulation_from_any_start(lag: float, monkeypatch: pytest.MonkeyPatch) -> None:
     # From a slow start the search meets the same response with a lag of 1/12 s and a pole at 20 1/s.
     monkeypatch.setattr(open_loop_fit, "STARTS", ((0.03, lag, 5.0, 30.0, 6.0),))
     model = fit_channel(*Known().measured(noise=0.002), "q", "elevator", 1.0)  # rad/s, as of a gyroscope
@@ -215,7 +213,7 @@ def test_the_model_of_a_channel_is_that_of_its_own_simulation_from_any_start(
     np.testing.assert_allclose([model.Omega, model.lag + model.delay], [80.0, 0.13], rtol=0.1)
 
 
-def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() -> None:
+def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
     # 0.1 rad/s is the rms of the response: 70 % of y is unexplained, and gain and phase of the loop are certain
     model = fit_channel(*Known().measured(noise=0.1), "q", "elevator", 1.0)
     assert model is not None
@@ -228,7 +226,7 @@ def test_noise_as_large_as_the_response_leaves_a_model_with_standard_errors() ->
     assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
 
 
-def test_a_lag_that_a_zero_cancels_is_not_taken_for_the_lag_of_the_channel() -> None:
+def test_lag_that_zero_cancels_is_not_taken_for_lag_of_channel() -> None:
     # Two complex poles without a lag: the second order fits them with a lag of up to 1 s and a zero at its pole, and the loop's
     # bandwidth follows from the lag. The first order has one of 1/12 s or less: 23 1/s is the sum of both poles.
     t = np.arange(0.0, 14.0, 0.01)
@@ -245,7 +243,7 @@ def test_a_lag_that_a_zero_cancels_is_not_taken_for_the_lag_of_the_channel() -> 
     assert model.delay + model.lag == pytest.approx(0.07 + 0.005 + 0.04, abs=0.03)  # s; a lag of 0.04 s is the slower real part
 
 
-def test_the_fast_oscillation_of_a_light_airplane_is_found() -> None:
+def test_fast_oscillation_of_light_airplane_found() -> None:
     # that of PX4's airplane in yaw: 480 / s^2 is 3.5 Hz, and its response returns to 0 within 0.15 s
     known = Known(Omega=500.0, damping=24.0, stiffness=480.0, lag=0.01, delay=0.02)
     model = fit_channel(*known.measured(noise=0.02), "q", "elevator", 1.0)
@@ -254,12 +252,12 @@ def test_the_fast_oscillation_of_a_light_airplane_is_found() -> None:
     np.testing.assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
 
 
-def test_noise_far_above_the_response_leaves_no_model() -> None:
+def test_noise_far_above_response_leaves_no_model() -> None:
     model = fit_channel(*Known().measured(noise=5.0), "q", "elevator", 1.0)
     assert model is None or not model.usable
 
 
-def test_an_output_that_never_moves_has_no_model() -> None:
+def test_output_that_never_moves_has_no_model() -> None:
     y, u = Known().measured(noise=0.0)
     assert fit_channel(Signal(y.stamp_ns, y.names, 0.0 * y.values), u, "q", "elevator", 1.0) is None
 
@@ -288,7 +286,7 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
     return Tape({"y": Signal(stamps, tuple(MAP.outputs), y), "u": Signal(stamps, params.inputs, held), "pose": pose})
 
 
-def test_thrust_is_told_from_the_phugoid_by_the_climb() -> None:
+def test_thrust_told_from_phugoid_by_climb() -> None:
     tape, whole = thrust_with_phugoid(0.2), [(0, 10**18)]
     place = channel_pairs(MAP)[0].outputs.index("V")
     model = channel_models(MAP, tape, whole, SPEED)[place]
@@ -301,7 +299,7 @@ def test_thrust_is_told_from_the_phugoid_by_the_climb() -> None:
     assert of_log_alone.Omega > 1.5 * 14.0, "the phugoid is large enough to matter"
 
 
-def test_speed_has_no_model_where_no_climb_is_measured() -> None:
+def test_speed_has_no_model_where_no_climb_measured() -> None:
     tape, place = thrust_with_phugoid(0.2), channel_pairs(MAP)[0].outputs.index("V")
     level = Signal(tape["pose"].stamp_ns, ("theta",), tape["pose"].values)
     for signals in ({"pose": level}, {}):
@@ -330,7 +328,7 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_log_of_a_flight_under_feedback_is_no_experiment(tmp_path: Path) -> None:
+def test_log_of_flight_under_feedback_is_no_experiment(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_gust", 1.0)
     (tmp_path / "run").mkdir()
     write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
@@ -341,7 +339,7 @@ def test_the_log_of_a_flight_under_feedback_is_no_experiment(tmp_path: Path) -> 
     assert not (tmp_path / "found").exists()
 
 
-def test_a_written_map_has_the_trims_that_were_sent() -> None:
+def test_written_map_has_trims_that_were_sent() -> None:
     row = MAP.inputs["elevator"]
     names = tuple(f"{one.message}.{one.field}" for one in MAP.inputs.values())
     raw = np.full((20, 4), 0.25)  # of the axes; the pause after engagement is at trim
@@ -354,7 +352,7 @@ def test_a_written_map_has_the_trims_that_were_sent() -> None:
     assert written.outputs == MAP.outputs
 
 
-def test_the_bridge_releases_a_stale_y_before_the_controller_engages_again() -> None:
+def test_bridge_releases_stale_y_before_controller_engages_again() -> None:
     # a controller that engages again begins the excitation again
     rows = {name: row.model_copy(update={"max_age": 1.0}) for name, row in MAP.outputs.items()}
     patient = MAP.model_copy(update={"outputs": rows})
@@ -363,7 +361,7 @@ def test_the_bridge_releases_a_stale_y_before_the_controller_engages_again() -> 
         assert planned.max_age > max(row.max_age for row in channel_map.outputs.values())
 
 
-def test_an_experiment_stays_within_a_part_of_the_limits_of_the_map() -> None:
+def test_experiment_stays_within_part_of_limits_of_map() -> None:
     planned = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
     for name, amplitude in zip(planned.inputs, planned.amplitude, strict=True):
         row = MAP.inputs[name]

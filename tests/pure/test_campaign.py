@@ -58,7 +58,7 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
 
 
 @given(VALUES, st.data())
-def test_a_figure_summed_from_parts_is_that_of_the_whole(values: FloatArray, data: st.DataObject) -> None:
+def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
     whole, parts = Figure.of(values), Figure.of(values[:cut]) + Figure.of(values[cut:])
     assert parts.count == len(values)
@@ -70,19 +70,19 @@ def test_a_figure_summed_from_parts_is_that_of_the_whole(values: FloatArray, dat
 
 
 @given(VALUES, st.floats(0.01, 1.0))
-def test_a_quantile_is_accurate_to_the_width_of_a_bin(values: FloatArray, share: float) -> None:
+def test_quantile_is_accurate_to_width_of_bin(values: FloatArray, share: float) -> None:
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
     assert Figure.of(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
 
 
-def test_the_size_of_a_figure_does_not_grow_with_the_flights() -> None:
+def test_size_of_figure_does_not_grow_with_flights() -> None:
     rng = np.random.default_rng(1)
     sizes = [len(Figure.of(np.exp(rng.normal(size=count))).model_dump_json()) for count in (10_000, 1_000_000)]
     assert sizes[1] < 2 * sizes[0]  # more bins at the tails, a digit or two more a bin
 
 
-def test_the_worst_flights_are_kept_with_the_diverged_ones_first() -> None:
+def test_worst_flights_kept_with_diverged_ones_first() -> None:
     scores = np.arange(30.0)
     diverged = scores == 4.0
     halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
@@ -93,7 +93,7 @@ def test_the_worst_flights_are_kept_with_the_diverged_ones_first() -> None:
     assert total.figures["score"].count == 29
 
 
-def test_the_share_of_diverged_flights_has_a_confidence_interval() -> None:
+def test_share_of_diverged_flights_has_confidence_interval() -> None:
     # Clopper-Pearson: of 0 in n, the upper end is 1 - 0.025^(1/n).
     share, low, high = Tally(flights=100).share(0)
     assert (share, low) == (0.0, 0.0)
@@ -108,7 +108,7 @@ def test_a_score_counts_errors_in_their_units() -> None:
         score_units(("q", "theta"), units)
 
 
-def test_an_aircraft_of_a_campaign_has_the_same_score_in_the_single_process_simulation(tmp_path: Path) -> None:
+def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "one", definition())
     worst = campaign.tally(0).worst[0]
     path = tmp_path / "again.yaml"
@@ -141,7 +141,7 @@ def mission() -> Definition:
 
 
 @pytest.mark.parametrize("name", MISSIONS)
-def test_each_mission_of_a_campaign_flies_as_in_the_single_process_simulation(name: str) -> None:
+def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: str) -> None:
     # As of fleets without guidance: the nonlinear remainder is held over a tick (10 ms). Where u holds a lost y, the node's
     # extrapolation of y_m differs: 1e-2 there.
     definition, within = define(MISSIONS[name], 2, 0.3, 7, 2), 1e-2 if "lost" in name else 1e-3
@@ -164,7 +164,7 @@ def test_each_mission_of_a_campaign_flies_as_in_the_single_process_simulation(na
     assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
 
 
-def test_the_report_of_missions_says_what_their_score_counts(mission: Definition, tmp_path: Path) -> None:
+def test_report_of_missions_says_what_score_counts(mission: Definition, tmp_path: Path) -> None:
     campaign = Campaign.begin(tmp_path, mission)
     tally = Tally.of(*fly_chunk_figures(mission.model_dump_json(), (0, 0)))
     write_page(tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}])
@@ -189,12 +189,12 @@ REFUSED_MISSIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("sentence", REFUSED_MISSIONS)
-def test_a_mission_that_a_fleet_cannot_fly_is_refused(sentence: str) -> None:
+def test_mission_that_fleet_cannot_fly_refused(sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         define(CORNER.vary(**REFUSED_MISSIONS[sentence]), 2, 0.3, 7, 2)
 
 
-def test_missions_need_a_route_and_an_airframe_with_matrices() -> None:
+def test_missions_need_route_and_airframe_with_matrices() -> None:
     program = ROUTE.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
     with pytest.raises(ParameterError, match=r"guidance.route: found none, expected a route"):
         define(program, 2, 0.3, 7, 2)
@@ -202,7 +202,7 @@ def test_missions_need_a_route_and_an_airframe_with_matrices() -> None:
         define(find_scenario("jsbsim_c172p_route"), 2, 0.3, 7, 2)
 
 
-def test_a_campaign_flies_the_effect_of_wind_that_its_definition_names(tmp_path: Path) -> None:
+def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> None:
     gust = {"vertical": {"start": 2.0, "speed": 10.12, "length": 15.24}}
     gusty = find_scenario("osprey_servo").vary(flight={"duration": 4.0}, aircraft={"gusts": gust})
     published = gusty.vary(aircraft={"uncertainty": {"A": 0.9, "wind": "published"}})
@@ -219,7 +219,7 @@ def test_a_campaign_flies_the_effect_of_wind_that_its_definition_names(tmp_path:
         assert of[name].aircraft_scenario(3).aircraft.uncertainty.wind == wind
 
 
-def test_a_campaign_of_a_version_without_effects_of_wind_is_not_continued(tmp_path: Path) -> None:
+def test_campaign_of_version_without_effects_of_wind_is_not_continued(tmp_path: Path) -> None:
     old = json.loads(definition().model_dump_json())
     del old["wind"]
     (tmp_path / "campaign.json").write_text(json.dumps(old), encoding="utf-8")
@@ -227,7 +227,7 @@ def test_a_campaign_of_a_version_without_effects_of_wind_is_not_continued(tmp_pa
         Campaign.resume(tmp_path)
 
 
-def test_the_same_seed_gives_the_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:
+def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:
     first, second = (fly_campaign(tmp_path / name, definition()) for name in ("first", "second"))
     assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()
 
@@ -242,7 +242,7 @@ def test_the_same_seed_gives_the_same_figures_in_any_order_and_engine(tmp_path: 
     assert other.tally(0).figures["score"].mean != first.tally(0).figures["score"].mean
 
 
-def test_a_stopped_campaign_resumes_with_the_missing_chunks(tmp_path: Path) -> None:
+def test_stopped_campaign_resumes_with_missing_chunks(tmp_path: Path) -> None:
     whole = fly_campaign(tmp_path / "whole", definition())
     (tmp_path / "part").mkdir()
     part = Campaign.begin(tmp_path / "part", definition())
@@ -254,7 +254,7 @@ def test_a_stopped_campaign_resumes_with_the_missing_chunks(tmp_path: Path) -> N
     assert resumed.tally(0) == whole.tally(0)
 
 
-def test_a_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
+def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.25, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
     assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
@@ -273,7 +273,7 @@ def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
         definition(20, 20, sweep)
 
 
-def test_a_sweep_of_a_law_without_that_parameter_is_refused() -> None:
+def test_sweep_of_law_without_that_parameter_refused() -> None:
     pi = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["pi"], "controller"))
     with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: Lambda, input_scale$"):
         define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
@@ -306,7 +306,7 @@ def refusal(*words: str) -> str:
 
 
 @pytest.mark.parametrize("content", ["", Tally.of(0, np.zeros(9), {"score": np.ones(9)}).model_dump_json()])
-def test_a_chunk_that_is_damaged_or_of_another_campaign_is_named(flown: Campaign, content: str) -> None:
+def test_chunk_that_damaged_or_of_another_campaign_named(flown: Campaign, content: str) -> None:
     path = flown.folder / CHUNKS / "0-000000.json"
     path.write_text(content, encoding="utf-8")
     assert refusal("--resume", str(flown.folder)).startswith(
@@ -314,19 +314,19 @@ def test_a_chunk_that_is_damaged_or_of_another_campaign_is_named(flown: Campaign
     )
 
 
-def test_results_that_cannot_be_written_are_a_sentence(flown: Campaign) -> None:
+def test_results_that_cannot_be_written_are_sentence(flown: Campaign) -> None:
     (flown.folder / REPORT).mkdir()
     assert refusal("--resume", str(flown.folder)).startswith(f"{flown.folder} cannot be written (Is a directory)")
 
 
-def test_a_printed_command_quotes_a_path_with_spaces(flown: Campaign) -> None:
+def test_printed_command_quotes_path_with_spaces(flown: Campaign) -> None:
     folder = flown.folder.rename(flown.folder.with_name("my runs"))
     result = CliRunner().invoke(application(["campaign"]), ["campaign", "--resume", str(folder), "--json"])
     words = shlex.split(json.loads(result.stdout)["cases"][0]["fly_again"][0]["command"])
     assert words == ["rise-di", "fly", str(folder / "osprey_servo_19.yaml"), "--in-process"]
 
 
-def test_a_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
+def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
     sentence = refusal("--resume", str(flown.folder), "--aircraft", "1000")
     assert sentence == "--aircraft: found it beside --resume, expected none: the folder of a campaign holds its definition"
 
@@ -368,7 +368,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
     return figures(command(*new(400), cwd=tmp_path_factory.mktemp("whole")))
 
 
-def test_a_killed_campaign_resumes_to_the_figures_of_an_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
+def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
     stopped = command(*new(400, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
@@ -392,7 +392,7 @@ def square(job: engines.Job) -> int:
     return job[0] ** 2
 
 
-def test_a_campaign_goes_on_with_a_scheduler_that_is_back() -> None:
+def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
     def cluster(port: int) -> LocalCluster:
         where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": ":0"}
         return LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **where)
@@ -406,15 +406,13 @@ def test_a_campaign_goes_on_with_a_scheduler_that_is_back() -> None:
     assert sorted(results) == [((k,), k**2) for k in range(20)]
 
 
-def test_a_chunk_that_ends_its_workers_is_one_sentence() -> None:
+def test_chunk_that_ends_workers_is_one_sentence() -> None:
     sentence = "--engine dask: found a chunk that ended 2 workers, as one .* expected a smaller --chunk"
     with dask.config.set({"distributed.scheduler.allowed-failures": 1}), pytest.raises(ParameterError, match=sentence):
         next(engines.dask(1)(lambda _: os._exit(1), [(0,)]))
 
 
-def test_two_dask_workers_give_the_same_figures_and_a_killed_one_repeats_only_its_chunks(
-    whole: list[object], tmp_path: Path
-) -> None:
+def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:
     spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)
     workers = [one for one in psutil.Process(spread.pid).children(recursive=True) if one.cpu_times().user > 0.5]

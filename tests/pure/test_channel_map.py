@@ -70,14 +70,14 @@ def test_each_output_comes_in_si_and_frd(name: str, channel: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_each_input_is_sent_in_the_autopilots_unit_and_sign(name: str) -> None:
+def test_each_input_sent_in_autopilots_unit_and_sign(name: str) -> None:
     for (path, expected), row in zip(SENT[name].items(), named_map(name).inputs.values(), strict=True):
         assert path in (row.field, f"{row.message}.{row.field}")
         assert to_raw(row.trim + 0.1, row.line) == pytest.approx(expected, abs=1e-3)  # the fields in us are integers
 
 
 @pytest.mark.parametrize("name", FOREIGN_MAPS)
-def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name: str) -> None:
+def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> None:
     """A float32 has 24 bits, so a value is kept to 1e-7 of its size; an integer field rounds to half a unit."""
     channel_map = named_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
@@ -112,7 +112,7 @@ def test_each_field_of_a_map_is_published_and_accepts_the_values_of_the_map(name
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_each_input_of_a_map_states_its_own_trim_and_sign(name: str) -> None:
+def test_each_input_of_map_states_own_trim_and_sign(name: str) -> None:
     """A merged row would hand a changed trim or sign of the elevator to the other inputs."""
     inputs = MAP_FILES[name].read_text(encoding="utf-8").split("\ninputs:\n")[1].split("\n\n")[0]
     assert [inputs.count(f"\n    {key}: ") for key in ("trim", "sign")] == 2 * [len(named_map(name).inputs)]
@@ -125,7 +125,7 @@ MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8
 
 
 @pytest.mark.parametrize("name", MEASURED)
-def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
+def test_lost_message_does_not_end_engagement(name: str) -> None:
     """Each age limit is longer than two periods at the measured rate."""
     channel_map = named_map(name)
     rows = (*channel_map.outputs.values(), *channel_map.pose.values(), *channel_map.trims.values())
@@ -139,14 +139,14 @@ def test_a_lost_message_does_not_end_an_engagement(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "package"), [("mavros", "mavros_msgs"), ("rosflight", "rosflight_msgs"), ("rosflight", "rosplane_msgs")]
 )
-def test_a_map_and_its_page_name_the_release_of_the_definitions(name: str, package: str) -> None:
+def test_map_and_page_name_release_of_definitions(name: str, package: str) -> None:
     release = PACKAGES[package].partition(",")[0]
     assert release in named_map(name).source
     assert release in PAGE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name: str) -> None:
+def test_each_map_is_dry_run_by_default_and_names_source_of_each_row(name: str) -> None:
     channel_map = named_map(name)
     assert channel_map.dry_run
     assert list(channel_map.outputs) == ["q", "V", "p", "r"]
@@ -158,7 +158,7 @@ def test_each_map_is_a_dry_run_by_default_and_names_the_source_of_each_row(name:
         assert row.neutral == "trim" or to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
 
 
-def test_the_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
+def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
     types = {kind for _, _, kind in named_map("ardupilot_2024").used_topics()}
     stamped = {f"geometry_msgs/msg/{kind}Stamped" for kind in ("Pose", "Twist", "Vector3")}
     assert types == {*stamped, "sensor_msgs/msg/Joy"}
@@ -172,7 +172,7 @@ TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 @pytest.mark.parametrize("name", ["ardupilot", "mavros", "px4"])
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
-def test_the_attitude_of_a_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
+def test_attitude_of_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
     """Checked by SciPy's rotations. ArduPilot and MAVROS publish body FLU in ENU (REP 103), PX4 body FRD in NED."""
     frd_in_ned, channel_map = Rotation.from_euler("ZYX", [psi, theta, phi]), shipped(name)
     x, y, z, w = (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD).as_quat().tolist()
@@ -211,7 +211,7 @@ def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mavros", "rosflight"])
-def test_an_override_that_is_offered_reliably_is_not_lost(name: str) -> None:
+def test_override_that_offered_reliably_is_not_lost(name: str) -> None:
     """Publishers of rc_io.cpp:47 and rosflight_io.cpp:534, with ROS 2's default reliability."""
     channel_map = named_map(name)
     assert {channel_map.topics[row.topic].reliability for row in channel_map.overrides.values()} == {"reliable"}
@@ -225,18 +225,18 @@ def test_a_quaternion_without_an_attitude_is_refused(quaternion: list[float]) ->
 
 
 @given(LINES, st.floats(-1e4, 1e4))
-def test_sending_a_value_and_reading_it_back_gives_the_value(line: Line, channel: float) -> None:
+def test_sending_value_and_reading_it_back_gives_value(line: Line, channel: float) -> None:
     assert to_channel(to_raw(channel, line), line) == pytest.approx(channel, rel=1e-12, abs=1e-9)
 
 
 @given(LINES, st.floats(-1e4, 1e4), st.floats(1e-3, 1e3))
-def test_a_channel_rises_with_the_raw_value_by_its_sign_and_scale(line: Line, raw: float, more: float) -> None:
+def test_channel_rises_with_raw_value_by_sign_and_scale(line: Line, raw: float, more: float) -> None:
     rise = to_channel(raw + more, line) - to_channel(raw, line)
     assert rise == pytest.approx(line.sign * line.scale * more, rel=1e-6, abs=1e-5)  # cancellation with terms of 1e7
 
 
 @given(st.floats(0.0, 300.0))
-def test_the_speed_of_a_dynamic_pressure_is_the_one_that_makes_it(speed: float) -> None:
+def test_speed_of_dynamic_pressure_is_one_that_makes_it(speed: float) -> None:
     message = Message(fluid_pressure=0.5 * 1.225 * speed**2)
     assert read_raw(message, "fluid_pressure", "airspeed_of_pressure") == pytest.approx(speed, abs=1e-6)
 
@@ -252,7 +252,7 @@ def test_fields_are_reached_by_their_paths() -> None:
             get_field(message, path)
 
 
-def test_values_of_integer_fields_are_rounded_and_never_wrapped() -> None:
+def test_values_of_integer_fields_rounded_and_never_wrapped() -> None:
     message = Message(channels=np.zeros(18, dtype=np.uint16))
     set_field(message, "channels[1]", 1595.5001)
     assert message.channels[1] == 1596
@@ -263,19 +263,19 @@ def test_values_of_integer_fields_are_rounded_and_never_wrapped() -> None:
 
 
 @pytest.mark.parametrize("raw", [math.nan, math.inf])
-def test_a_value_that_is_not_finite_is_refused(raw: float) -> None:
+def test_value_that_is_not_finite_refused(raw: float) -> None:
     with pytest.raises(ChannelError, match="not finite") as refused:
         read_raw(Message(q=raw), "q", "value")
     assert refused.value.reason == "finite"
 
 
-def test_a_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> None:
+def test_missing_message_package_is_one_sentence_that_tells_how_to_get_it() -> None:
     expected = r"absent_msgs/msg/State: .*make messages PACKAGE=absent_msgs SOURCE=FOLDER .*ros-jazzy-absent-msgs"
     with pytest.raises(ParameterError, match=expected):
         message_type("absent_msgs/msg/State")
 
 
-def test_a_message_that_another_version_lacks_is_one_sentence() -> None:
+def test_message_that_another_version_lacks_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match="no Airspeed in the installed ardupilot_msgs"):
         message_type("ardupilot_msgs/msg/Airspeed", lambda name: Message())
 
@@ -315,7 +315,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
 @pytest.mark.parametrize(
     ("place", "value", "sentence"), REFUSALS, ids=lambda one: ".".join(one) if isinstance(one, tuple) else ""
 )
-def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], value: object, sentence: str) -> None:
+def test_bad_map_is_one_sentence_that_names_row(place: tuple[str, ...], value: object, sentence: str) -> None:
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))
     part = content
     for key in place[:-1]:
@@ -328,7 +328,7 @@ def test_a_bad_map_is_one_sentence_that_names_the_row(place: tuple[str, ...], va
 
 
 @pytest.mark.parametrize("name", MOVED)
-def test_a_moved_map_is_named_with_its_file(name: str) -> None:
+def test_moved_map_named_with_file(name: str) -> None:
     with pytest.raises(ParameterError) as refused:
         BridgeConfig.validate_mapping({"map": name}, "bridge")
     moved = f"examples/maps/{name}.yaml"

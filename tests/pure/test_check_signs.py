@@ -48,14 +48,14 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_the_shipped_maps_fit_the_controller_of_the_osprey(name: str) -> None:
+def test_shipped_maps_fit_controller_of_osprey(name: str) -> None:
     result = CliRunner().invoke(app, ["check-signs", str(MAP_FILES[name]), "--json"])
     assert result.exit_code == 0
     channels = [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]]
     assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
 
 
-def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> None:
+def test_through_map_of_right_signs_omega_is_that_of_airframe() -> None:
     assert AIRFRAME.outputs == ("q", "V", "p", "r")  # as in the maps
     for name in MAPS:
         assert through(named_map(name), OMEGA) == pytest.approx(OMEGA)
@@ -63,7 +63,7 @@ def test_through_a_map_of_the_right_signs_omega_is_that_of_the_airframe() -> Non
 
 @pytest.mark.parametrize("channel", INPUTS)
 @pytest.mark.parametrize("name", MAPS)
-def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel: str) -> None:
+def test_input_with_wrong_sign_changes_own_d_only(name: str, channel: str) -> None:
     original, k = named_map(name), INPUTS.index(channel)
     row = original.inputs[channel]
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
@@ -75,7 +75,7 @@ def test_an_input_with_the_wrong_sign_changes_its_own_d_only(name: str, channel:
 
 
 @pytest.mark.parametrize("channel", OUTPUTS)
-def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str) -> None:
+def test_two_wrong_signs_that_cancel_in_d_are_still_contradiction(channel: str) -> None:
     k = OUTPUTS.index(channel)
     original = load_map("ardupilot")
     flipped = changed(original, "outputs", channel, sign=-original.outputs[channel].sign)
@@ -84,7 +84,7 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_a_contradiction(channel: str
     assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
 
 
-def test_the_command_refuses_a_flipped_map_with_a_sentence(tmp_path: Path) -> None:
+def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
     path, flipped = tmp_path / "ardupilot.yaml", changed(load_map("ardupilot"), "inputs", "elevator", sign=-1)
     content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
@@ -112,7 +112,7 @@ def test_options_that_contradict_a_bridge_are_refused(options: tuple[str, ...], 
     assert not list(tmp_path.iterdir())  # refused before a run folder is created
 
 
-def test_a_map_of_other_channels_or_motions_is_one_sentence() -> None:
+def test_map_of_other_channels_or_motions_is_one_sentence() -> None:
     original = load_map("ardupilot")
     with pytest.raises(ParameterError, match=r"outputs\.q\.positive: found 'roll right', .* a motion to which q responds"):
         through(changed(original, "outputs", "q", positive="roll right"), OMEGA)
@@ -176,7 +176,7 @@ def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
 
 @pytest.mark.parametrize("k", range(4), ids=INPUTS)
 @pytest.mark.parametrize("topic", ["u", "y"])
-def test_each_wrong_sign_is_found_in_an_experiment(experiment: Tape, topic: str, k: int) -> None:
+def test_each_wrong_sign_found_in_experiment(experiment: Tape, topic: str, k: int) -> None:
     name = {"u": INPUTS, "y": OUTPUTS}[topic][k]
     wrong = Tape({**experiment.signals, topic: turned(experiment[topic], name)})
     checked = check_osprey(load_map("ardupilot"), measured=response(wrong, None))
@@ -185,7 +185,7 @@ def test_each_wrong_sign_is_found_in_an_experiment(experiment: Tape, topic: str,
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_feedback_through_a_delay_is_not_taken_for_a_response(seed: int) -> None:
+def test_feedback_through_delay_is_not_taken_for_response(seed: int) -> None:
     """Moderate turbulence moves q, r and V more than the commands of osprey_servo do; p, which it hardly moves, may be certain.
 
     A flight of ArduPlane showed thrust with the wrong sign at 5.8 standard errors: in a closed loop they count twice.
@@ -198,7 +198,7 @@ def test_feedback_through_a_delay_is_not_taken_for_a_response(seed: int) -> None
     assert "by the excitation, the rest by feedback of disturbances, expected 90 % or more: command r" in rudder
 
 
-def test_commands_that_move_the_aircraft_more_than_disturbances_show_the_signs_in_closed_loop() -> None:
+def test_commands_that_move_aircraft_more_than_disturbances_show_signs_in_closed_loop() -> None:
     tape = flown(GAINS, 45.0, seed=1, wind=0.0)
     checked = check_osprey(load_map("ardupilot"), measured=response(tape, tape["y_m"]))
     assert not checked.contradictions
@@ -208,7 +208,7 @@ def test_commands_that_move_the_aircraft_more_than_disturbances_show_the_signs_i
     assert [sentence for sentence in checked.contradictions if "p_dot fall with aileron" in sentence]
 
 
-def test_a_flight_under_guidance_is_refused_since_its_commands_follow_y(tmp_path: Path) -> None:
+def test_flight_under_guidance_refused_since_commands_follow_y(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_route", 1.0)
     (tmp_path / "run").mkdir()
     write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
@@ -216,7 +216,7 @@ def test_a_flight_under_guidance_is_refused_since_its_commands_follow_y(tmp_path
         recorded_response(tmp_path / "run", OUTPUTS, INPUTS)
 
 
-def test_a_flight_that_does_not_show_a_sign_says_which_input_to_excite() -> None:
+def test_flight_that_does_not_show_sign_says_which_input_to_excite() -> None:
     tape = flown(EXCITATION | {"amplitude": [0.04, 0.04, 0.0, 0.2]}, 36.0, seed=1, wind=15.4)
     checked = check_osprey(load_map("ardupilot"), measured=response(tape, None))
     assert not checked.contradictions

@@ -29,7 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Co
     return where, rise_di("fly", "osprey_gust", "--in-process", "--duration", "4", cwd=where)
 
 
-def test_a_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     where, shown = flown
     assert shown.returncode == 0, shown.stderr
     run = (where / "runs" / "latest").resolve()
@@ -50,7 +50,7 @@ def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedPro
     assert (summary["ticks"]["ticks"], summary["ticks"]["without_new_y"]) == (401, 0)
 
 
-def test_the_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+def test_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
     assert 'src="http' not in page
     assert "gust: from the entry of a gust to 1 s after its end" in page
@@ -105,7 +105,7 @@ def test_a_scenario_file_may_lie_anywhere(tmp_path: Path, osprey_gust: Scenario)
     assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
 
 
-def test_a_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
+def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
     (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8")
     shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)  # -m puts the working folder first
     assert shown.returncode == 2
@@ -118,7 +118,7 @@ def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
 
 
-def test_every_command_of_the_help_has_a_help_of_its_own(tmp_path: Path) -> None:
+def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
     for name in COMMANDS:
         shown = CliRunner().invoke(application([name]), [name, "--help"], prog_name="rise-di")
         assert shown.exit_code == 0, name
@@ -127,7 +127,7 @@ def test_every_command_of_the_help_has_a_help_of_its_own(tmp_path: Path) -> None
     assert all(name in listed for name in COMMANDS)
 
 
-def test_the_shell_completes_commands_and_the_options_of_a_command() -> None:
+def test_shell_completes_commands_and_options_of_command() -> None:
     def complete(words: str, place: int) -> list[str]:
         environment = os.environ | {"_RISE_DI_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place)}
         command = [sys.executable, "-m", "flight_cli.cli"]
@@ -137,7 +137,7 @@ def test_the_shell_completes_commands_and_the_options_of_a_command() -> None:
     assert "--parquet" in complete("rise-di report --", 2)
 
 
-def test_an_interrupt_inside_a_destructor_ends_a_command_without_a_traceback() -> None:
+def test_interrupt_inside_destructor_ends_command_without_traceback() -> None:
     code = """
 import signal, time
 from flight_cli import cli

@@ -52,7 +52,7 @@ def initial(name: str, benchmark: Benchmark, **changes: Any) -> TuningResult:
     return as_tuned(initial_gains(LAWS[name], benchmark.model), **changes)
 
 
-def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short: Benchmark) -> None:
+def test_score_counts_each_channel_in_unit_and_cost_adds_activity(short: Benchmark) -> None:
     # q, p, r, V: 10 mrad/s, 20 mrad/s, 10 mrad/s and 0.1 m/s are one each; 60 deg/s or 600 %/s of an input too
     rms = np.array([[0.01], [0.02], [0.01], [0.1]])
     slew = np.array([[np.deg2rad(60.0)], [0.0], [np.deg2rad(30.0)], [6.0]])
@@ -66,7 +66,7 @@ def test_a_score_counts_each_channel_in_its_unit_and_a_cost_adds_activity(short:
 
 
 @pytest.mark.parametrize("name", list(OBJECTIVES))
-def test_a_cost_is_the_mean_of_the_aircraft_in_each_wind_and_that_of_the_late_ones(name: str, short: Benchmark) -> None:
+def test_cost_is_mean_of_aircraft_in_each_wind_and_that_of_late_ones(name: str, short: Benchmark) -> None:
     objective = OBJECTIVES[name]
     aircraft = 1 + tuning.UNCERTAIN_AIRCRAFT
     found = tuning.evaluations(objective, short)
@@ -80,7 +80,7 @@ def test_a_cost_is_the_mean_of_the_aircraft_in_each_wind_and_that_of_the_late_on
         np.testing.assert_array_equal(part.fleet.rate[..., aircraft], part.fleet.rate[..., 0])
 
 
-def test_the_turbulence_replaces_the_gusts_and_depends_on_its_seed(short: Benchmark) -> None:
+def test_turbulence_replaces_gusts_and_depends_on_seed(short: Benchmark) -> None:
     other = tuning.build_benchmark(short.scenario, law_comparison.TURBULENCE_SEED)
     forcing = {}
     for seed, one in (("tuning", short), ("comparison", other)):
@@ -93,7 +93,7 @@ def test_the_turbulence_replaces_the_gusts_and_depends_on_its_seed(short: Benchm
     assert not np.array_equal(forcing["tuning", TURBULENCE], forcing["comparison", TURBULENCE])
 
 
-def test_a_search_is_repeatable_and_lowers_the_cost_of_its_initial_gains(short: Benchmark) -> None:
+def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark) -> None:
     law, begin, objective = LAWS["pi"], initial_gains(LAWS["pi"], short.model), OBJECTIVES["gust_turbulence"]
     found = [tuning.tune(law, objective, short, (3, 4), generations=6) for _ in range(2)]
     assert found[0] == found[1]
@@ -115,7 +115,7 @@ def test_a_search_is_repeatable_and_lowers_the_cost_of_its_initial_gains(short: 
 
 
 @pytest.mark.parametrize("wind", [GUST, TURBULENCE])
-def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(wind: str, short: Benchmark) -> None:
+def test_score_of_campaign_is_that_of_single_process_simulation(wind: str, short: Benchmark) -> None:
     controller = short.scenario.controller
     gains = {key: np.array([getattr(controller, key)]).T for key in ("Lambda", "beta")}
     gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.array([[short.scenario.rise_di().softening]])}
@@ -130,7 +130,7 @@ def test_the_score_of_a_campaign_is_that_of_the_single_process_simulation(wind: 
         np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
 
 
-def test_more_aircraft_do_not_change_the_results_of_the_first_ones(short: Benchmark) -> None:
+def test_more_aircraft_do_not_change_results_of_first_ones(short: Benchmark) -> None:
     one = {"pi": {"gust": initial("pi", short)}}
     few, more = (next(iter(law_comparison.compare(short, one, count, [0.3, 0.5], 7))) for count in (2, 3))
     assert few.scores == more.scores
@@ -139,7 +139,7 @@ def test_more_aircraft_do_not_change_the_results_of_the_first_ones(short: Benchm
             assert level.scores[wind].worst <= wider.scores[wind].worst
 
 
-def test_the_effect_of_wind_changes_uncertain_aircraft_and_not_the_nominal_one(short: Benchmark) -> None:
+def test_effect_of_wind_changes_uncertain_aircraft_and_not_nominal_one(short: Benchmark) -> None:
     published = tuning.build_benchmark(short.scenario.vary(aircraft={"uncertainty": {"wind": "published"}}))
     tuned = {"pi": {"gust": initial("pi", short)}}
     own, other = (next(iter(law_comparison.compare(one, tuned, 2, [0.3], 1, delays=()))) for one in (short, published))
@@ -148,7 +148,7 @@ def test_the_effect_of_wind_changes_uncertain_aircraft_and_not_the_nominal_one(s
         assert own.levels[0].scores[wind].mean != other.levels[0].scores[wind].mean
 
 
-def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u(short: Benchmark) -> None:
+def test_share_of_lost_aircraft_is_that_of_first_level_by_delay_of_u(short: Benchmark) -> None:
     # K of 40 1/s and the 35 ms of the loop of q are 1.4 rad at the crossover: stable below pi/2; with 60 ms more it is unstable
     fast = as_tuned({"K": np.full((4, 1), 40.0), "Lambda": np.ones((4, 1))})
     (found,) = law_comparison.compare(short, {"pi": {"gust": fast}}, 3, [0.3, 0.5], 1, delays=(0, 6))
@@ -156,7 +156,7 @@ def test_the_share_of_lost_aircraft_is_that_of_the_first_level_by_the_delay_of_u
     assert found.levels[0].scores[GUST].lost == 0.0
 
 
-def test_tuned_gains_are_written_to_a_new_folder_or_refused_in_a_sentence(tmp_path: Path) -> None:
+def test_tuned_gains_written_to_new_folder_or_refused_in_sentence(tmp_path: Path) -> None:
     path, found = tmp_path / "one" / "two" / "gains.yaml", TuningResult({"K": [1.0]}, 2.0, 1, [2.0, 3.0], 100)
     tuned_gains.save(path, {"pi": {"gust": found}}, ["gust"], "a command")
     assert tuned_gains.load(path) == {"pi": {"gust": found}}
@@ -184,7 +184,7 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_shipped_gains_are_in_the_form_that_save_writes(name: str, tmp_path: Path) -> None:
+def test_shipped_gains_are_in_form_that_save_writes(name: str, tmp_path: Path) -> None:
     path = tuned_gains.TUNED / f"{name}.yaml"
     text, tuned = path.read_text(encoding="utf-8"), tuned_gains.load(path)
     tuned_gains.save(tmp_path / path.name, tuned, list(OBJECTIVES), f"rise-di compare {name} --tune")
@@ -193,7 +193,7 @@ def test_shipped_gains_are_in_the_form_that_save_writes(name: str, tmp_path: Pat
     assert len(text.splitlines()) <= 6 + sum(1 + 3 * len(sets) for sets in tuned.values())  # a gain set in at most three lines
 
 
-def test_gains_read_back_as_they_were_written_in_the_order_of_the_catalogue(tmp_path: Path) -> None:
+def test_gains_read_back_as_they_were_written_in_order_of_catalogue(tmp_path: Path) -> None:
     pi = TuningResult({"K": [9.0, 0.1 + 0.2], "Lambda": [2e-07, 1e22]}, 4.5, 2, [4.75, 4.5], 32)
     tuned = {"l1": {"gust": pi}, "pi": {"delay": pi._replace(cost=1 / 3), "gust": pi}}
     path = tmp_path / "made" / "gains.yaml"
@@ -268,7 +268,7 @@ def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tm
         assert set(row["slew"]) == {"elevator", "thrust", "aileron", "rudder"}
 
 
-def test_an_interrupted_tuning_resumes_with_the_missing_laws(
+def test_interrupted_tuning_resumes_with_missing_laws(
     short: Benchmark, brief_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, tuned = tmp_path / "gains.yaml", list[str]()

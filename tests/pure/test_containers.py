@@ -57,7 +57,7 @@ def pins(lock: Path) -> dict[str, tuple[set[str], int]]:
 
 
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.name)
-def test_a_dockerfile_copies_files_of_the_build_context(dockerfile: Path) -> None:
+def test_dockerfile_copies_files_of_build_context(dockerfile: Path) -> None:
     copies = [rest for word, rest in instructions(dockerfile) if word == "COPY" and not rest.startswith("--from=")]
     copied = [source for rest in copies for source in rest.split()[:-1]]
     assert copied
@@ -76,7 +76,7 @@ def test_the_build_context_holds_sources_only() -> None:
 
 
 @pytest.mark.parametrize("dockerfile", DOCKERFILES, ids=lambda path: path.name)
-def test_an_image_is_small_and_its_user_is_not_root(dockerfile: Path) -> None:
+def test_image_is_small_and_user_is_not_root(dockerfile: Path) -> None:
     words = instructions(dockerfile)
     stages = [index for index, (word, _) in enumerate(words) if word == "FROM"]
     assert len(stages) == 2, "one stage to build, one to run"
@@ -93,7 +93,7 @@ def test_both_images_have_the_same_runtime() -> None:
     assert len(DOCKERFILES) == 2
 
 
-def test_the_images_use_the_uv_of_the_makefile() -> None:
+def test_images_use_uv_of_makefile() -> None:
     version = re.search(r"^UV_VERSION := (\S+)", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert version is not None
     for dockerfile in DOCKERFILES:
@@ -115,7 +115,7 @@ def test_the_package_lists_agree() -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_a_service_starts_its_node_with_parameters_that_it_has(name: str) -> None:
+def test_service_starts_node_with_parameters_that_it_has(name: str) -> None:
     executable, arguments, *words = SERVICES[name]["command"]
     assert list(INSTALLED.glob(f"*/lib/*/{executable}"))
     assert executable == name  # also the section of the scenario file
@@ -129,7 +129,7 @@ def test_a_service_starts_its_node_with_parameters_that_it_has(name: str) -> Non
     assert {option for option, _ in options} <= {"--params-file", "-p"}
 
 
-def test_each_documented_container_starts_a_program_that_the_image_has() -> None:
+def test_each_documented_container_starts_program_that_image_has() -> None:
     texts = [path.read_text(encoding="utf-8") for path in (DOCKER / "README.md", ROOT / ".github" / "workflows" / "test.yml")]
     commands = [match[1] for text in texts for match in re.finditer(r"docker run .*?(?<=\s)rise-di ([\w-]+)", text)]
     assert len(commands) > 3
@@ -137,7 +137,7 @@ def test_each_documented_container_starts_a_program_that_the_image_has() -> None
         assert command == "rise-di" or list(INSTALLED.glob(f"*/lib/*/{command}")), command
 
 
-def test_the_services_are_the_nodes_of_a_flight() -> None:
+def test_services_are_nodes_of_flight() -> None:
     assert SERVICES.keys() == {"aircraft", "reference_model", "controller", "recorder"}
     timed = {name for name, service in SERVICES.items() if any("start_time:=" in word for word in service["command"])}
     assert timed == {"aircraft", "reference_model"}  # the nodes with a t = 0
@@ -155,7 +155,7 @@ def test_no_service_has_a_network() -> None:
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_a_service_has_a_health_check_a_grace_period_and_no_restart(name: str) -> None:
+def test_service_has_health_check_grace_period_and_no_restart(name: str) -> None:
     service = SERVICES[name]
     image = dict(instructions(DOCKER / "Dockerfile"))["HEALTHCHECK"]
     command = yaml.safe_load(image[image.index("CMD [") + 4 :])
@@ -165,7 +165,7 @@ def test_a_service_has_a_health_check_a_grace_period_and_no_restart(name: str) -
     assert service["depends_on"] == ([] if name == "recorder" else ["recorder"])  # compose stops them in reverse order
 
 
-def test_only_the_link_of_the_autopilot_is_open() -> None:
+def test_only_link_of_autopilot_is_open() -> None:
     """The agent's topics and the flight's are on one loopback interface, with the stack's own profile."""
     agent, flight = AUTOPILOT["agent"], AUTOPILOT["flight"]
     assert AUTOPILOT.keys() == {"agent", "flight"}
@@ -185,7 +185,7 @@ def test_only_the_link_of_the_autopilot_is_open() -> None:
         assert service["restart"] == "no"
 
 
-def test_the_flight_of_an_autopilot_is_dry_unless_it_is_told_to_send(tmp_path: Path) -> None:
+def test_flight_of_autopilot_is_dry_unless_it_told_to_send(tmp_path: Path) -> None:
     """The command as compose expands it without variables, but for the scenario. It ends at the scenario, which is missing."""
     command = re.sub(r"\$\{SCENARIO:\?[^}]*\}", str(tmp_path / "absent.yaml"), AUTOPILOT["flight"]["command"])
     words = re.sub(r"\$\{\w+:-(.*?)\}", r"\1", command).split()

@@ -72,7 +72,7 @@ EXCHANGE = np.array([[0.0, 1.0], [1.0, 0.0]])
 
 
 @given(matrices())
-def test_the_factors_have_the_structure_that_the_paper_requires(Omega: FloatArray) -> None:
+def test_factors_have_structure_that_paper_requires(Omega: FloatArray) -> None:
     S, D, U = decomposed(Omega)
     assert np.array_equal(S, S.T)
     # A Cholesky factor exists only for positive definite matrices; the shift is the rounding of the entries of S.
@@ -84,7 +84,7 @@ def test_the_factors_have_the_structure_that_the_paper_requires(Omega: FloatArra
 
 @pytest.mark.equation(10, 11)
 @given(matrices())
-def test_the_product_of_the_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
+def test_product_of_factors_is_omega_to_machine_precision(Omega: FloatArray) -> None:
     sdu = decomposed(Omega)
     residual = np.linalg.norm(product(sdu) - Omega)
     # The largest of 20 000 random matrices with up to 6 channels and entries over 6 decades was 1.0; the bound is 10.
@@ -102,7 +102,7 @@ def test_unique_factors_are_recovered_from_their_product(known: SDU) -> None:
 
 
 @given(matrices())
-def test_d_is_the_sign_of_the_ratios_of_leading_minors(Omega: FloatArray) -> None:
+def test_d_is_sign_of_ratios_of_leading_minors(Omega: FloatArray) -> None:
     D = decomposed(Omega).D
     minors = leading_minors(Omega)
     np.testing.assert_array_equal(D, np.sign(minors / np.concatenate([[1.0], minors[:-1]])))
@@ -110,7 +110,7 @@ def test_d_is_the_sign_of_the_ratios_of_leading_minors(Omega: FloatArray) -> Non
 
 
 @given(matrices(), st.data())
-def test_a_sign_change_of_an_input_changes_its_own_d_only(Omega: FloatArray, data: st.DataObject) -> None:
+def test_sign_change_of_input_changes_own_d_only(Omega: FloatArray, data: st.DataObject) -> None:
     D = decomposed(Omega).D
     k = data.draw(st.integers(0, len(Omega) - 1))
     flip = np.where(np.arange(len(Omega)) == k, -1.0, 1.0)
@@ -127,7 +127,7 @@ def test_units_of_inputs_and_outputs_do_not_change_d(Omega: FloatArray, data: st
 
 
 @given(matrices(), st.data())
-def test_coupling_depends_on_neither_units_nor_signs_of_the_inputs(Omega: FloatArray, data: st.DataObject) -> None:
+def test_coupling_depends_on_neither_units_nor_signs_of_inputs(Omega: FloatArray, data: st.DataObject) -> None:
     decomposed(Omega)
     assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
     units = data.draw(arrays(np.float64, len(Omega), elements=st.sampled_from([-57.3, -1.0, 0.01, 1.0, 8.0])))
@@ -136,7 +136,7 @@ def test_coupling_depends_on_neither_units_nor_signs_of_the_inputs(Omega: FloatA
 
 @given(matrices())
 @settings(max_examples=30)  # up to 14 400 orders of five channels
-def test_search_returns_a_pairing_with_identity_d_and_its_u(Omega: FloatArray) -> None:
+def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None:
     pairing = search(Omega)
     assume(pairing is not None)
     assert pairing is not None
@@ -162,7 +162,7 @@ def test_a_diagonal_omega_is_its_own_s() -> None:
 
 
 @pytest.mark.equation(10, 11)
-def test_a_positive_diagonal_does_not_make_d_one() -> None:
+def test_positive_diagonal_does_not_make_d_one() -> None:
     # By hand: L = [[1, 0], [2, 1]], p = (1, -3), W = [[1, 2], [0, 1]]; S = L |p| L', U = D L^-T D W.
     S, D, U = decompose(np.array([[1.0, 2.0], [2.0, 1.0]]))
     np.testing.assert_array_equal(S, [[1.0, 2.0], [2.0, 7.0]])
@@ -170,7 +170,7 @@ def test_a_positive_diagonal_does_not_make_d_one() -> None:
     np.testing.assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
 
 
-def test_a_nonsingular_omega_without_s_d_u_is_refused_with_the_number_of_its_minor() -> None:
+def test_nonsingular_omega_without_s_d_u_refused_with_number_of_minor() -> None:
     with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
         decompose(EXCHANGE)
     assert caught.value.minor == 1
@@ -189,18 +189,18 @@ def test_a_nonsingular_omega_without_s_d_u_is_refused_with_the_number_of_its_min
     ],
 )
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_a_minor_that_is_zero_up_to_rounding_is_refused_in_any_unit(Omega: list[list[float]], minor: int, unit: float) -> None:
+def test_minor_that_is_zero_up_to_rounding_refused_in_any_unit(Omega: list[list[float]], minor: int, unit: float) -> None:
     units = unit ** np.arange(len(Omega))
     with pytest.raises(DecompositionError) as caught:
         signs(units[:, None] * np.array(Omega) / units[::-1])
     assert caught.value.minor == minor
 
 
-def test_a_minor_that_is_small_only_in_its_units_is_accepted() -> None:
+def test_minor_that_is_small_only_in_units_accepted() -> None:
     np.testing.assert_array_equal(signs(np.diag([1e-200, 1e200])), [1.0, 1.0])
 
 
-def test_a_minor_of_one_part_in_a_million_still_has_a_sign() -> None:
+def test_minor_of_one_part_in_million_still_has_sign() -> None:
     # Published derivatives have two to five digits: a difference in the sixth digit must be accepted.
     np.testing.assert_array_equal(signs(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])), [1.0, -1.0])
 
@@ -215,7 +215,7 @@ def test_a_minor_of_one_part_in_a_million_still_has_a_sign() -> None:
         (np.array([[1.0, 0.0], [0.0, math.inf]]), r"Omega: found .*inf.*, expected finite values"),
     ],
 )
-def test_a_matrix_that_is_not_square_or_not_finite_is_refused(Omega: FloatArray, sentence: str) -> None:
+def test_matrix_that_is_not_square_or_not_finite_refused(Omega: FloatArray, sentence: str) -> None:
     for function in (decompose, signs, leading_minors, unit_diagonal, coupling, search):
         with pytest.raises(DecompositionError, match=sentence):
             function(Omega)
@@ -225,7 +225,7 @@ def test_leading_minors_may_be_zero() -> None:
     np.testing.assert_array_equal(leading_minors(EXCHANGE), [0.0, -1.0])
 
 
-def test_the_osprey_has_identity_d_and_little_coupling() -> None:
+def test_osprey_has_identity_d_and_little_coupling() -> None:
     # Channels q, V, p, r and elevator, thrust, aileron, rudder, with the signs of the airframe file.
     np.testing.assert_array_equal(signs(OSPREY), [1.0, 1.0, 1.0, 1.0])
     assert coupling(OSPREY) == pytest.approx(0.058, abs=5e-4)
@@ -237,14 +237,14 @@ def test_textbook_elevator_sign_flips_the_first_d() -> None:
     assert pairing_of(trailing_edge_down).signs == (-1, 1, 1, 1)
 
 
-def test_rudder_paired_with_roll_rate_flips_a_d_and_makes_u_large() -> None:
+def test_rudder_paired_with_roll_rate_flips_d_and_makes_u_large() -> None:
     _, D, U = decompose(SWAPPED)
     np.testing.assert_array_equal(D, [1.0, 1.0, -1.0, 1.0])
     # By hand, on the block [[-0.02, 1.5], [0.17, -0.09]]: W_12 = -75, L_21 = -8.5, U_12 = W_12 + L_21.
     assert U[2, 3] == pytest.approx(-83.5, abs=1e-9)
 
 
-def test_search_keeps_a_bad_pairing_unless_u_is_limited() -> None:
+def test_search_keeps_bad_pairing_unless_u_limited() -> None:
     sign_change = pairing_of(SWAPPED)
     assert sign_change.inputs == (0, 1, 2, 3)
     assert sign_change.signs == (1, 1, -1, 1)
@@ -253,12 +253,12 @@ def test_search_keeps_a_bad_pairing_unless_u_is_limited() -> None:
     assert float(np.max(np.abs(re_paired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
 
 
-def test_search_changes_the_pairing_where_sign_changes_do_not_suffice() -> None:
+def test_search_changes_pairing_where_sign_changes_do_not_suffice() -> None:
     assert pairing_of(EXCHANGE)[:3] == ((0, 1), (1, 0), (1, 1))
 
 
 @pytest.mark.parametrize(("near", "far", "inputs"), [(1.0, 0.1, (1, 2, 0)), (0.1, 1.0, (2, 0, 1))])
-def test_search_prefers_the_smaller_u_among_equal_changes(near: float, far: float, inputs: tuple[int, ...]) -> None:
+def test_search_prefers_smaller_u_among_equal_changes(near: float, far: float, inputs: tuple[int, ...]) -> None:
     # No output responds to its own input, so the pairing of all three changes in one of two ways.
     pairing = pairing_of(np.array([[0.0, near, far], [far, 0.0, near], [near, far, 0.0]]))
     assert pairing.inputs == inputs
@@ -269,13 +269,13 @@ def test_search_finds_nothing_for_a_singular_omega() -> None:
     assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
 
 
-def test_coupling_is_infinite_where_an_output_does_not_respond_to_its_own_input() -> None:
+def test_coupling_is_infinite_where_output_does_not_respond_to_own_input() -> None:
     assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
     with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
         unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))
 
 
-def test_an_uncertainty_of_50_percent_per_entry_does_not_change_d_of_the_osprey() -> None:
+def test_uncertainty_of_50_percent_per_entry_does_not_change_d_of_osprey() -> None:
     generator = np.random.default_rng(20101)
     for _ in range(1000):  # also none in 5000; with 90 % 2 to 4 in 10 000
         np.testing.assert_array_equal(signs(OSPREY * generator.uniform(0.5, 1.5, (4, 4))), np.ones(4))

@@ -38,7 +38,7 @@ def aircraft(**section: Any) -> Aircraft:
 
 
 @given(H=st.floats(9.144, 106.68), peak=st.floats(-17.07, 17.07))  # 30 to 350 ft and U_ref at sea level, CS-25.341
-def test_a_gust_has_the_peak_and_the_length_of_the_formula(H: float, peak: float) -> None:
+def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
     gust = single(Gusts, 40.0, peak, H)
 
     def w(s: float) -> float:
@@ -49,7 +49,7 @@ def test_a_gust_has_the_peak_and_the_length_of_the_formula(H: float, peak: float
     assert speeds == pytest.approx([0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
 
 
-def test_wind_along_an_axis_changes_the_relative_velocity() -> None:
+def test_wind_along_axis_changes_relative_velocity() -> None:
     # x_rel = x - w gives minus the column of V, of beta = v / V0 and, published to three digits, of alpha = w / V0.
     osprey = load_airframe("osprey")
     A = osprey.matrix_a()
@@ -59,14 +59,14 @@ def test_wind_along_an_axis_changes_the_relative_velocity() -> None:
     assert set(osprey.gusts) == set(AXES)
 
 
-def test_a_bias_rises_along_half_a_cosine_and_stays() -> None:
+def test_bias_rises_along_half_cosine_and_stays() -> None:
     params = single(Bias, 2.0, 0.3, 4.0)
     at = [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 3.0, 4.0, 5.0, 6.0, 60.0)]
     # 0.15 (1 - cos(pi s)) at s = 0, 1/4, 1/2, 3/4, 1
     assert at == pytest.approx([0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3], abs=1e-15)
 
 
-def test_a_bias_without_a_rise_is_a_step() -> None:
+def test_bias_without_rise_is_step() -> None:
     params = single(Bias, 2.0, 0.3, 0.0)
     assert [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 2.0 + 1e-9, 9.0)] == [0.0, 0.0, 0.3, 0.3]
 
@@ -77,7 +77,7 @@ def test_a_sine_follows_its_formula() -> None:
     assert values == pytest.approx([0.2 * math.sin(0.5), 0.2 * math.sin(5.6)])
 
 
-def test_biases_and_sines_act_on_the_state_they_name() -> None:
+def test_biases_and_sines_act_on_state_they_name() -> None:
     params = aircraft(
         bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
         sines={"r": {"amplitude": 0.1, "frequency": 2.0}, "q": {"amplitude": 0.2, "frequency": 1.0, "phase": 1.0}},
@@ -102,7 +102,7 @@ SMOOTH: dict[str, tuple[Disturbance, float, float]] = {  # the function, its lar
 
 @pytest.mark.equation("Assumption 2")
 @pytest.mark.parametrize("name", SMOOTH)
-def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None:
+def test_gusts_sines_and_biases_with_rise_meet_assumption_2(name: str) -> None:
     # A derivative bounded by d1 that changes by at most d2 dt in dt is continuous. Below 2 ms second differences are rounding.
     value, first, second = SMOOTH[name]
     for dt in (0.02, 0.002):
@@ -113,7 +113,7 @@ def test_gusts_sines_and_biases_with_a_rise_meet_assumption_2(name: str) -> None
 
 
 @pytest.mark.equation("Assumption 2")
-def test_a_bias_without_a_rise_lies_outside_assumption_2() -> None:
+def test_bias_without_rise_lies_outside_assumption_2() -> None:
     # The largest difference does not fall with dt, so the derivative is unbounded.
     step = single(Bias, 2.0, 10.0, 0.0)
     assert [np.abs(np.diff(bias(np.arange(0.0, 5.0, dt), step))).max() for dt in (0.02, 0.002, 0.0002)] == [10.0] * 3
@@ -142,14 +142,14 @@ def largest(disturbed: dict[str, Any], rate: float, scenario: Scenario) -> Float
 
 
 @pytest.mark.parametrize("name", INSIDE)
-def test_inside_assumption_2_the_error_falls_with_the_square_of_the_period(name: str, osprey_gust: Scenario) -> None:
+def test_inside_assumption_2_error_falls_with_square_of_period(name: str, osprey_gust: Scenario) -> None:
     # Measured in q at 100 and 200 Hz: 1.00 and 0.25 mrad/s with the sine, 1.56 and 0.39 with the bias.
     coarse, fine = (largest(INSIDE[name], rate, osprey_gust)[0] for rate in (100.0, 200.0))
     assert coarse / fine == pytest.approx(4.0, rel=0.05)
 
 
 @pytest.mark.parametrize(("name", "channel"), [("step", 0), ("turbulence", 1)])
-def test_outside_assumption_2_a_shorter_period_does_not_help(name: str, channel: int, osprey_gust: Scenario) -> None:
+def test_outside_assumption_2_shorter_period_does_not_help(name: str, channel: int, osprey_gust: Scenario) -> None:
     # Measured at 100 and 200 Hz: 35.3 and 32.6 mrad/s in q with the step, 63 and 61 in r in light turbulence at 100 m.
     coarse, fine = (largest(OUTSIDE[name], rate, osprey_gust)[channel] for rate in (100.0, 200.0))
     assert coarse / fine < 1.2

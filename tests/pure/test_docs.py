@@ -114,7 +114,7 @@ def test_the_readme_links_the_main_pages() -> None:
     assert {f"docs/{page}.md" for page in LINKED} <= set(links(REPOSITORY / "README.md"))
 
 
-def test_sources_tests_and_pages_use_the_words_of_the_field() -> None:
+def test_sources_tests_and_pages_use_words_of_field() -> None:
     files = [path for folder in FOLDERS for path in sorted((REPOSITORY / folder).rglob("*")) if path.suffix in TEXTS]
     files += [REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "Makefile", "pyproject.toml")]
     occurrences = [

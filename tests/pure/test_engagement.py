@@ -157,7 +157,7 @@ def undisturbed() -> list[Tick]:
     return fly(lambda k: Conditions())
 
 
-def test_the_loop_of_these_tests_equals_the_simulation_to_the_last_bit() -> None:
+def test_loop_of_these_tests_equals_simulation_to_last_bit() -> None:
     u = simulate(SERVO.vary(flight={"duration": 3.0}))["u"]
     assert np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes() == u.values.tobytes()
 
@@ -235,7 +235,7 @@ def upset(*, latched: bool) -> tuple[FloatArray, FloatArray]:
     return np.array([tick.error for tick in records]), np.array([tick.after.u for tick in records])
 
 
-def test_engagement_with_an_error_commands_zero_at_the_first_tick() -> None:
+def test_engagement_with_error_commands_zero_at_first_tick() -> None:
     # Measured at the second tick, 10 ms later, of elevator, aileron, rudder, thrust: 0.06, 0.02, 0.49 deg, 0.8 %; without
     # latching 1.9, 2.4, 5.8 deg and the limit of 50 %. The prototype: 2.55, 2.7, 7.1 deg, 100 %.
     _, u = upset(latched=True)
@@ -260,7 +260,7 @@ def test_latching_e_0_reduces_overshoot_and_peak_command() -> None:
     assert (peak[True] < 0.7 * peak[False]).all()
 
 
-def test_the_error_goes_to_zero_with_and_without_latching() -> None:
+def test_error_goes_to_zero_with_and_without_latching() -> None:
     # Latching is slower: measured 0.23 s to 5 % of e(0) in q, 0.07 s without. After 6 s at most a hundredth is left.
     e, without = upset(latched=True)[0], upset(latched=False)[0]
     assert int(np.argmax(np.abs(e[:, 0]) < 0.05 * e[0, 0])) in range(15, 30)

@@ -50,18 +50,18 @@ def flight(**changes: Any) -> Scenario:
     return replace(calm, controller=controller(**changes))
 
 
-def test_a_live_page_offers_no_gains_of_a_timetable() -> None:
+def test_live_page_offers_no_gains_of_timetable() -> None:
     assert gains_of(controller()) == {}
 
 
-def test_only_one_input_is_excited_at_a_time_and_none_in_a_pause() -> None:
+def test_only_one_input_excited_at_time_and_none_in_pause() -> None:
     active = excited(controller()) != 0.0
     assert active.sum(axis=1).max() == 1
     assert not active[: round(1.5 / DT)].any()
     assert not active[-round(1.4 / DT) :].any()
 
 
-def test_the_excitation_lasts_as_long_as_the_parameters_say() -> None:
+def test_excitation_lasts_as_long_as_parameters_say() -> None:
     # a pause, then for each input 8 widths, a period and a pause: 1.5 + 3 (2 + 6 + 1.5) + 8 + 10 + 1.5
     assert controller().duration == pytest.approx(49.5)
 
@@ -74,7 +74,7 @@ def test_doublets_and_multisine_have_no_mean() -> None:
     assert np.cumsum(doublets).sum() * DT**2 == pytest.approx((1.0 - 4.0) * 0.25**2, rel=0.02)
 
 
-def test_a_multisine_has_its_band_alone_and_a_low_peak() -> None:
+def test_multisine_has_band_alone_and_low_peak() -> None:
     # Schroeder's phases keep the crest factor of a flat band near 1.7; that of cosines in phase would be sqrt(2 h) = 5.8.
     harmonic, phase, part = multisine(6.0, 0.3, 3.0)
     assert harmonic[0] / 6.0 == pytest.approx(0.3, abs=1.0 / 12.0)
@@ -89,7 +89,7 @@ def test_a_multisine_has_its_band_alone_and_a_low_peak() -> None:
     assert outside.max() < 1e-9
 
 
-def test_a_flight_commands_the_timetable_whatever_y_does() -> None:
+def test_flight_commands_timetable_whatever_y_does() -> None:
     tape = simulate(flight())
     u, params = tape["u"], controller().law_params()
     t = (u.stamp_ns - u.stamp_ns[0]) * 1e-9
@@ -121,7 +121,7 @@ def test_limits_act_on_the_excitation() -> None:
         ),
     ],
 )
-def test_a_timetable_that_cannot_be_flown_is_refused(changes: dict[str, Any], sentence: str) -> None:
+def test_timetable_that_cannot_be_flown_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError) as error:
         controller(**changes)
     assert str(error.value).startswith(sentence)

@@ -28,7 +28,7 @@ def flight(osprey_gust: Scenario) -> RecordedFlight:
     return RecordedFlight("run", scenario, tape, summarise(scenario, tape, tape.outcome))
 
 
-def test_the_table_has_a_row_per_instant_and_null_without_a_sample() -> None:
+def test_table_has_row_per_instant_and_null_without_sample() -> None:
     y = Signal(np.array([EPOCH, EPOCH + 1, EPOCH + 2]), ("q", "V"), np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]))
     u = Signal(np.array([EPOCH + 1, EPOCH + 3, EPOCH + 3]), ("thrust",), np.array([[0.5], [0.25], [0.75]]))
     assert data_frame(Tape({"y": y, "u": u}, EPOCH)).to_dict(as_series=False) == {
@@ -40,7 +40,7 @@ def test_the_table_has_a_row_per_instant_and_null_without_a_sample() -> None:
     }
 
 
-def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_csv_and_parquet_hold_every_sample_to_last_bit(flight: RecordedFlight, tmp_path: Path) -> None:
     write_csv(tmp_path / "run.csv", [flight])
     write_parquet(tmp_path / "run.parquet", [flight])
     with (tmp_path / "run.csv").open(newline="", encoding="utf-8") as stream:
@@ -54,7 +54,7 @@ def test_csv_and_parquet_hold_every_sample_to_the_last_bit(flight: RecordedFligh
     assert [row["u.thrust"] != "" for row in rows[:11]] == [True, *[False] * 4, True, *[False] * 4, True]  # 100 Hz of 500
 
 
-def test_the_table_of_several_flights_has_a_column_run(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_table_of_several_flights_has_column_run(flight: RecordedFlight, tmp_path: Path) -> None:
     bare = flight._replace(name="bare", tape=Tape({"y": flight.tape["y"], "y_m": flight.tape["y_m"]}))
     write_parquet(tmp_path / "both.parquet", [flight, bare])
     both = pl.read_parquet(tmp_path / "both.parquet")

@@ -49,7 +49,7 @@ def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
     ],
     ids=["stuck", "lost", "gust"],
 )
-def test_a_fault_that_begins_now_is_one_that_was_scheduled(name: str, now: dict[str, Any], scheduled: dict[str, Any]) -> None:
+def test_fault_that_begins_now_is_one_that_was_scheduled(name: str, now: dict[str, Any], scheduled: dict[str, Any]) -> None:
     scenario = find_scenario(name).vary(aircraft={"gusts": {}, "rate": 500.0, "step": 0.002})
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
@@ -67,7 +67,7 @@ def test_sensor_errors_begin_and_end_between_two_samples(osprey_gust: Scenario) 
     assert 0.4 < lost[CHANGE:].mean() < 0.6  # 199 draws: 0.1 is 2.8 standard deviations
 
 
-def test_a_gust_changes_neither_the_past_nor_a_gust_that_acts(osprey_gust: Scenario) -> None:
+def test_gust_changes_neither_past_nor_gust_that_acts(osprey_gust: Scenario) -> None:
     scenario = osprey_gust.vary(aircraft={"gusts": {"vertical": GUST | {"start": 0.3}}})
     with pytest.raises(ParameterError, match=r"gusts\.lateral\.start: found 0\.1 s, expected at least t = 0\.4 s"):
         flown(scenario.aircraft, varied(scenario, gusts={"lateral": GUST | {"start": 0.1}}))

@@ -38,7 +38,7 @@ def number(sentence: str) -> float:
     return float(found[1])
 
 
-def test_a_route_within_all_limits_gives_its_legs() -> None:
+def test_route_within_all_limits_gives_legs() -> None:
     first, fillet, second, orbit = flyable_legs(CORNER, RADIUS, PERIOD, CAN)
     assert (type(first), type(fillet), type(second), type(orbit)) == (Line, Arc, Line, Arc)
     assert first.end == pytest.approx((3000.0 - RADIUS, 0.0))
@@ -49,14 +49,14 @@ def test_a_speed_lasts_until_the_next_one() -> None:
     assert speeds(route, 40.0) == (40.0, 45.0, 45.0, 35.0)
 
 
-def test_a_radius_too_small_for_the_wind_is_refused() -> None:
+def test_radius_too_small_for_wind_refused() -> None:
     sentence = refusal(CORNER, radius=400.0)
     assert sentence == "guidance.radius: found 400 m, expected at least 573 m at this speed, wind and bank"
     assert flyable_legs(CORNER, number(sentence), PERIOD, CAN)
     assert flyable_legs(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
 
 
-def test_at_low_speed_the_stall_limits_the_bank_and_with_it_the_radius() -> None:
+def test_at_low_speed_stall_limits_bank_and_with_it_radius() -> None:
     # V = 29: acos((27.5 / 29)^2) = 25.95 deg, below the 30 of the parameters, so 39^2 / (g tan(20.76 deg)) = 409.1.
     assert number(refusal(CORNER, radius=300.0, speed=29.0)) == 410.0
 
@@ -75,7 +75,7 @@ def test_a_speed_below_the_floor_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
-def test_an_altitude_beyond_the_climb_to_the_next_point_is_refused(altitude: float, side: str, rate: float) -> None:
+def test_altitude_beyond_climb_to_next_point_refused(altitude: float, side: str, rate: float) -> None:
     route = (CORNER[0], CORNER[1]._replace(altitude=altitude), CORNER[2]._replace(altitude=altitude))
     sentence = refusal(route)
     reach = math.floor(rate * (3000.0 - RADIUS) / 50.0)  # the straight part, with the wind from behind
@@ -88,7 +88,7 @@ def test_an_altitude_beyond_the_climb_to_the_next_point_is_refused(altitude: flo
     )
 
 
-def test_of_the_routes_of_the_tutorial_one_is_flown_and_one_is_refused_with_the_sentence_shown(tmp_path: Path) -> None:
+def test_of_routes_of_tutorial_one_flown_and_one_refused_with_sentence_shown(tmp_path: Path) -> None:
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
@@ -102,7 +102,7 @@ def test_of_the_routes_of_the_tutorial_one_is_flown_and_one_is_refused_with_the_
     assert f"error: guidance.{refused.value}\n" in page
 
 
-def test_a_route_file_replaces_the_program_of_targets() -> None:
+def test_route_file_replaces_program_of_targets() -> None:
     turns = find_scenario("osprey_route").vary(guidance={"program": {"heading": {"start": [2.0], "value": [1.0]}}})
     flown = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
     assert flown is not None
@@ -110,7 +110,7 @@ def test_a_route_file_replaces_the_program_of_targets() -> None:
     assert [one.speed for one in flown.waypoints()] == [25.0, 26.0]
 
 
-def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused() -> None:
+def test_leg_too_short_for_fillets_and_route_of_one_waypoint_refused() -> None:
     short = (*CORNER, Waypoint(3500, 3000, 1000))
     assert refusal(short) == "route[3]: found 500 m from the waypoint before, expected more than 580 m, for fillets of 580 m"
     assert refusal(CORNER[:1]) == "route: found 1 waypoints, expected two or more"
@@ -126,7 +126,7 @@ def test_a_leg_too_short_for_its_fillets_and_a_route_of_one_waypoint_are_refused
         ((Waypoint(-1e308, 0, 0), Waypoint(1e308, 0, 0)), "route[0]: found north -1e+308, east 0, altitude 0 m, expected"),
     ],
 )
-def test_what_any_message_may_hold_is_refused_as_a_route(waypoints: tuple[Waypoint, ...], sentence: str) -> None:
+def test_what_any_message_may_hold_refused_as_route(waypoints: tuple[Waypoint, ...], sentence: str) -> None:
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
     with pytest.raises(ParameterError) as refused:

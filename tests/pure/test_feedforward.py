@@ -114,7 +114,7 @@ def test_one_tick_gives_the_hand_worked_numbers() -> None:
     assert added.tolist() == [0.0]
 
 
-def test_the_input_is_extrapolated_linearly_from_the_last_two() -> None:
+def test_input_extrapolated_linearly_from_last_two() -> None:
     # The middles of ticks of 0.1 and 0.2 s are 0.15 s apart; from the last middle it is 0.1 s to the tick plus 0.05 s of lead.
     nominal = BY_HAND._replace(lead=np.array([0.05]))
     first, _ = feedforward.step(feedforward.initial_state(np.zeros(1), nominal), np.array([0.1]), np.array(0.1), nominal)
@@ -122,7 +122,7 @@ def test_the_input_is_extrapolated_linearly_from_the_last_two() -> None:
     assert second.u_0 == pytest.approx(second.u + 0.15 * (second.u - first.u) / 0.15)
 
 
-def test_zero_dynamics_are_the_zeros_of_the_model() -> None:
+def test_zero_dynamics_are_zeros_of_model() -> None:
     # With y = x_1 at 0, x_2_dot = -3 x_2; in the small aircraft c_dot = -2 c and d_dot = 0
     assert feedforward.zero_dynamics(BY_HAND) == pytest.approx([-3.0])
     assert sorted(feedforward.zero_dynamics(nominal_of(small_aircraft())).real) == pytest.approx([-2.0, 0.0])
@@ -135,7 +135,7 @@ def test_the_feedforward_does_not_depend_on_y() -> None:
     assert (tracking[-1].u != oscillating[-1].u).all()
 
 
-def test_on_the_nominal_plant_the_feedforward_alone_leaves_the_sampling_error() -> None:
+def test_on_nominal_plant_feedforward_alone_leaves_sampling_error() -> None:
     # K = 1.02 and beta = 1e-9 alone leave an error of 1.6. With the feedforward it is 1.0e-3, the error of the linear
     # extrapolation, which is of second order in the period: 3.5 to 4.5 differs from first order (2) and third order (8).
     coarse, fine = largest_error(small_aircraft(100.0)), largest_error(small_aircraft(200.0))
@@ -187,7 +187,7 @@ def recomputed(params: ControllerConfig, tape: Tape) -> tuple[FloatArray, FloatA
 
 
 @pytest.mark.parametrize("enabled", [False, True])
-def test_u_is_recomputed_from_the_log_to_the_last_bit(enabled: bool) -> None:
+def test_u_recomputed_from_log_to_last_bit(enabled: bool) -> None:
     # Without feedforward the loop above is the law inside its limits only: the feedforward that is off changes no bit.
     scenario = both(short(flight={"duration": 3.0}))[enabled]
     tape = simulate(scenario)
@@ -212,7 +212,7 @@ def ticks(
     return states
 
 
-def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
+def test_engagement_and_re_engagement_during_manoeuvre_bumpless() -> None:
     states = ticks(small_aircraft(), reference, missing=(0.8, 1.2))
     modes = [state.mode for state in states]
     engaged = [0, modes.index(Mode.ENGAGED, modes.index(Mode.HOLD))]
@@ -230,7 +230,7 @@ def test_engagement_and_re_engagement_during_a_manoeuvre_are_bumpless() -> None:
         assert np.abs(whole).max() > 0.5
 
 
-def test_new_gains_change_neither_the_feedforward_nor_the_input() -> None:
+def test_new_gains_change_neither_feedforward_nor_input() -> None:
     old = small_aircraft()
     values = old.model_dump() | {"k_g": 5.0, "Lambda": (2.0, 2.0), "delay": 0.02}
     new = AnyLaw.validate_mapping(values, "controller")
@@ -273,14 +273,14 @@ def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentenc
         small_aircraft(**change)
 
 
-def test_a_model_without_hidden_states_or_gravity_is_accepted() -> None:
+def test_model_without_hidden_states_or_gravity_accepted() -> None:
     square: dict[str, Any] = {"states": ("b", "a"), "A": (0.0,) * 4, "B": (0.3, -1.0, 2.0, 0.4), "gravity": None}
     nominal = nominal_of(small_aircraft(**square))
     assert len(feedforward.zero_dynamics(nominal)) == 0
     assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
 
 
-def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_reads_back(tmp_path: Path) -> None:
+def test_gains_command_writes_nominal_model_on_request_and_section_reads_back(tmp_path: Path) -> None:
     path, scenario = tmp_path / "gains.yaml", tmp_path / "short.yaml"
     scenario.write_text(SERVO.path.read_text(encoding="utf-8").replace("duration: 60.0", "duration: 3.0"), encoding="utf-8")
     arguments = ["gains", "osprey", "--scenario", str(scenario), "--samples", "1", "--write", str(path)]
@@ -300,7 +300,7 @@ def test_the_gains_command_writes_the_nominal_model_on_request_and_the_section_r
         with_feedforward(other, load_airframe("osprey"))
 
 
-def test_beta_has_to_exceed_only_the_slew_that_the_feedforward_leaves() -> None:
+def test_beta_has_to_exceed_only_slew_that_feedforward_leaves() -> None:
     # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30 % in calm air the mean
     # remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust, aileron and rudder; the test allows half.
     airframe = load_airframe("osprey")
@@ -334,7 +334,7 @@ def scores() -> dict[str, FloatArray]:
     return {name: np.column_stack([of(one, level, n) for one in both(base)]) for name, (base, level, n) in sets.items()}
 
 
-def test_the_feedforward_reduces_the_error_of_the_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:
+def test_feedforward_reduces_error_of_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:
     # Measured: 1.98 -> 0.22 in calm air, where noise remains, and 5.29 -> 4.52 in 12 s with two gusts, which the model does
     # not include. The margin is half of each improvement.
     assert scores["calm"][0, 1] < 0.55 * scores["calm"][0, 0]
@@ -342,7 +342,7 @@ def test_the_feedforward_reduces_the_error_of_the_nominal_osprey_with_servos(sco
 
 
 @pytest.mark.parametrize("level", ["+-0.3", "+-0.5"])
-def test_the_feedforward_reduces_the_error_of_uncertain_aircraft(scores: dict[str, FloatArray], level: str) -> None:
+def test_feedforward_reduces_error_of_uncertain_aircraft(scores: dict[str, FloatArray], level: str) -> None:
     # Measured: all 16 scores fall, by 12 % in the mean at +-30 % and by 9 % at +-50 %. The margin is half of that.
     without, enabled = scores[level].T
     assert (enabled < without).all()

@@ -50,7 +50,7 @@ PAIRS = [(kind_of(one(Field)), pydantic.TypeAdapter(one(pydantic.Field), config=
 @given(value=VALUES)
 @example(value=(1, 2.0))
 @example(value=10**400)
-def test_a_field_takes_what_strict_pydantic_takes_and_holds_the_same(
+def test_field_takes_what_strict_pydantic_takes_and_holds_same(
     kind: Kind, adapter: pydantic.TypeAdapter[Any], value: object
 ) -> None:
     problems = Problems()
@@ -96,13 +96,13 @@ class Outer(Config):
         ({"inner": {"a": 2.0}, 3: 2}, "set: found the key 3, expected a name"),
     ],
 )
-def test_the_sentence_names_the_key_what_was_found_and_what_is_expected(values: dict[Any, Any], sentence: str) -> None:
+def test_sentence_names_key_what_was_found_and_what_expected(values: dict[Any, Any], sentence: str) -> None:
     with pytest.raises(ParameterError) as refused:
         Outer.validate_mapping(values, "set")
     assert str(refused.value) == sentence
 
 
-def test_a_set_is_frozen_and_comes_back_from_its_dump_and_its_json() -> None:
+def test_set_is_frozen_and_comes_back_from_dump_and_json() -> None:
     made = Outer(inner=Inner(a=2.0, b={"c": (1, 2)}))
     with pytest.raises(AttributeError, match="found an assignment"):
         made.scale = 3.0  # type: ignore[misc]
@@ -117,7 +117,7 @@ def test_a_set_is_frozen_and_comes_back_from_its_dump_and_its_json() -> None:
 
 
 @pytest.mark.parametrize("annotation", [Annotated[str, Field(gt=0)], Annotated[float, Field(min_length=1)], list[int], complex])
-def test_a_rule_or_a_type_that_no_parameter_has_is_an_error_of_the_declaration(annotation: Any) -> None:
+def test_rule_or_type_that_no_parameter_has_is_error_of_declaration(annotation: Any) -> None:
     with pytest.raises(TypeError):
         kind_of(annotation)
 

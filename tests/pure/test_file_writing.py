@@ -162,7 +162,7 @@ def test_report_of_read_only_archive_goes_to_output(run: Path, tmp_path: Path, c
         report([run, run], output=tmp_path / "pages")
 
 
-def test_scenario_is_parsed_before_any_file_is_written(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scenario_parsed_before_any_file_written(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("osprey_gust.yaml", SUMMARY, REPORT):
         (run / name).unlink(missing_ok=True)
     log = next(run.glob("*.mcap"))

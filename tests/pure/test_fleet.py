@@ -105,7 +105,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", VARIATIONS)
-def test_each_aircraft_of_a_fleet_flies_as_in_the_single_process_simulation(name: str) -> None:
+def test_each_aircraft_of_fleet_flies_as_in_single_process_simulation(name: str) -> None:
     # A fleet holds the nonlinear remainder over a tick and the wind over a step of the integration (2 ms); the simulation
     # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
     # next step, after which u differs: 2e-2.
@@ -118,7 +118,7 @@ def test_each_aircraft_of_a_fleet_flies_as_in_the_single_process_simulation(name
     assert not np.asarray(together.diverged).any()
 
 
-def test_every_aircraft_can_have_its_own_gains_wind_and_delay() -> None:
+def test_every_aircraft_can_have_own_gains_wind_and_delay() -> None:
     A, B = sampled(0.3, 5, 1)
     wind, late = np.array([1.0, 0.0, 1.0, 1.0]), np.array([0, 0, 2, 0])
     beta = PARAMS.beta * np.array([1.0, 1.0, 1.0, 0.5])
@@ -139,7 +139,7 @@ class Ticks(NamedTuple):
     count: Array
 
 
-def test_the_wind_acts_on_x_dot_by_the_own_directions_of_each_aircraft() -> None:
+def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
     course, plant = build_course(SERVO), SERVO.aircraft.plant()
     A, B = sampled(0.3, 5, 2)
     directions = gust_directions(load_airframe("osprey"), A, "air_relative")
@@ -167,7 +167,7 @@ def _pulse(delay: int) -> ControlLaw:
     return campaign_law(Ticks, engage, limited)
 
 
-def test_a_late_u_acts_that_many_ticks_later() -> None:
+def test_late_u_acts_that_many_ticks_later() -> None:
     undisturbed = SERVO.vary(aircraft={"gusts": {}}, flight={"duration": 2.0})
     late = fly(undisturbed, *sampled(0.0, 1, 1), late=3, control_law=_pulse(0), params=())
     later = fly(undisturbed, *sampled(0.0, 1, 1), control_law=_pulse(3), params=())
@@ -176,7 +176,7 @@ def test_a_late_u_acts_that_many_ticks_later() -> None:
     assert np.asarray(late.max)[0, 0] > 0.01  # it did move
 
 
-def test_an_aircraft_that_diverges_is_marked_and_does_not_affect_the_others() -> None:
+def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
     course, vehicle = build_course(SERVO), fleet.vehicle(SERVO)
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
@@ -197,6 +197,6 @@ def test_an_aircraft_that_diverges_is_marked_and_does_not_affect_the_others() ->
         (find_scenario("jsbsim_c172p"), "airframe: found jsbsim:c172p, expected an airframe with matrices"),
     ],
 )
-def test_a_scenario_that_a_fleet_cannot_fly_is_refused(scenario: Scenario, sentence: str) -> None:
+def test_scenario_that_fleet_cannot_fly_refused(scenario: Scenario, sentence: str) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         build_course(scenario)

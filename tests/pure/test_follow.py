@@ -42,9 +42,7 @@ def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], Float
 
 
 @pytest.mark.parametrize("piece", [997, 65_536, 10_000_000])
-def test_a_log_that_grows_in_pieces_gives_what_the_whole_log_holds(
-    piece: int, recorded: Path, tape: Tape, tmp_path: Path
-) -> None:
+def test_log_that_grows_in_pieces_gives_what_whole_log_holds(piece: int, recorded: Path, tape: Tape, tmp_path: Path) -> None:
     content = (recorded / "run_0.mcap").read_bytes()
     follower = Follower(tmp_path, all_of)
     assert list(follower.read()) == []  # the recorder has not begun
@@ -69,7 +67,7 @@ def test_an_iteration_that_is_left_is_continued(recorded: Path) -> None:
     assert [next(iter(follower.read())) for _ in whole] == whole
 
 
-def test_a_topic_is_thinned_to_its_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
+def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
     follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)  # y is sent at 500 Hz
     stamps, _ = vectors([one for one in follower.read() if isinstance(one, Messages)], "/y")
     assert stamps.tolist() == tape["y"].stamp_ns[::5].tolist()
@@ -77,7 +75,7 @@ def test_a_topic_is_thinned_to_its_rate_at_even_distances(recorded: Path, tape: 
 
 
 @pytest.mark.parametrize("options", [{"index_types": IndexType.NONE}, {"use_chunking": False}])
-def test_logs_without_message_indexes_or_chunks_are_read(options: dict[str, object], tmp_path: Path) -> None:
+def test_logs_without_message_indexes_or_chunks_read(options: dict[str, object], tmp_path: Path) -> None:
     path, sent = tmp_path / "foreign.mcap", [vector(k, ["q"], [k / 7.0]) for k in range(50)]
     writer = Writer(str(path), chunk_size=2000, **options)  # type: ignore[arg-type]
     writer.start(profile="ros2", library="test")
@@ -90,7 +88,7 @@ def test_logs_without_message_indexes_or_chunks_are_read(options: dict[str, obje
     assert [next(iter(follower.read())) for _ in whole] == whole  # an iteration that is left is continued here, too
 
 
-def test_all_files_of_a_split_bag_are_read_in_order(tmp_path: Path) -> None:
+def test_all_files_of_split_bag_read_in_order(tmp_path: Path) -> None:
     run = tmp_path / "split"
     with RosbagsWriter(run, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/y", JOINT_STATE, typestore=STORE)
@@ -107,14 +105,14 @@ def test_all_files_of_a_split_bag_are_read_in_order(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
-def test_a_hostile_log_ends_without_an_exception_and_without_much_memory(case: Path) -> None:
+def test_hostile_log_ends_without_exception_and_without_much_memory(case: Path) -> None:
     follower = Follower(case, all_of)
     for one in follower.read():
         assert not isinstance(one, Messages) or sum(map(len, one.data)) < 1 << 25
     assert list(follower.read()) == []
 
 
-def test_an_endless_record_is_a_fault_and_a_chunk_in_progress_is_awaited(recorded: Path, tmp_path: Path) -> None:
+def test_endless_record_is_fault_and_chunk_in_progress_awaited(recorded: Path, tmp_path: Path) -> None:
     path = tmp_path / "endless.mcap"
     path.write_bytes(MCAP0_MAGIC + RECORD.pack(Opcode.CHUNK, 1 << 60) + bytes(100))
     follower = Follower(path, all_of)
@@ -130,7 +128,7 @@ def test_an_endless_record_is_a_fault_and_a_chunk_in_progress_is_awaited(recorde
     assert follower.fault.endswith("does not begin as an MCAP file")
 
 
-def test_an_index_that_points_outside_its_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
+def test_index_that_points_outside_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
     content = bytearray((recorded / "run_0.mcap").read_bytes())
     place, changed = 8, 0
     while content[place] != Opcode.DATA_END:
@@ -146,7 +144,7 @@ def test_an_index_that_points_outside_its_messages_counts_as_damage(recorded: Pa
     assert (follower.complete, follower.damaged) == (True, 1)  # the rest of that chunk is left out
 
 
-def test_an_index_with_more_entries_than_its_chunk_has_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
+def test_index_with_more_entries_than_chunk_has_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
     content, place = (recorded / "run_0.mcap").read_bytes(), len(MCAP0_MAGIC)
     while content[place] != Opcode.MESSAGE_INDEX:
         place += RECORD.size + RECORD.unpack_from(content, place)[1]
@@ -161,7 +159,7 @@ def test_an_index_with_more_entries_than_its_chunk_has_messages_counts_as_damage
 
 
 @pytest.mark.parametrize("part", [0.4, 1.0])
-def test_a_file_that_is_replaced_is_not_read_on(part: float, run: Path) -> None:
+def test_file_that_replaced_is_not_read_on(part: float, run: Path) -> None:
     path, content = run / "run_0.mcap", (run / "run_0.mcap").read_bytes()
     path.write_bytes(content[: len(content) // 2])
     follower = Follower(run, all_of)
@@ -173,7 +171,7 @@ def test_a_file_that_is_replaced_is_not_read_on(part: float, run: Path) -> None:
     assert follower.fault == f"{path} was replaced by another file, as rise-di repair does"
 
 
-def test_a_file_is_locked_as_long_as_its_recorder_holds_it(tmp_path: Path) -> None:
+def test_file_locked_as_long_as_recorder_holds_it(tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
     path.write_bytes(b"")
     assert not is_locked(path)

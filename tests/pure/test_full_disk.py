@@ -50,7 +50,7 @@ def write_until_full(bag: BagWriter, channel: BagChannel) -> None:
         write(bag, channel, 1)
 
 
-def test_a_log_on_a_full_disk_is_finished_without_loss(disk: Path) -> None:
+def test_log_on_full_disk_finished_without_loss(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write_until_full(bag, channel)
@@ -62,7 +62,7 @@ def test_a_log_on_a_full_disk_is_finished_without_loss(disk: Path) -> None:
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_a_log_whose_chunks_fill_up_between_two_flushes_is_finished_too(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_whose_chunks_fill_up_between_two_flushes_finished_too(disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Three messages a chunk: a reserve that did not grow with each of them would be too small for the index of a thousand.
     monkeypatch.setattr("flight_log.bag.CHUNK_BYTES", 4000)
     monkeypatch.setattr("flight_log.bag.END_BYTES", 8000)
@@ -79,7 +79,7 @@ def test_a_log_whose_chunks_fill_up_between_two_flushes_is_finished_too(disk: Pa
 
 
 @pytest.mark.parametrize("chunks", range(1, 5))
-def test_a_log_closes_where_its_last_chunk_would_need_a_larger_reserve(
+def test_log_closes_where_last_chunk_would_need_larger_reserve(
     chunks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flight_log.disk.RESERVE_STEP", 0)  # each chunk needs more
@@ -92,13 +92,13 @@ def test_a_log_closes_where_its_last_chunk_would_need_a_larger_reserve(
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) == chunks
 
 
-def test_the_end_of_the_file_has_a_reserve_until_it_is_closed(disk: Path) -> None:
+def test_end_of_file_has_reserve_until_it_closed(disk: Path) -> None:
     with BagWriter(disk / "run"):
         assert SIZE - free_bytes(disk) >= END_BYTES
     assert SIZE - free_bytes(disk) < 50_000  # freed; a file without messages and metadata.yaml remain
 
 
-def test_a_log_is_finished_when_another_process_fills_the_disk(disk: Path) -> None:
+def test_log_finished_when_another_process_fills_disk(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write(bag, channel, 300)
@@ -109,7 +109,7 @@ def test_a_log_is_finished_when_another_process_fills_the_disk(disk: Path) -> No
         assert reader.message_count == channel.messages >= 300
 
 
-def test_a_log_without_a_reserve_stays_readable_to_its_last_complete_chunk(disk: Path) -> None:
+def test_log_without_reserve_stays_readable_to_last_complete_chunk(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
     write_until_full(bag, channel)
@@ -125,7 +125,7 @@ def test_a_log_without_a_reserve_stays_readable_to_its_last_complete_chunk(disk:
     assert "run_0.mcap is truncated: read up to its last complete chunk" in back.notes[0]
 
 
-def test_an_input_output_error_is_not_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_input_output_error_is_not_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = ReservedFile(tmp_path / "file")
 
     def fails(descriptor: int, data: bytes) -> int:
@@ -138,7 +138,7 @@ def test_an_input_output_error_is_not_a_full_disk(tmp_path: Path, monkeypatch: p
     file.close()
 
 
-def test_what_is_kept_for_the_end_survives_a_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_kept_for_end_survives_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = ReservedFile(tmp_path / "file")
     file.keep(b"reserve")
 
@@ -162,7 +162,7 @@ def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert (tmp_path / "file").read_bytes() == b"0123456789"
 
 
-def test_a_flight_in_one_process_on_a_full_disk_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
+def test_flight_in_one_process_on_full_disk_is_one_sentence(disk: Path, osprey_gust: Scenario) -> None:
     fill(disk / "other")
     with pytest.raises(ParameterError, match=r"disk/run cannot be written \(No space left on device\)"):
         write_run(simulate(osprey_gust.vary(flight={"duration": 0.1})), disk / "run", LogAttachments(osprey_gust.path))

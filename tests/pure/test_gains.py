@@ -69,13 +69,13 @@ def failing_in_loop(assessment: GainAssessment) -> list[str]:
 
 
 @pytest.mark.equation(29, 30)
-def test_beta_follows_29_and_30_from_the_last_channel_up() -> None:
+def test_beta_follows_29_and_30_from_last_channel_up() -> None:
     # beta_3 = 3 (1 + 0/4) = 3; beta_2 = (2 + 0.5 3) (1 + 2/2) = 7; beta_1 = (1 + 2 7 + 1 3) (1 + 1/1) = 36
     assert gain_conditions.least_beta(np.array([1.0, 2.0, 4.0]), HAND).tolist() == [36.0, 7.0, 3.0]
 
 
 @pytest.mark.equation(27, "Step 2", "Step 3")
-def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
+def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
     found = gain_conditions.theorem_gains(HAND, np.ones(3))
     # k_g = 1.5 2^2 / 4; k_3 = 1 + k_g = 2.5; a row of step 3 may take 0.3 / 2
     # zeta_Phi,2 = 0.5 2.5 = 1.25, k_d,2 = 1.25^2 / (4 0.15); k_2 = 2.5 + k_d,2
@@ -87,7 +87,7 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_the_last_channel_up() -> None:
 
 
 @pytest.mark.equation("Step 3")
-def test_the_gains_of_theorem_1_meet_its_conditions() -> None:
+def test_gains_of_theorem_1_meet_conditions() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert not gain_conditions.failing(conditions)
     assert [one.margin for one in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
@@ -114,13 +114,13 @@ def test_a_condition_that_fails_is_named(change: dict[str, FloatArray | float], 
 
 
 @pytest.mark.equation(40)
-def test_what_rests_on_gamma_2_is_marked_an_estimate() -> None:
+def test_what_rests_on_gamma_2_marked_estimate() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert [one.estimate for one in conditions] == [True, True, True, False, False]
 
 
 @pytest.mark.equation(22)
-def test_a_gain_that_22_does_not_allow_is_refused() -> None:
+def test_gain_that_22_does_not_allow_refused() -> None:
     with pytest.raises(ParameterError, match=r"^k_d: found \[0\.\], expected values above 0$"):
         gain_conditions.check(GainSet(1.0, np.zeros(1), np.ones(2), np.ones(2)), HAND)
     with pytest.raises(ParameterError, match="the smallest in the last channel"):
@@ -139,7 +139,7 @@ def test_a_gain_that_22_does_not_allow_is_refused() -> None:
         (True, (3.0, 1.0, 3.0, 2.0), 32.6, 400.0, (400.0,) * 4, 1333.0),
     ],
 )
-def test_the_literal_conditions_need_bandwidths_of_the_osprey_beyond_any_servo(
+def test_literal_conditions_need_bandwidths_of_osprey_beyond_any_servo(
     scaled: bool, Lambda: tuple[float, ...], rho: float, k_g: float, bandwidths: tuple[float, ...], k_d3: float
 ) -> None:
     # Measured before this project, in the units of the file (degrees and percent); three digits, so 1 %.
@@ -158,7 +158,7 @@ def test_the_literal_conditions_need_bandwidths_of_the_osprey_beyond_any_servo(
 
 
 @pytest.mark.equation(27)
-def test_bounds_of_U_are_those_of_the_worst_sample() -> None:
+def test_bounds_of_U_are_those_of_worst_sample() -> None:
     lower, upper = np.array([[0.9, 0.0], [0.0, 0.9]]), np.array([[1.1, 0.3], [0.2, 1.1]])
     places = np.array(list(product((0.0, 0.5, 1.0), repeat=4))).reshape(-1, 2, 2)
     samples = lower + places * (upper - lower)  # the corners of the interval, and points between them
@@ -174,7 +174,7 @@ def test_n_d_is_minus_D_U_v_dot() -> None:
     np.testing.assert_allclose(gain_conditions.N_d(Omega, v_dot), expected, atol=1e-12)
 
 
-def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurements(osprey: Study) -> None:
+def test_slew_of_ideal_control_of_osprey_is_that_of_earlier_measurements(osprey: Study) -> None:
     # deg/s and %/s; measured with steps for commands, where these have edges of 0.1 s: thrust and rudder in calm air are
     # slower (36 and 9.3 with steps), the gusts are the same
     shown = np.degrees([1.0, 0.0, 1.0, 1.0]) + np.array([0.0, 100.0, 0.0, 0.0])
@@ -183,7 +183,7 @@ def test_the_slew_of_the_ideal_control_of_the_osprey_is_that_of_earlier_measurem
     np.testing.assert_allclose((osprey.slew_undisturbed * shown)[[1, 3]], [32.2, 7.35], rtol=0.01)
 
 
-def test_u_of_a_loop_with_small_error_is_the_ideal_control(osprey_gust: Scenario) -> None:
+def test_u_of_loop_with_small_error_is_ideal_control(osprey_gust: Scenario) -> None:
     # The rate of u in the simulation is the reference: the implicit sign keeps e below 1e-3, so u is u* up to sampling.
     short = osprey_gust.vary(flight={"duration": 4.0})
     found = selection.study_airframe(AIRFRAME, selection.manoeuvre(short, AIRFRAME), samples=0)
@@ -203,14 +203,14 @@ def test_uncertain_airframes_have_the_published_kinematic_rows() -> None:
         nominal_and_sampled(AIRFRAME, 1.5, 1, seed=1)
 
 
-def test_an_airframe_with_an_unstable_zero_is_refused(osprey_gust: Scenario) -> None:
+def test_airframe_with_unstable_zero_refused(osprey_gust: Scenario) -> None:
     rows = [list(row) for row in AIRFRAME.A]
     rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
     with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
         selection.study_airframe(AIRFRAME.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, AIRFRAME))
 
 
-def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
+def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
     controller = selected.engineering.controller
     params = controller.law_params()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
@@ -225,7 +225,7 @@ def test_the_engineering_gains_of_the_osprey_are_close_to_those_tuned_by_hand(se
     assert selected.engineering.delay_margin == pytest.approx(0.045, abs=0.003)
 
 
-def test_the_gains_of_theorem_1_are_unstable_on_the_osprey_with_servos(selected: selection.Selection) -> None:
+def test_gains_of_theorem_1_are_unstable_on_osprey_with_servos(selected: selection.Selection) -> None:
     literal = selected.theorem
     assert not gain_conditions.failing(literal.theorem)
     assert literal.delay_margin == 0.0
@@ -233,7 +233,7 @@ def test_the_gains_of_theorem_1_are_unstable_on_the_osprey_with_servos(selected:
     assert "k_g, step 2" in names(selected.engineering.failing, literal.controller.outputs)
 
 
-def test_a_channel_too_slow_for_22_gets_a_smaller_input_scale() -> None:
+def test_channel_too_slow_for_22_gets_smaller_input_scale() -> None:
     bandwidth = gain_conditions.bandwidths(Loop(np.array([0.02, 1.0]), 0.0, 0.01), np.array([0.63, 0.23]))
     gains, response = gain_conditions.engineering_gains(bandwidth, np.ones(2), 1.25, np.full(2, np.inf))
     np.testing.assert_allclose(gains.K, [18.0, 1.5])
@@ -241,7 +241,7 @@ def test_a_channel_too_slow_for_22_gets_a_smaller_input_scale() -> None:
     np.testing.assert_allclose(gains.beta * response, 1.25)  # and the same rate of u
 
 
-def test_beta_stays_below_the_rate_of_the_actuators(osprey: Study) -> None:
+def test_beta_stays_below_rate_of_actuators(osprey: Study) -> None:
     limited = selection.select_gains(osprey, SERVOS._replace(rate_limit={"thrust": 1.2})).engineering
     params = limited.controller.law_params()
     assert params.beta[3] * params.input_scale[3] == pytest.approx(0.7 * 1.2)  # the slew of the ideal thrust is 1.14 1/s
@@ -263,7 +263,7 @@ def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
     assert names(again.failing, read.outputs) == names(selected.engineering.failing, read.outputs)
 
 
-def test_a_scenarios_gain_set_is_judged_condition_by_condition(osprey: Study) -> None:
+def test_scenarios_gain_set_judged_condition_by_condition(osprey: Study) -> None:
     servo = find_scenario("osprey_servo")
     weak = servo.vary(controller={"beta": [14.7, 22.5, 6.8, 3.6]})
     failing = failing_in_loop(selection.check_gains(weak, osprey))
@@ -282,7 +282,7 @@ def osprey_channels(
 
 
 @pytest.mark.equation("Remark 1")
-def test_a_wrong_D_is_refused_with_the_one_that_fits() -> None:
+def test_wrong_D_refused_with_one_that_fits() -> None:
     Omega, channels = osprey_channels(flipped=("elevator",))
     sentence = r"^controller\.D: found \[1, 1, 1, 1\], expected \[-1, 1, 1, 1\], .* or flip elevator and keep D$"
     with pytest.raises(ParameterError, match=sentence):
@@ -290,7 +290,7 @@ def test_a_wrong_D_is_refused_with_the_one_that_fits() -> None:
     assert selection.require_channels(Omega, channels, [-1, 1, 1, 1]).tolist() == [-1, 1, 1, 1]
 
 
-def test_a_wrong_sign_map_is_refused_with_the_one_that_fits() -> None:
+def test_wrong_sign_map_refused_with_one_that_fits() -> None:
     Omega, channels = osprey_channels(flipped=("elevator", "rudder"))
     sentence = r"^input_signs: found \[1, 1, 1, -1\], expected \[-1, 1, 1, -1\] for D = \[1, 1, 1, 1\]: elevator the other way$"
     with pytest.raises(ParameterError, match=sentence):
@@ -311,12 +311,12 @@ def test_a_wrong_sign_map_is_refused_with_the_one_that_fits() -> None:
         ),
     ],
 )
-def test_a_pairing_without_decomposition_or_with_strong_coupling_is_refused(inputs: tuple[str, ...], sentence: str) -> None:
+def test_pairing_without_decomposition_or_with_strong_coupling_refused(inputs: tuple[str, ...], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         selection.require_channels(*osprey_channels(inputs))
 
 
-def test_gains_can_be_selected_for_the_pairing_that_a_refusal_proposes(osprey_gust: Scenario) -> None:
+def test_gains_can_be_selected_for_pairing_that_refusal_proposes(osprey_gust: Scenario) -> None:
     airframe = load_airframe("aerosonde_first_edition_lateral")
     manoeuvre = selection.manoeuvre(osprey_gust.vary(flight={"duration": 1.0}), airframe)
     assert manoeuvre.reference.outputs == ("p", "r")
@@ -353,7 +353,7 @@ def osprey_loop(
         (3.0, (22.0, 2.5, 26.0, 11.0), (10.0, 0.5, 10.0, 6.0), 0.030),
     ],
 )
-def test_delay_margins_of_the_osprey_are_those_of_an_independent_prototype(
+def test_delay_margins_of_osprey_are_those_of_independent_prototype(
     factor: float, K: tuple[float, ...], Lambda: tuple[float, ...], margin: float
 ) -> None:
     # given as 45, 64, 61 and 30 to 31 ms
@@ -393,7 +393,7 @@ def grows(params: LawParams, omega: float, lag: float, delay: float) -> bool:
 
 
 @pytest.mark.parametrize(("lag", "factor"), [(0.02, 3.0), (0.02, 5.0), (0.05, 3.0)])
-def test_the_predicted_delay_margin_is_where_the_simulated_loop_begins_to_grow(lag: float, factor: float) -> None:
+def test_predicted_delay_margin_is_where_simulated_loop_begins_to_grow(lag: float, factor: float) -> None:
     omega, period = 0.98, 0.01
     params = scalar(omega, factor * (lag + 1.5 * period))
     plant = LinearPlant(np.zeros((1, 1)), np.array([[omega]]), np.eye(1))
@@ -404,7 +404,7 @@ def test_the_predicted_delay_margin_is_where_the_simulated_loop_begins_to_grow(l
     assert grows(params, omega, lag, margin + 0.00075)
 
 
-def test_a_softened_sign_narrower_than_the_lag_of_the_loop_is_unstable() -> None:
+def test_softened_sign_narrower_than_lag_of_loop_is_unstable() -> None:
     loop = Loop(np.array([0.02]), 0.0, 0.01)
     plant = LinearPlant(np.zeros((1, 1)), np.eye(1), np.eye(1))
     wide, narrow = (scalar(1.0, factor * 0.035) for factor in (1.7, 0.5))
@@ -414,7 +414,7 @@ def test_a_softened_sign_narrower_than_the_lag_of_the_loop_is_unstable() -> None
     assert names(gain_conditions.failing(conditions), ("y",)) == ["softening of y"]
 
 
-def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
+def test_delay_that_loop_has_already_counts_against_margin() -> None:
     plant, law = osprey_loop()
     free = delay_margin(plant, law, OSPREY_LOOP)
     spent = delay_margin(plant, law, OSPREY_LOOP._replace(delay=0.013))
@@ -423,7 +423,7 @@ def test_delay_that_the_loop_has_already_counts_against_the_margin() -> None:
     assert min(alone) < 0.05 < max(alone)  # thrust bears three times what the surfaces bear
 
 
-def test_the_delay_margin_lasts_up_to_the_speed_at_which_the_loop_with_its_responses_turns_unstable(
+def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unstable(
     osprey: Study, selected: selection.Selection
 ) -> None:
     margin = selected.engineering.delay_margin
@@ -454,14 +454,14 @@ def rise_di(*arguments: str) -> Result:
     return CliRunner(env={"COLUMNS": "80"}).invoke(app, arguments)
 
 
-def test_the_command_names_the_conditions_that_a_scenario_fails() -> None:
+def test_command_names_conditions_that_scenario_fails() -> None:
     result = rise_di("gains", "osprey", "--check", "--samples", "2", "--scenario", "osprey_servo")
     assert result.exit_code == 1
     assert "beta above slew of q: found 14.7, expected at least 22.8" in result.stdout
     assert "beta in units of y / s^2" in " ".join(result.stdout.split())
 
 
-def test_the_command_shows_the_sign_of_each_channel() -> None:
+def test_command_shows_sign_of_each_channel() -> None:
     signs = {"navion_longitudinal": {"q by elevator": "-1"}, "osprey": {"q by elevator": "+1", "r by rudder": "+1"}}
     for airframe, expected in signs.items():  # the elevator is positive nose down, and nose up
         shown = rise_di("gains", airframe, "--samples", "2").stdout
@@ -481,7 +481,7 @@ def test_the_command_writes_gains_that_load(tmp_path: Path) -> None:
     assert output["theorem"]["delay_margin"] == 0.0
 
 
-def test_a_y_that_is_slower_than_the_law_counts_as_delay_and_may_be_three_messages_old(tmp_path: Path) -> None:
+def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old(tmp_path: Path) -> None:
     """1.5 periods of 1 / 9.9 Hz, the airspeed of PX4, less 1.5 of 1 / 50 Hz are 121.515 ms. A faster y changes nothing.
 
     An age limit of 0.1 s would be over before the next message of such a y.
@@ -515,7 +515,7 @@ def test_an_invalid_loop_is_refused(option: str, value: str, expected: str) -> N
     assert str(result.exception) == expected
 
 
-def test_a_smallest_eigenvalue_of_zero_is_no_decay() -> None:
+def test_smallest_eigenvalue_of_zero_is_no_decay() -> None:
     condition = Condition("V2_dot", None, 0.0, 0.0, strict=True)
     assert not condition.holds
     assert condition._replace(found=1e-9).holds
@@ -534,7 +534,7 @@ def test_the_command_lists_the_airframes() -> None:
     assert printed.count("aerosonde_first_edition_lateral ") == 3  # on one line in each table
 
 
-def test_a_manoeuvre_leaves_out_what_an_airframe_does_not_have(osprey_gust: Scenario) -> None:
+def test_manoeuvre_leaves_out_what_airframe_does_not_have(osprey_gust: Scenario) -> None:
     manoeuvre: Manoeuvre = selection.manoeuvre(osprey_gust, load_airframe("f16_longitudinal"))
     assert set(manoeuvre.reference.outputs) == {"q", "V"}
     assert manoeuvre.reference.coordinated_turn is None

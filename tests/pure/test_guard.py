@@ -31,7 +31,7 @@ def sample(ms: float, value: float = 0.0) -> StampedVector:
     return StampedVector(round(ms * MS), np.full(4, value))
 
 
-def test_reference_is_taken_at_the_stamp_of_y() -> None:
+def test_reference_taken_at_stamp_of_y() -> None:
     samples = [sample(0, 0.0), sample(10, 1.0), sample(20, 3.0)]
 
     def at(ms: float) -> FloatArray | None:
@@ -44,7 +44,7 @@ def test_reference_is_taken_at_the_stamp_of_y() -> None:
     assert at(-1) is None  # before the oldest
 
 
-def test_a_single_sample_is_held_for_one_period() -> None:
+def test_single_sample_held_for_one_period() -> None:
     assert align([sample(0, 7.0)], 10 * MS, 10 * MS) == pytest.approx([7.0] * 4, rel=0.0, abs=0.0)
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
@@ -59,7 +59,7 @@ def test_noise_of_closely_spaced_reference_samples_is_not_amplified() -> None:
 
 
 @given(ms=st.floats(0, 20))
-def test_a_straight_line_is_reproduced_at_any_instant(ms: float) -> None:
+def test_straight_line_reproduced_at_any_instant(ms: float) -> None:
     value = align([sample(t, t) for t in (0, 5, 10)], round(ms * MS), 10 * MS)
     assert value == pytest.approx([round(ms * MS) / MS] * 4, abs=1e-9)
 
@@ -84,14 +84,14 @@ def run(
     return states[1:]
 
 
-def test_waits_until_both_signals_are_received_then_engages_with_zero_input() -> None:
+def test_waits_until_both_signals_received_then_engages_with_zero_input() -> None:
     both = (30, sample(30, 1.0), [sample(20), sample(30)])
     modes = run((0, None, []), (10, sample(10, 1.0), []), (20, None, [sample(20)]), both)
     assert [state.mode for state in modes] == [Mode.WAITING, Mode.WAITING, Mode.WAITING, Mode.ENGAGED]
     assert modes[-1].u.tolist() == [0.0] * 4
 
 
-def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt() -> None:
+def test_each_new_sample_is_one_step_of_law_with_measured_dt() -> None:
     first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))
     law_state = engage(np.full(4, 1.0), np.zeros(4))
     _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law_params())
@@ -100,7 +100,7 @@ def test_each_new_sample_is_one_step_of_the_law_with_its_measured_dt() -> None:
 
 
 @pytest.mark.parametrize(("gap_ms", "dt_ms"), [(1, 2), (25, 25), (80, 80), (200, 100)])
-def test_the_measured_dt_is_clipped_between_a_fifth_and_ten_periods(gap_ms: int, dt_ms: int) -> None:
+def test_measured_dt_clipped_between_fifth_and_ten_periods(gap_ms: int, dt_ms: int) -> None:
     (engaged,) = run((0, sample(0, 1.0), [sample(0)]))
     _, inputs = tick(engaged, gap_ms, sample(gap_ms, 1.0), [sample(gap_ms)])
     assert inputs is not None
@@ -114,7 +114,7 @@ def test_a_repeated_sample_changes_nothing() -> None:
     assert states[2].law is states[1].law
 
 
-def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_without_a_jump(osprey_gust: Scenario) -> None:
+def test_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_without_jump(osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y, y_m = sample(10, 1.1), [sample(10)]
     states = run(
@@ -146,7 +146,7 @@ def test_the_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_witho
 
 
 @pytest.mark.parametrize("policy", ["trim", "hold"])
-def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey_gust: Scenario) -> None:
+def test_deactivation_holds_or_ramps_input_as_configured(policy: str, osprey_gust: Scenario) -> None:
     params = osprey_gust.vary(controller={"ramp": 0.4, "on_deactivate": policy}).controller
     states = [guard.initial_state(4)]
     for ms, active in ((0, True), (10, True), (20, False), (220, False), (620, False), (630, True)):
@@ -159,7 +159,7 @@ def test_deactivation_holds_or_ramps_the_input_as_configured(policy: str, osprey
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 
-def test_an_inactive_controller_commands_trim_before_its_first_engagement_once_it_has_y_and_y_m() -> None:
+def test_inactive_controller_commands_trim_before_first_engagement_once_it_has_y_and_y_m() -> None:
     """A bridge engages only with a fresh u, and activates the controller after that."""
     state, inputs = tick(guard.initial_state(4), 0, None, [sample(0)], active=False)
     assert (state.mode, inputs) == (Mode.INACTIVE, None)
@@ -182,7 +182,7 @@ STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
 
 @pytest.mark.parametrize("sign", list(Sign))
 @given(state=STATES, y=PAIRS)
-def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
+def test_anti_windup_without_saturation_leaves_law_to_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
@@ -192,7 +192,7 @@ def test_anti_windup_without_saturation_leaves_the_law_to_the_last_bit(sign: Sig
 
 
 @given(u=PAIRS, before=PAIRS, bound=st.floats(0.1, 5), rate=st.floats(0.1, 100))
-def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
+def test_saturation_keeps_limits_and_leaves_input_inside_them_unchanged(
     u: FloatArray, before: FloatArray, bound: float, rate: float
 ) -> None:
     limits = limits_of(bound, rate)
@@ -204,7 +204,7 @@ def test_saturation_keeps_the_limits_and_leaves_an_input_inside_them_unchanged(
     assert (limited[inside] == u[inside]).all()
 
 
-def test_saturation_moves_to_new_limits_at_its_rate() -> None:
+def test_saturation_moves_to_new_limits_at_rate() -> None:
     """Without a limit of the rate u is inside at once."""
     u, before = np.array([5.0, -5.0]), np.array([3.0, -3.0])
     for rate, limited in ((10.0, [2.9, -2.9]), (1000.0, [1.0, -1.0]), (np.inf, [1.0, -1.0])):
@@ -213,7 +213,7 @@ def test_saturation_moves_to_new_limits_at_its_rate() -> None:
 
 @given(state=STATES, y=PAIRS, trim=PAIRS)
 @pytest.mark.parametrize("limited_in", ["magnitude", "rate"])
-def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
+def test_integrals_stop_only_in_direction_that_worsens_saturation(
     limited_in: str, state: LawState, y: FloatArray, trim: FloatArray
 ) -> None:
     limits = limits_of(1.0) if limited_in == "magnitude" else limits_of(np.inf, 10.0)
@@ -229,7 +229,7 @@ def test_integrals_stop_only_in_the_direction_that_worsens_saturation(
     assert (limited_state.Pi <= np.maximum(state.Pi, free.Pi) + 1e-9).all()
 
 
-def test_an_input_reaches_its_limit_however_large_a_tick_of_the_integrals_is() -> None:
+def test_input_reaches_limit_however_large_tick_of_integrals_is() -> None:
     # A step of Pi changes u by 0.5 0.01 3 = 0.015. Without scaling, u could end anywhere within 0.015 of the limit.
     limits = Limits(np.full(2, -np.inf), np.full(2, 0.01), np.full(2, np.inf))
     zero, e = np.zeros(2), np.array([-0.2, 0.2])
@@ -258,7 +258,7 @@ def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *ot
     return dict(zip(internals.names(PARAMS.logged_groups()), values, strict=True))
 
 
-def test_internals_hold_the_integrals_and_what_limited_each_input() -> None:
+def test_internals_hold_integrals_and_what_limited_each_input() -> None:
     limits = Limits(np.full(4, -1.0), np.full(4, 1.0), np.full(4, np.inf))
     law_state = LawState(np.zeros(4), np.ones(4), np.full(4, 2.0), np.full(4, 3.0))
     state = guard.initial_state(4)._replace(

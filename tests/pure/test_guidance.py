@@ -44,7 +44,7 @@ def loop_damping(gain: float, frequency: float, damping: float) -> float:
     return float(np.min(-np.real(poles) / np.abs(poles)))
 
 
-def test_a_quarter_of_the_bandwidth_gives_the_bank_loop_a_damping_of_0_74() -> None:
+def test_quarter_of_bandwidth_gives_bank_loop_damping_of_0_74() -> None:
     # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on (Hurwitz).
     assert loop_damping(5.0 / 4.0, 5.0, 0.9) == pytest.approx(0.74, abs=0.01)
     assert loop_damping(2.0, 5.0, 0.9) == pytest.approx(0.48, abs=0.01)
@@ -52,13 +52,13 @@ def test_a_quarter_of_the_bandwidth_gives_the_bank_loop_a_damping_of_0_74() -> N
 
 
 @pytest.mark.parametrize("phi", [-0.9, 0.0, 0.5])
-def test_a_bank_that_is_held_gives_the_rates_of_a_level_turn(phi: float) -> None:
+def test_bank_that_held_gives_rates_of_level_turn(phi: float) -> None:
     turn = GRAVITY * math.tan(phi) / SPEED
     rates = body_rates(phi, 0.0, phi, 0.0, turn * math.cos(phi), 0.0, SPEED, HOLD)
     assert rates == pytest.approx((0.0, turn * math.sin(phi), turn * math.cos(phi)), abs=1e-15)
 
 
-def test_commanded_rates_turn_the_attitude_at_the_commanded_rates() -> None:
+def test_commanded_rates_turn_attitude_at_commanded_rates() -> None:
     # With r as commanded, a rotation by the body rates changes (phi, theta) by k times the errors and psi by the level turn.
     phi, theta, phi_c, theta_c = 0.4, 0.1, 0.5, 0.15
     turn = GRAVITY * math.tan(phi) / SPEED
@@ -77,11 +77,11 @@ def test_roll_rate_and_load_are_limited() -> None:
     assert (rates.p, rates.q) == pytest.approx((0.3, 0.5 * GRAVITY / SPEED))
 
 
-def test_a_sideslip_to_the_right_turns_the_nose_right() -> None:
+def test_sideslip_to_right_turns_nose_right() -> None:
     assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == pytest.approx(0.1)
 
 
-def test_the_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_the_acceleration() -> None:
+def test_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_acceleration() -> None:
     free = CLIMB._replace(climb=1e3, sink=1e3)
     near, step = 1.0 / (2.0 * 0.2**2), 1e-6
     assert climb_for(near - step, free) == pytest.approx(climb_for(near + step, free), abs=1e-6)
@@ -94,7 +94,7 @@ def test_the_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_the_
 
 
 @pytest.mark.parametrize("stall_speed", [20.0, 60.0, 121.9, 133.0])
-def test_the_altitude_loop_keeps_its_margin_where_the_flight_path_lags_the_pitch(stall_speed: float) -> None:
+def test_altitude_loop_keeps_margin_where_flight_path_lags_pitch(stall_speed: float) -> None:
     # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma. JSBSim's f16 at 154 m/s and
     # 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h = 0.2 and T = 2 s.
     frequencies = (4.0, 1.2, 5.0, 4.0)
@@ -105,14 +105,14 @@ def test_the_altitude_loop_keeps_its_margin_where_the_flight_path_lags_the_pitch
     assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0  # a gain margin of 2.5
 
 
-def test_without_a_stall_speed_the_altitude_loop_is_that_of_a_path_which_follows_within_two_seconds() -> None:
+def test_without_stall_speed_altitude_loop_is_that_of_path_which_follows_within_two_seconds() -> None:
     loop = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0).params().vertical
     assert (loop.k_h, loop.alpha_time) == (0.2, 2.0)
     given = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0, altitude_gain=0.3, alpha_time=1.0)
     assert given.params().vertical[::4] == (0.3, 1.0)
 
 
-def test_pitch_settles_where_the_angle_of_attack_is_estimated() -> None:
+def test_pitch_settles_where_angle_of_attack_estimated() -> None:
     alpha = 0.0
     for _ in range(1000):  # 20 s, ten time constants: exp(-10)
         alpha = alpha_estimate(alpha, 0.13, 2.0, SPEED, 0.02, CLIMB)
@@ -121,7 +121,7 @@ def test_pitch_settles_where_the_angle_of_attack_is_estimated() -> None:
     assert slewed(1.0, 2.0, 0.5, 0.1) == pytest.approx(1.05)
 
 
-def test_a_course_is_approached_on_the_shorter_side_and_with_all_it_has_beyond_90_degrees() -> None:
+def test_course_approached_on_shorter_side_and_with_all_it_has_beyond_90_degrees() -> None:
     assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0  # to the right, over south
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
     assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == pytest.approx(0.2 * SPEED)
@@ -141,7 +141,7 @@ def cross_track(e_0: float, times: FloatArray) -> FloatArray:
     return np.asarray(solution.y[0])
 
 
-def test_near_a_line_the_error_is_that_of_a_second_order_system() -> None:
+def test_near_line_error_is_that_of_second_order_system() -> None:
     # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000 of v_g P zeta.
     times, zeta, w = np.linspace(0.0, 40.0, 81), 0.75, 2.0 * math.pi / 20.0
     damped = w * math.sqrt(1.0 - zeta**2)
@@ -149,7 +149,7 @@ def test_near_a_line_the_error_is_that_of_a_second_order_system() -> None:
     assert cross_track(0.1, times) / 0.1 == pytest.approx(exact, abs=2e-3)
 
 
-def test_a_line_is_captured_from_far_at_the_capture_angle() -> None:
+def test_line_captured_from_far_at_capture_angle() -> None:
     times = np.linspace(0.0, 200.0, 401)
     e = cross_track(2000.0, times)
     assert np.diff(e)[100] / 0.5 == pytest.approx(-SPEED * math.sin(FOLLOW.capture), rel=1e-3)
@@ -158,14 +158,14 @@ def test_a_line_is_captured_from_far_at_the_capture_angle() -> None:
 
 
 @pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
-def test_on_the_course_opposite_to_a_line_the_aircraft_turns_with_all_it_has(away: float) -> None:
+def test_on_course_opposite_to_line_aircraft_turns_with_all_it_has(away: float) -> None:
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
     assert turn == pytest.approx(math.copysign(full, -away), rel=1e-9)  # a sine would leave 0.2 % of it at 179.9 deg
 
 
 @pytest.mark.parametrize("radius", [300.0, -300.0])
-def test_on_a_circle_the_acceleration_is_centripetal_and_drives_an_offset_back(radius: float) -> None:
+def test_on_circle_acceleration_is_centripetal_and_drives_offset_back(radius: float) -> None:
     orbit = Arc((0.0, 0.0), radius)
     on = path.error(orbit, (300.0, 0.0))  # to the north of the centre: east on a right turn, west on a left one
     assert on == pytest.approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
@@ -192,18 +192,18 @@ def offset_from_a_circle(*, estimated: bool) -> float:
     return math.hypot(north, east) - radius
 
 
-def test_an_aircraft_that_slips_flies_on_its_circle() -> None:
+def test_aircraft_that_slips_flies_on_circle() -> None:
     # Without the estimate e'' + 2 zeta w e' + w^2 e = 0.1 V^2 / R near the circle: an offset of 3.2 m; measured 3.5 m.
     assert offset_from_a_circle(estimated=False) == pytest.approx(0.1 * 50.0**2 / 800.0 / (2.0 * math.pi / 20.0) ** 2, rel=0.15)
     assert abs(offset_from_a_circle(estimated=True)) < 0.01  # m, of the integration in steps of 50 ms
 
 
-def test_a_roll_in_which_the_turn_lags_the_bank_is_no_sideslip() -> None:
+def test_roll_in_which_turn_lags_bank_is_no_sideslip() -> None:
     assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
     assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12)
 
 
-def test_a_gyro_with_a_bias_is_no_sideslip_of_a_straight_flight() -> None:
+def test_gyro_with_bias_is_no_sideslip_of_straight_flight() -> None:
     # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m beside a leg.
     slip = 0.0
     for _ in range(1000):
@@ -212,7 +212,7 @@ def test_a_gyro_with_a_bias_is_no_sideslip_of_a_straight_flight() -> None:
     assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(0.4)  # a fifth of the turn of a bank to the left
 
 
-def test_the_error_of_a_line_is_positive_to_its_right() -> None:
+def test_error_of_line_is_positive_to_right() -> None:
     east = Line((0.0, 0.0), (0.0, 1000.0))
     assert path.error(east, (-7.0, 400.0)) == pytest.approx((7.0, math.pi / 2.0, 0.0))
     assert not path.passed(east, (50.0, 999.0))
@@ -246,14 +246,14 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
         ([(0.0, 0.0), (900.0, 0.0), (900.0, 300.0), (0.0, 300.0)], 200.0, r"route\[2\]: found 300 m .* more than 400 m"),
     ],
 )
-def test_a_route_that_cannot_be_flown_is_refused_with_what_would_do(
+def test_route_that_cannot_be_flown_refused_with_what_would_do(
     waypoints: list[tuple[float, float]], radius: float, sentence: str
 ) -> None:
     with pytest.raises(ParameterError, match=sentence):
         path.route(waypoints, radius, 100.0)
 
 
-def test_waypoints_on_a_straight_line_have_no_fillet_by_rounding() -> None:
+def test_waypoints_on_straight_line_have_no_fillet_by_rounding() -> None:
     waypoints = [(0.0, 0.0), (141.4213562373095, 989.9494936611666), (424.26406871192864, 2969.848480983499)]  # k (0.1, 0.7)
     first, second = (path.course_of(*leg) for leg in pairwise(waypoints))
     assert 0.0 < abs(second - first) < 1e-15  # the arc of such a turn has no length to draw: it divided by zero

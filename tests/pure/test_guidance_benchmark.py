@@ -17,14 +17,14 @@ from flight_core.vectors import StampedVector
 pytestmark = pytest.mark.slow
 
 
-def test_a_step_of_the_bank_is_flown_within_its_limits() -> None:
+def test_step_of_bank_flown_within_limits() -> None:
     rows = list(benchmark.rows("osprey_servo", {"phi": benchmark.MANOEUVRES["phi"]}, seeds=0))
     assert [row.figure.name for row in rows][:2] == ["overshoot (%)", "settled to 1 deg (s)"]
     for row in rows:
         assert row.figure.value <= row.figure.limit, row
 
 
-def test_a_known_step_has_the_figures_that_it_must_have() -> None:
+def test_known_step_has_figures_that_it_must_have() -> None:
     # 10 % beyond 20 deg from 1 s after the start, then exact from 3 s on.
     t = np.arange(0, 1000) * 0.02
     phi = benchmark.BANK * np.where(t < 6.0, 0.0, np.where(t < 8.0, 1.1, 1.0))
@@ -41,7 +41,7 @@ def test_a_known_step_has_the_figures_that_it_must_have() -> None:
     ("pose", "stale"),
     [("5 Hz, 0.2 s late, noisy", 0.0), ("frozen for 8 s, new stamps", 7.8), ("jump", 0.0), ("one sample off", 0.0)],
 )
-def test_a_poor_pose_is_flown_across_180_deg_and_a_frozen_one_levels_the_wings(pose: str, stale: float) -> None:
+def test_poor_pose_flown_across_180_deg_and_frozen_one_levels_wings(pose: str, stale: float) -> None:
     rows = list(benchmark.rows("osprey_servo", {f"pose: {pose}": benchmark.MANOEUVRES[f"pose: {pose}"]}, seeds=0))
     for row in rows:
         assert row.figure.value <= row.figure.limit, row
@@ -49,7 +49,7 @@ def test_a_poor_pose_is_flown_across_180_deg_and_a_frozen_one_levels_the_wings(p
     assert rows[0].figure.name == "heading (deg)"  # held again at the end
 
 
-def test_a_delayed_pose_keeps_its_stamp_and_one_that_comes_late_is_stale() -> None:
+def test_delayed_pose_keeps_stamp_and_one_that_comes_late_is_stale() -> None:
     section = benchmark.aircraft_of("osprey_servo").guidance
     assert section is not None
     made = benchmark.PoseReceiver(benchmark.Pose(delay=0.3), section)

@@ -64,7 +64,7 @@ def after(tape: Tape, seconds: float) -> FloatArray:
     return np.asarray(tape.time("guidance") > seconds)
 
 
-def test_a_heading_an_altitude_and_an_airspeed_are_reached_and_held() -> None:
+def test_heading_altitude_and_airspeed_reached_and_held() -> None:
     tape = simulate(calm(45.0, program=program(heading=math.pi / 2.0, altitude=20.0, V=27.0)))
     psi, altitude, V, phi = channels(tape["guidance"], "pose.psi", "pose.altitude", "y.V", "pose.phi")
     end = after(tape, 40.0)
@@ -77,7 +77,7 @@ def test_a_heading_an_altitude_and_an_airspeed_are_reached_and_held() -> None:
     assert np.degrees(np.abs(phi).max()) < 32.0  # the limit of 30 deg, and 2
 
 
-def test_a_short_route_is_flown_leg_by_leg_and_ends_in_an_orbit() -> None:
+def test_short_route_flown_leg_by_leg_and_ends_in_orbit() -> None:
     points = {"north": [0.0, 400.0, 400.0], "east": [0.0, 0.0, 400.0], "altitude": [0.0, 0.0, 10.0]}
     tape = simulate(calm(60.0, route=points))
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
@@ -87,7 +87,7 @@ def test_a_short_route_is_flown_leg_by_leg_and_ends_in_an_orbit() -> None:
     assert altitude[-1] == pytest.approx(10.0, abs=1.0)
 
 
-def test_a_corner_of_half_a_degree_is_flown_with_the_bank_of_half_a_degree() -> None:
+def test_corner_of_half_degree_flown_with_bank_of_half_degree() -> None:
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the osprey banked by 17 deg.
     points = {"north": [0.0, 400.0, 900.0], "east": [0.0, 0.0, 5.0], "altitude": [0.0, 0.0, 0.0]}
     phi, xtrack = channels(simulate(calm(22.0, route=points))["guidance"], "pose.phi", "xtrack")
@@ -95,7 +95,7 @@ def test_a_corner_of_half_a_degree_is_flown_with_the_bank_of_half_a_degree() -> 
     assert np.abs(xtrack).max() < 1.0  # 0.4 m, in place of 6.9 m
 
 
-def test_each_step_follows_from_the_log_to_the_last_bit() -> None:
+def test_each_step_follows_from_log_to_last_bit() -> None:
     scenario = calm(8.0, program=program(course=1.0, climb=1.0))
     signal, section = simulate(scenario)["guidance"], scenario.guidance
     assert section is not None
@@ -136,7 +136,7 @@ def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) 
 
 
 @pytest.mark.parametrize("y_too", [False, True], ids=["pose alone", "then y too"])
-def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates(y_too: bool) -> None:
+def test_stale_pose_levels_wings_by_dead_reckoning_then_stops_all_rates(y_too: bool) -> None:
     made = flying(hold=4.0)
     signal = run(made, 1, 300)
     mode, phi = signal["mode"], signal["state.phi"]
@@ -157,7 +157,7 @@ def test_a_stale_pose_levels_the_wings_by_dead_reckoning_then_stops_all_rates(y_
 
 
 @pytest.mark.parametrize("command", [{}, {"heading": 0.5}])
-def test_a_shorter_route_replaces_one_on_a_later_leg(command: dict[str, float]) -> None:
+def test_shorter_route_replaces_one_on_later_leg(command: dict[str, float]) -> None:
     section = GuidanceConfig.validate_mapping(SECTION, "guidance")
     made, points = flying(), [Waypoint(900.0 * k, 0.0, 100.0) for k in range(5)]
     made.take_route(section.plan(points))
@@ -171,7 +171,7 @@ def test_a_shorter_route_replaces_one_on_a_later_leg(command: dict[str, float]) 
     assert signal["to_go"][0] == (0.0 if command else pytest.approx(900.0, abs=2.0))  # of the first leg
 
 
-def test_a_route_replaces_an_altitude_and_an_airspeed_that_were_commanded_before_the_engagement() -> None:
+def test_route_replaces_altitude_and_airspeed_that_were_commanded_before_engagement() -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.pause(paused=True, forget=False)
     made.take_target({"altitude": 500.0, "V": 21.0})
@@ -182,7 +182,7 @@ def test_a_route_replaces_an_altitude_and_an_airspeed_that_were_commanded_before
 
 
 @pytest.mark.parametrize("leg", [2.0, 0.5, -1.0, 99.0])
-def test_a_leg_that_the_route_does_not_have_is_refused(leg: float) -> None:
+def test_leg_that_route_does_not_have_refused(leg: float) -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))  # a line and the orbit
     with pytest.raises(ChannelError, match=f"target.leg: found {leg:g}, expected a whole number from 0 to 1"):
@@ -190,7 +190,7 @@ def test_a_leg_that_the_route_does_not_have_is_refused(leg: float) -> None:
     assert run(made, 1, 2)["leg"][0] == 0.0
 
 
-def test_a_new_route_voids_the_legs_of_the_program() -> None:
+def test_new_route_voids_legs_of_program() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.07], "value": [26.0]}}
     made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
@@ -200,7 +200,7 @@ def test_a_new_route_voids_the_legs_of_the_program() -> None:
     assert signal["target.V"][-1] == 26.0
 
 
-def test_a_new_route_leaves_the_airspeed_of_a_program_step_with_a_leg() -> None:
+def test_new_route_leaves_airspeed_of_program_step_with_leg() -> None:
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.05], "value": [26.0]}}
     made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
@@ -211,7 +211,7 @@ def test_a_new_route_leaves_the_airspeed_of_a_program_step_with_a_leg() -> None:
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
-def test_a_route_that_is_sent_while_guidance_is_off_is_flown_from_its_engagement(by: str) -> None:
+def test_route_that_sent_while_guidance_is_off_flown_from_engagement(by: str) -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
 
     def switch(*, on: bool) -> None:
@@ -235,7 +235,7 @@ def test_a_route_that_is_sent_while_guidance_is_off_is_flown_from_its_engagement
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
-def test_commands_of_the_time_in_which_another_flew_are_not_flown(by: str) -> None:
+def test_commands_of_time_in_which_another_flew_are_not_flown(by: str) -> None:
     made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
     made.take_target({"altitude": 300.0})
     if by == "guidance/engage":
@@ -258,7 +258,7 @@ def test_commands_of_the_time_in_which_another_flew_are_not_flown(by: str) -> No
     assert (signal["mode.vertical"][0], signal["target.climb"][0]) == (Vertical.CLIMB, 1.0)
 
 
-def test_a_skip_on_the_last_leg_is_refused_and_leaves_the_commands() -> None:
+def test_skip_on_last_leg_refused_and_leaves_commands() -> None:
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
     assert run(made, 1, 2)["leg"][0] == 0.0
@@ -270,7 +270,7 @@ def test_a_skip_on_the_last_leg_is_refused_and_leaves_the_commands() -> None:
     assert run(made, 4, 5)["target.altitude"][0] == 180.0
 
 
-def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> None:
+def test_without_fresh_y_there_is_no_command_and_frozen_pose_refused() -> None:
     made = flying()
     assert made.step(400 * MS, 400 * MS) is None
     with pytest.raises(ChannelError, match="sample: stamp 0 s before the last one"):
@@ -281,7 +281,7 @@ def test_without_fresh_y_there_is_no_command_and_a_frozen_pose_is_refused() -> N
 
 
 @pytest.mark.parametrize(("gap", "continues"), [(5, True), (50, False)])
-def test_after_a_short_pause_the_commands_go_on_from_the_last_ones(gap: int, continues: bool) -> None:
+def test_after_short_pause_commands_go_on_from_last_ones(gap: int, continues: bool) -> None:
     made = flying()
     made.take_target({"phi": 0.5})
     before = run(made, 1, 9, np.zeros(4))
@@ -299,7 +299,7 @@ def test_after_a_short_pause_the_commands_go_on_from_the_last_ones(gap: int, con
     )  # a step of the slew limit; otherwise it starts from zero
 
 
-def test_a_new_command_continues_the_climb_rate_and_bounds_the_slew_of_u_m() -> None:
+def test_new_command_continues_climb_rate_and_bounds_slew_of_u_m() -> None:
     made = flying()
     made.take_target({"phi": 0.5, "climb": 2.0})
     signal = run(made, 1, 100, np.zeros(4))
@@ -324,7 +324,7 @@ def test_a_new_command_continues_the_climb_rate_and_bounds_the_slew_of_u_m() -> 
         ({"leg": 0.0}, "target.leg: found no route, expected one"),
     ],
 )
-def test_a_command_that_cannot_be_flown_is_refused_and_changes_nothing(values: dict[str, float], sentence: str) -> None:
+def test_command_that_cannot_be_flown_refused_and_changes_nothing(values: dict[str, float], sentence: str) -> None:
     made = flying()
     with pytest.raises(ChannelError, match=sentence):
         made.take_target(values)
@@ -355,7 +355,7 @@ def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], se
         GuidanceConfig.validate_mapping(SECTION | section, "guidance")
 
 
-def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
+def test_numbers_that_left_out_follow_from_other_sections() -> None:
     section = ROUTE.guidance
     assert section is not None
     assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
@@ -384,12 +384,12 @@ def test_the_numbers_that_are_left_out_follow_from_the_other_sections() -> None:
         ({"guidance": {"rate": 40.0}}, r"guidance.rate: found 40 Hz, expected a whole fraction of the rate of pose \(50 Hz\)"),
     ],
 )
-def test_sections_that_do_not_fit_guidance_are_refused(changes: dict[str, Any], sentence: str) -> None:
+def test_sections_that_do_not_fit_guidance_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         ROUTE.vary(**changes)
 
 
-def test_commands_beyond_the_bounds_of_the_reference_model_are_refused_and_the_flight_goes_on() -> None:
+def test_commands_beyond_bounds_of_reference_model_refused_and_flight_goes_on() -> None:
     turn = calm(6.0, program=program(heading=2.0)).vary(reference_model={"live": {"speed": 25.0, "bounds": {"p": 0.1}}})
     tape = simulate(turn)
     assert tape.outcome == "completed"
@@ -412,14 +412,14 @@ def test_an_airframe_of_one_plane_is_refused() -> None:
         guidance_by_rule(sections["aircraft"], sections["reference_model"], sections["controller"])
 
 
-def test_a_scenario_with_guidance_is_restored_from_its_parameters(tmp_path: Path) -> None:
+def test_scenario_with_guidance_restored_from_parameters(tmp_path: Path) -> None:
     path = tmp_path / "again.yaml"
     path.write_text(scenario_yaml(ROUTE), encoding="utf-8")
     assert load_scenario(path).guidance == ROUTE.guidance
     assert find_scenario("osprey_gust").guidance is None
 
 
-def test_an_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: Path) -> None:
+def test_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: Path) -> None:
     before, route, after = ROUTE.path.read_text(encoding="utf-8").partition("/**/guidance:")
     path = tmp_path / "empty.yaml"
     rest = after[after.index("\n/**/") :]
@@ -431,13 +431,13 @@ def test_an_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: P
     assert load_scenario(path).guidance is None
 
 
-def test_every_step_of_a_guided_flight_has_a_command_from_t_0_on() -> None:
+def test_every_step_of_guided_flight_has_command_from_t_0_on() -> None:
     tape = simulate(calm(1.0))
     assert tape["u_m"].stamp_ns.tolist() == [nanoseconds(0.02 * k) for k in range(51)]
     assert tape["u_m"].names == ("q", "V", "p", "r", "phi", "theta")
 
 
-def test_replay_computes_every_step_again_and_names_the_first_difference() -> None:
+def test_replay_computes_every_step_again_and_names_first_difference() -> None:
     scenario = calm(4.0, program=program(heading=0.5))
     tape = simulate(scenario)
     result = replay_guidance(tape, scenario.guidance)
@@ -449,7 +449,7 @@ def test_replay_computes_every_step_again_and_names_the_first_difference() -> No
     assert (changed.first.number, changed.first.channel, changed.first.ulps) == (101, "published.p", 1)
 
 
-def test_replay_leaves_a_route_that_arrived_in_flight_unchecked() -> None:
+def test_replay_leaves_route_that_arrived_in_flight_unchecked() -> None:
     scenario = calm(2.0, route={"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]})
     section = calm(2.0).guidance
     result = replay_guidance(simulate(scenario), section)
@@ -488,7 +488,7 @@ def path_message(*points: tuple[float, float, float]) -> bytes:
     return bytes(typestore().serialize_cdr(types[PATH](header, poses), PATH))
 
 
-def test_a_route_that_arrives_in_flight_is_read_from_the_log_replayed_and_drawn(tmp_path: Path) -> None:
+def test_route_that_arrives_in_flight_read_from_log_replayed_and_drawn(tmp_path: Path) -> None:
     scenario = calm(3.0)
     section = scenario.guidance
     assert section is not None
@@ -506,7 +506,7 @@ def test_a_route_that_arrives_in_flight_is_read_from_the_log_replayed_and_drawn(
     assert replay_guidance(flown, section).checked == 50  # without the route: those before it
 
 
-def test_a_log_with_an_empty_route_alone_is_read(tmp_path: Path) -> None:
+def test_log_with_empty_route_alone_read(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run") as bag:
         y, route = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/route", PATH, "")
         bag.write(y, 1, 1, 0, vector(1, ["q"], [0.1]))
@@ -514,7 +514,7 @@ def test_a_log_with_an_empty_route_alone_is_read(tmp_path: Path) -> None:
     assert [*read_run(tmp_path / "run").tape.signals] == ["y"]
 
 
-def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None:
+def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     file = tmp_path / "line.yaml"
     file.write_text("route: [[0, 0, 0], [800, 0, 10, 26.5], [800, 900, 10]]", encoding="utf-8")
     scenario = written(with_route(ROUTE, read_route(file)), tmp_path / "osprey_route.yaml")
@@ -541,13 +541,13 @@ def test_a_route_file_is_flown_and_stays_with_the_flight(tmp_path: Path) -> None
         (["fly", "--in-process", "--origin", "47.4,8.5"], "--origin: found no --route, expected the file of a route"),
     ],
 )
-def test_bad_words_of_the_command_line_are_one_sentence(words: list[str], sentence: str) -> None:
+def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: str) -> None:
     result = CliRunner().invoke(application([*COMMANDS]), words)
     assert isinstance(result.exception, ParameterError)
     assert sentence in str(result.exception)
 
 
-def test_a_climb_that_the_throttle_cannot_sustain_slows_and_leaves_the_airspeed() -> None:
+def test_climb_that_throttle_cannot_sustain_slows_and_leaves_airspeed() -> None:
     # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
     weak = calm(40.0, program=program(climb=2.5)).vary(aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}})
     tape = simulate(weak)
@@ -563,7 +563,5 @@ def test_a_climb_that_the_throttle_cannot_sustain_slows_and_leaves_the_airspeed(
 @pytest.mark.parametrize(
     ("shortfall", "expected"), [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))]
 )
-def test_climb_and_sink_fall_with_the_departure_of_the_airspeed_from_its_command(
-    shortfall: float, expected: tuple[float, float]
-) -> None:
+def test_climb_and_sink_fall_with_departure_of_airspeed_from_command(shortfall: float, expected: tuple[float, float]) -> None:
     assert climb_range(2.0, 3.0, shortfall, 25.0) == pytest.approx(expected, abs=5e-3)  # d = 9.81 x 2 / (0.4 x 25) = 1.96

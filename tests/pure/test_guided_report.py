@@ -56,7 +56,7 @@ def after(instant: float, value: float) -> FloatArray:
     return np.where(instant <= T, value, 0.0)
 
 
-def test_a_segment_ends_where_the_mode_the_command_or_the_leg_changes() -> None:
+def test_segment_ends_where_mode_command_or_leg_changes() -> None:
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
     found = segments(log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0)))
     assert [(one.start, one.stop) for one in found] == [near(0.0, 10.0), near(10.0, 20.0), near(20.0, 30.0), near(30.0, 39.98)]
@@ -64,7 +64,7 @@ def test_a_segment_ends_where_the_mode_the_command_or_the_leg_changes() -> None:
     assert [one.lateral.quantity for one in found] == ["heading", "xtrack", "xtrack", "xtrack"]
 
 
-def test_commands_less_than_a_second_apart_begin_one_segment() -> None:
+def test_commands_less_than_second_apart_begin_one_segment() -> None:
     assert len(segments(log(target__heading=after(10.0, 0.5) + after(10.5, 0.1)))) == 2
 
 
@@ -81,18 +81,18 @@ def test_a_step_has_overshoot_and_settling() -> None:
     assert step.settling == pytest.approx(last + 0.02 - 5.0, abs=1e-6)
 
 
-def test_what_begins_within_its_band_has_no_step() -> None:
+def test_what_begins_within_band_has_no_step() -> None:
     held = segments(log(pose__altitude=3.0))[0].vertical
     assert (held.rms, held.max) == near(3.0, 3.0)
     assert (held.overshoot, held.settling) == (None, None)
 
 
-def test_a_heading_error_is_that_of_the_shorter_side() -> None:
+def test_heading_error_is_that_of_shorter_side() -> None:
     held = segments(log(pose__psi=math.radians(-179.0), target__heading=math.radians(179.0)))[0].lateral
     assert held.max == pytest.approx(math.radians(2.0))
 
 
-def test_the_summary_names_bank_age_and_limited_commands() -> None:
+def test_summary_names_bank_age_and_limited_commands() -> None:
     tape = log(pose__phi=after(10.0, -0.4), age__pose=after(39.0, 0.3), limited__bank=after(30.0, 1.0))
     summary = guidance_summary(tape)
     assert summary is not None
@@ -103,7 +103,7 @@ def test_the_summary_names_bank_age_and_limited_commands() -> None:
     json.dumps(summary)
 
 
-def test_the_wind_follows_from_the_velocities_over_ground_and_through_the_air() -> None:
+def test_wind_follows_from_velocities_over_ground_and_through_air() -> None:
     # To the east at 40 m/s through the air, climbing at 4 m/s, 3 m/s faster than trim, in a wind to (1, -6).
     level = math.sqrt(43.0**2 - 4.0**2)
     tape = log(
@@ -135,7 +135,7 @@ def curve(figure: Figure, name: str, row: int) -> FloatArray:
     return np.asarray(trace.y, dtype=float)
 
 
-def test_the_ground_track_has_equal_axes_and_arrows_of_the_wind() -> None:
+def test_ground_track_has_equal_axes_and_arrows_of_wind() -> None:
     figure = drawn(guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED))
     assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
     assert [trace.name for trace in figure.data] == ["flown", "wind, the longest arrow 5 m/s"]
@@ -145,7 +145,7 @@ def test_the_ground_track_has_equal_axes_and_arrows_of_the_wind() -> None:
     assert not drawn(guided_figures.track_figure(log(), [], SPEED)).layout.annotations
 
 
-def test_commands_and_limits_are_drawn_in_display_units() -> None:
+def test_commands_and_limits_drawn_in_display_units() -> None:
     tape = log(phi_c=after(10.0, math.radians(20.0)), mode__vertical=np.where(T < 20.0, Vertical.ALTITUDE, Vertical.CLIMB))
     context, bounds = context_of(tape), {"V": (30.0, math.inf), "phi": (-0.5, 0.5)}
     attitude = guided_figures.attitude_figure(context, bounds)
@@ -160,7 +160,7 @@ def test_commands_and_limits_are_drawn_in_display_units() -> None:
     assert curve(vertical, "flown", 2)[0] == SPEED
 
 
-def test_the_cross_track_error_is_drawn_by_leg_where_a_path_is_followed() -> None:
+def test_cross_track_error_drawn_by_leg_where_path_followed() -> None:
     assert guided_figures.cross_track_figure(context_of(log())) is None
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
     figure = drawn(guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0))))
@@ -187,7 +187,7 @@ def flight() -> RecordedFlight:
     return RecordedFlight("osprey_route", scenario, tape, summarise(scenario, tape, tape.outcome))
 
 
-def test_the_figures_of_a_flight_are_those_of_its_scenario(flight: RecordedFlight) -> None:
+def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None:
     (route,) = guided_figures.flown_routes(flight.scenario, flight.tape)
     assert isinstance(route.legs[0], Line)
     assert isinstance(route.legs[1], Arc)
@@ -196,7 +196,7 @@ def test_the_figures_of_a_flight_are_those_of_its_scenario(flight: RecordedFligh
     assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
 
 
-def test_a_comparison_draws_all_ground_tracks_over_the_route(flight: RecordedFlight, tmp_path: Path) -> None:
+def test_comparison_draws_all_ground_tracks_over_route(flight: RecordedFlight, tmp_path: Path) -> None:
     other = flight._replace(name="other")
     write_page(tmp_path / "page.html", [flight, other])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -207,7 +207,7 @@ def test_a_comparison_draws_all_ground_tracks_over_the_route(flight: RecordedFli
     assert [trace.name for trace in figure.data] == ["route", "one", "two"]
 
 
-def test_a_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:
+def test_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:
     t = flight.tape.time("y")
     assert set(part_masks(t, transients(flight.scenario, flight.tape))) == {"whole", "calm", "capture", "turn", "gust"}
     tables = {table.caption: table for table in flight_tables(flight.summary, {}, [])}

@@ -15,27 +15,27 @@ from flight_core.tape import Signal, Tape
 PERIOD_NS = 2_000_000
 
 
-def test_a_skip_without_a_host_delay_counts_each_of_its_periods() -> None:
+def test_skip_without_host_delay_counts_each_of_periods() -> None:
     skipped = [(0, 2 * PERIOD_NS), (10 * PERIOD_NS, 11 * PERIOD_NS + 1)]
     assert missed_excluding_delays(skipped, [], PERIOD_NS) == 3
     assert missed_excluding_delays(skipped, [(2 * PERIOD_NS, 9 * PERIOD_NS)], PERIOD_NS) == 3  # a delay at another time
 
 
-def test_a_skip_within_a_host_delay_does_not_count() -> None:
+def test_skip_within_host_delay_does_not_count() -> None:
     assert missed_excluding_delays([(0, 3 * PERIOD_NS + 1000)], [(-PERIOD_NS, 3 * PERIOD_NS)], PERIOD_NS) == 0
 
 
-def test_the_rest_of_a_skip_counts_in_whole_periods() -> None:
+def test_rest_of_skip_counts_in_whole_periods() -> None:
     assert missed_excluding_delays([(0, 5 * PERIOD_NS)], [(0, 2 * PERIOD_NS)], PERIOD_NS) == 3
     assert missed_excluding_delays([(0, 5 * PERIOD_NS)], [(0, 2 * PERIOD_NS + 1)], PERIOD_NS) == 2
 
 
-def test_a_delay_of_two_cores_at_once_is_subtracted_once() -> None:
+def test_delay_of_two_cores_at_once_subtracted_once() -> None:
     delays = [(0, 2 * PERIOD_NS), (PERIOD_NS, 3 * PERIOD_NS), (PERIOD_NS, 2 * PERIOD_NS)]
     assert missed_excluding_delays([(0, 5 * PERIOD_NS)], delays[::-1], PERIOD_NS) == 2
 
 
-def test_a_pause_of_a_second_counts_inside_a_window_and_not_outside_of_it() -> None:
+def test_pause_of_second_counts_inside_window_and_not_outside_of_it() -> None:
     deadlines = np.delete(np.arange(0, 4 * NANOSECONDS, PERIOD_NS), slice(501, 1001))  # none from 1.002 s to 2.000 s
     internals = Signal(deadlines, ("age", "late"), np.tile((1e-3, 1e-3), (len(deadlines), 1)))  # a tick 1 ms after its deadline
     inside, outside = (NANOSECONDS // 2, 3 * NANOSECONDS), (3 * NANOSECONDS, 4 * NANOSECONDS)
@@ -47,7 +47,7 @@ def test_a_pause_of_a_second_counts_inside_a_window_and_not_outside_of_it() -> N
     assert figures_of_ticks(internals, delay, PERIOD_NS)["missed ticks, excluding host delays"] == 250
 
 
-def test_instants_that_a_late_tick_skips_are_missing_samples_except_in_host_delays() -> None:
+def test_instants_that_late_tick_skips_are_missing_samples_except_in_host_delays() -> None:
     scenario = triangle(1.0, observer=True)  # y and y_m at 500 Hz, u_m and guidance at 50 Hz
     every = np.arange(0, 100 * PERIOD_NS, PERIOD_NS)
     slow = Signal(every[::10], (), np.zeros((10, 0)))

@@ -83,7 +83,7 @@ STRAIGHT = lagged(np.diag([3.0, 3.0]), np.array([0.02, 0.02]))
     coupled=st.floats(-0.5, 0.5),
     lag=st.lists(st.floats(0.01, 0.1), min_size=2, max_size=2),
 )
-def test_omega_and_lags_of_a_linear_system_are_identified(
+def test_omega_and_lags_of_linear_system_identified(
     Omega: list[float], signs: list[float], coupled: float, lag: list[float]
 ) -> None:
     # The last chord begins 0.5 - 0.025 s after the step: what is left of the lag there is exp(-4.75) = 0.9 % of the slope,
@@ -96,7 +96,7 @@ def test_omega_and_lags_of_a_linear_system_are_identified(
     assert found.rejected == ()
 
 
-def test_the_tangent_of_a_damped_rate_is_its_initial_slope() -> None:
+def test_tangent_of_damped_rate_is_initial_slope() -> None:
     # y = b/a (1 - exp(-a t)): the first chord of s = 25 ms has the slope b (1 - exp(-a s)) / (a s) and, at its middle, no lag.
     a, b = 8.0, -5.0
     t = DT * np.arange(101)
@@ -120,7 +120,7 @@ def test_a_constant_response_has_no_tangent() -> None:
     assert steepest_tangent(np.zeros(101), DT) is None
 
 
-def test_drift_and_even_parts_of_the_response_cancel() -> None:
+def test_drift_and_even_parts_of_response_cancel() -> None:
     known, lag = np.diag([3.0, -2.0]), np.array([0.05, 0.02])
     straight = lagged(known, lag)
 
@@ -133,7 +133,7 @@ def test_drift_and_even_parts_of_the_response_cancel() -> None:
     assert found.lag == pytest.approx(clean.lag, abs=1e-9)
 
 
-def test_the_largest_step_determines_omega_behind_a_dead_zone() -> None:
+def test_largest_step_determines_omega_behind_dead_zone() -> None:
     # Half a dead zone of 0.06 hides the step of 0.05 and removes 30 % of that of 0.2: the slope is 0.7 of the true one.
     def dead(u: FloatArray, duration: float) -> FloatArray:
         return STRAIGHT(u - np.clip(u, -0.06, 0.06), duration)
@@ -155,7 +155,7 @@ def test_steps_stay_inside_the_stops() -> None:
     assert sorted(set(steps)) == pytest.approx([0.05, 0.09, 0.1, 0.2])
 
 
-def test_a_step_that_ends_the_flight_is_rejected_with_its_reason() -> None:
+def test_step_that_ends_flight_rejected_with_reason() -> None:
     def fragile(u: FloatArray, duration: float) -> FloatArray:
         if np.max(np.abs(u)) > 0.15:
             raise FlightEnded("gave up at t = 0.10 s")
@@ -172,7 +172,7 @@ def test_an_output_without_response_ends_the_identification() -> None:
 
 
 @pytest.mark.parametrize(("speed", "authority"), [(30.0, 0.8), (150.0, 2.5), (250.0, 0.4)])
-def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, authority: float) -> None:
+def test_commanded_airspeed_needs_third_of_throttle(speed: float, authority: float) -> None:
     # The filter's answer to a step, 2 m/s (1 - (1 + w t) exp(-w t)), is steepest at t = 1/w: 2 m/s w / e. The pulse's edge of
     # 0.1 s rounds that off by less than 1 %.
     params = ReferenceModelConfig.validate_mapping(reference_parameters(speed, authority), "reference_model")
@@ -185,7 +185,7 @@ def test_the_commanded_airspeed_needs_a_third_of_the_throttle(speed: float, auth
 
 
 @pytest.mark.parametrize(("altitude", "keys"), [(100.0, {"wind"}), (500.0, {"wind", "sigma"}), (3000.0, {"sigma"})])
-def test_moderate_turbulence_has_the_parameters_of_its_altitude(altitude: float, keys: set[str]) -> None:
+def test_moderate_turbulence_has_parameters_of_altitude(altitude: float, keys: set[str]) -> None:
     assert set(moderate_turbulence(altitude)) == {"altitude", "seed"} | keys
     section = {"airframe": "jsbsim:c172p", "speed": 46.3, "altitude": altitude, "rate": 200.0, "step": 0.005}
     find_scenario("jsbsim_c172p").vary(aircraft=section | {"turbulence": moderate_turbulence(altitude)})  # is accepted
@@ -196,7 +196,7 @@ def cessna() -> IdentifiedAircraft:
     return identify("c172p", 46.3, 1219.2)
 
 
-def test_signs_and_pairing_of_an_aircraft_are_found(cessna: IdentifiedAircraft) -> None:
+def test_signs_and_pairing_of_aircraft_found(cessna: IdentifiedAircraft) -> None:
     # Elevator and rudder of JSBSim's convention turn nose down and nose left: the signs of all its conventional aircraft.
     assert cessna.D == (-1, 1, 1, -1)
     assert cessna.coupling < 1.0
@@ -207,7 +207,7 @@ def test_signs_and_pairing_of_an_aircraft_are_found(cessna: IdentifiedAircraft) 
     assert cessna.failure == ""
 
 
-def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircraft) -> None:
+def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> None:
     # Numbers in the file have six digits; other machines may round the last ones of a flight differently.
     shipped = yaml.safe_load(find_scenario("jsbsim_c172p").path.read_text(encoding="utf-8"))
     written = yaml.safe_load(cessna.text)
@@ -219,7 +219,7 @@ def test_the_shipped_scenario_is_what_the_command_writes(cessna: IdentifiedAircr
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
 
 
-def test_the_airspeed_holds_the_wind_without_moving_the_throttle_from_stop_to_stop(cessna: IdentifiedAircraft) -> None:
+def test_airspeed_holds_wind_without_moving_throttle_from_stop_to_stop(cessna: IdentifiedAircraft) -> None:
     controller, light, moderate = cessna.selection.engineering.controller, 1.52, 3.05  # m/s, rms of turbulence
     K, V = 1.0 + controller.k_g, controller.outputs.index("V")
     assert controller.beta[V] == pytest.approx(K * controller.Lambda[V] * light, rel=1e-6)
@@ -235,7 +235,7 @@ def test_the_airspeed_holds_the_wind_without_moving_the_throttle_from_stop_to_st
 
 
 @pytest.mark.parametrize("authority", [0.1, 100.0])
-def test_the_airspeed_is_as_fast_as_throttle_and_engine_allow(authority: float) -> None:
+def test_airspeed_is_as_fast_as_throttle_and_engine_allow(authority: float) -> None:
     # 5 s of lag, and 1.5 periods of 10 ms, and 6 ms of topics; 0.46 rad of phase, 3.05 m/s of wind
     assert airspeed_bandwidth(authority, 5.0) == pytest.approx(min(0.46 / 5.021, authority / 3.05), rel=1e-12)
 
@@ -258,7 +258,7 @@ def f15() -> IdentifiedAircraft:
     return identified_by("f15", 180.0, 4572.0, "calm", guided=True)
 
 
-def test_the_stall_speed_of_guidance_is_the_slowest_trim(f15: IdentifiedAircraft) -> None:
+def test_stall_speed_of_guidance_is_slowest_trim(f15: IdentifiedAircraft) -> None:
     section, condition = f15.scenario().guidance, f15.condition
     assert section is not None
     assert section.stall_speed is not None
@@ -267,7 +267,7 @@ def test_the_stall_speed_of_guidance_is_the_slowest_trim(f15: IdentifiedAircraft
         trim_solution(condition._replace(speed=section.stall_speed - 0.011 * condition.speed))
 
 
-def test_guidance_with_sideslip_feedback_flies_holds_and_turns_of_the_f15(f15: IdentifiedAircraft) -> None:
+def test_guidance_with_sideslip_feedback_flies_holds_and_turns_of_f15(f15: IdentifiedAircraft) -> None:
     assert f15.sideslip_zero > 0.0
     assert f15.failure == ""
     log = simulate(f15.scenario().vary(aircraft={"gusts": {}}))["guidance"]
@@ -281,7 +281,7 @@ def test_without_sideslip_feedback_the_f15_is_lost(f15: IdentifiedAircraft) -> N
     assert lost.rms["V"] > 10.0  # m/s, of a command that is constant
 
 
-def test_an_extended_state_observer_lowers_every_error_in_turbulence(cessna: IdentifiedAircraft) -> None:
+def test_extended_state_observer_lowers_every_error_in_turbulence(cessna: IdentifiedAircraft) -> None:
     # measured 0.53, 0.81, 0.87, 0.56 in q, V, p, r; half of V is the wind itself
     observed = identified_by("c172p", 46.3, 1219.2, "turbulence", observer_margin=0.015).flights["turbulence"].rms
     for output, alone in cessna.flights["turbulence"].rms.items():
@@ -289,7 +289,7 @@ def test_an_extended_state_observer_lowers_every_error_in_turbulence(cessna: Ide
 
 
 @pytest.mark.parametrize("name", PROTOTYPE)
-def test_shipped_aircraft_fly_closer_than_the_prototype_did(name: str, cessna: IdentifiedAircraft) -> None:
+def test_shipped_aircraft_fly_closer_than_prototype_did(name: str, cessna: IdentifiedAircraft) -> None:
     calm, gust = PROTOTYPE[name]
     # The shipped scenario of the c172p is that of `cessna`: the test above.
     flights = cessna.flights if name == "jsbsim_c172p" else fly_all(find_scenario(name))
@@ -314,7 +314,7 @@ def rise_di(*arguments: str) -> Result:
         ("jsbsim:f61", "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim: and another of 737, "),
     ],
 )
-def test_an_airframe_that_is_none_of_jsbsim_is_refused_with_one_sentence(
+def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(
     airframe: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -324,7 +324,7 @@ def test_an_airframe_that_is_none_of_jsbsim_is_refused_with_one_sentence(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
+def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
     """In a process of its own: JSBSim itself prints nothing either."""
     words = [sys.executable, "-m", "flight_cli.cli", "identify", "jsbsim:dr1", "--speed", "46", "--altitude", "900"]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -334,7 +334,7 @@ def test_an_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> No
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_is_overwritten_only_if_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_overwritten_only_if_it_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
     refused = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception

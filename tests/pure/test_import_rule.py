@@ -131,7 +131,7 @@ def test_units_import_what_the_table_says() -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_every_source_file_belongs_to_a_unit_of_the_table() -> None:
+def test_every_source_file_belongs_to_unit_of_table() -> None:
     packages = {"flight_analysis"}  # its units are its subpackages and metrics
     strays = [path for path in FILES if "launch" not in path.parts and unit_of(module_of(path)) is None]
     assert {module_of(path).removesuffix(".__init__") for path in strays} <= packages
@@ -141,7 +141,7 @@ def test_no_unit_imports_itself_over_others() -> None:
     assert len(list(TopologicalSorter(IMPORTS).static_order())) == len(IMPORTS)  # raises CycleError
 
 
-def test_the_architecture_page_shows_the_table_in_layers() -> None:
+def test_architecture_page_shows_table_in_layers() -> None:
     page = (REPOSITORY / "docs" / "architecture.md").read_text(encoding="utf-8")
     lines = re.findall(r"^```text\n(.*?)```$", page, re.MULTILINE | re.DOTALL)[0].splitlines()
     sorter = TopologicalSorter(IMPORTS)
@@ -160,7 +160,7 @@ def modules_loaded_by(code: str) -> set[str]:
     return set(shown.stdout.split())
 
 
-def test_the_command_line_shows_its_help_without_loading_what_commands_need() -> None:
+def test_command_line_shows_help_without_loading_what_commands_need() -> None:
     heavy = {"rclpy", "flight_ros", "numpy", "scipy", "pydantic", "jax", "plotly", "polars", "jsbsim", "rosbags"}
     assert not modules_loaded_by("from flight_cli.cli import application\napplication([])") & heavy
 
@@ -169,10 +169,10 @@ NODES = ["rise_di_controller", "reference_model", "flight_guidance", "autopilot_
 
 
 @pytest.mark.parametrize("node", NODES)
-def test_a_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
+def test_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
     assert not modules_loaded_by(f"import {node}.node") & {"scipy", "jsbsim", "plotly", "jax", "rosbags"}
 
 
 @pytest.mark.parametrize("module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"])
-def test_a_flight_loads_no_library_of_the_report(module: str) -> None:
+def test_flight_loads_no_library_of_report(module: str) -> None:
     assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib", "ruamel"}

@@ -89,7 +89,7 @@ def test_in_trim_every_deviation_is_zero() -> None:
     assert model.trim.states[list(STATES).index("altitude")] == pytest.approx(1219.2, rel=1e-6)
 
 
-def test_end_stops_are_those_of_the_whole_command() -> None:
+def test_end_stops_are_those_of_whole_command() -> None:
     trim = cessna().trim
     # The nose-down pitch trim uses a part of the elevator.
     assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])
@@ -106,7 +106,7 @@ def test_end_stops_are_those_of_the_whole_command() -> None:
         ("rudder", "r", -1.0, 0.2),  # nose left
     ],
 )
-def test_a_positive_command_has_the_sign_of_the_table(name: str, output: str, sign: float, duration: float) -> None:
+def test_positive_command_has_sign_of_table(name: str, output: str, sign: float, duration: float) -> None:
     truth = fly(cessna(), command(**{name: 0.1}), duration)
     # A tenth of the travel for this long moves its own output by 0.016 (rudder) to 0.08 rad/s, or 0.07 m/s.
     assert sign * truth[f"x.{output}"][-1] > 0.01
@@ -172,7 +172,7 @@ def test_two_flights_agree_to_the_last_bit() -> None:
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
-def test_a_flight_in_another_process_agrees_to_the_last_bit() -> None:
+def test_flight_in_another_process_agrees_to_last_bit() -> None:
     # c182 needs the solver's trim. A third process finds it, and both apply its result.
     code = (
         "from tests.pure.test_jsbsim import *\n"
@@ -194,13 +194,13 @@ def test_nothing_is_printed_and_nothing_written(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_hang_in_the_isolated_process_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hang_in_isolated_process_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(isolated, "WAIT", 2.0)
     with pytest.raises(isolated.IsolatedCallError, match=r"^timed out after 2 s$"):
         isolated.call(time.sleep, 3600, timeout=1.0)
 
 
-def test_a_computation_without_end_in_the_isolated_process_times_out_by_its_processor_time() -> None:
+def test_computation_without_end_in_isolated_process_times_out_by_processor_time() -> None:
     before = os.times()
     with pytest.raises(isolated.IsolatedCallError, match=r"^timed out after 2 s of processor time$"):
         isolated.call(re.match, "(a+)+$", "a" * 100 + "b", timeout=2.0)  # tries 2**100 ways
@@ -211,7 +211,7 @@ def test_a_computation_without_end_in_the_isolated_process_times_out_by_its_proc
     assert 1.0 < used < 3.5
 
 
-def test_the_isolated_process_keeps_a_limit_of_processor_time_that_the_user_has() -> None:
+def test_isolated_process_keeps_limit_of_processor_time_that_user_has() -> None:
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (60, 60))\n"
         "from aircraft_sim import isolated\n"
@@ -221,7 +221,7 @@ def test_the_isolated_process_keeps_a_limit_of_processor_time_that_the_user_has(
     assert done.stdout == "[30, 60] [60, 60]\n"  # raising the second number needs a privilege, setrlimit(2)
 
 
-def test_a_crash_an_exception_and_an_exit_of_the_isolated_process_are_errors_here() -> None:
+def test_crash_exception_and_exit_of_isolated_process_are_errors_here() -> None:
     with pytest.raises(isolated.IsolatedCallError, match="was killed by SIGSEGV"):
         isolated.call(ctypes.string_at, 0, timeout=120.0)
     with pytest.raises(isolated.IsolatedCallError, match=r"exited with status 1 \(ValueError: "):
@@ -231,7 +231,7 @@ def test_a_crash_an_exception_and_an_exit_of_the_isolated_process_are_errors_her
     assert isolated.call(math.hypot, 3.0, 4.0, timeout=120.0) == 5.0
 
 
-def test_a_crash_of_jsbsim_ends_a_flight_in_one_process_with_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     real = isolated.call
     monkeypatch.setattr(isolated, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
     # No other test has cached the trim of this condition.
@@ -250,13 +250,13 @@ def test_a_crash_of_jsbsim_ends_a_flight_in_one_process_with_a_sentence(monkeypa
     ],
     ids=["stalled", "engine", "glider", "property", "empty"],
 )
-def test_a_condition_without_trim_is_refused_in_one_sentence(condition: tuple[str, float, float], sentence: str) -> None:
+def test_condition_without_trim_refused_in_one_sentence(condition: tuple[str, float, float], sentence: str) -> None:
     with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
         cessna(condition=FlightCondition(*condition, STEP_NS))
     assert "\n" not in str(ended.value)
 
 
-def test_a_property_that_does_not_exist_is_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     cessna()  # caches the trim found with the real table
     wrong = dict(INPUTS) | {"rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")}
     monkeypatch.setattr(jsbsim_trim, "INPUTS", wrong)
@@ -277,7 +277,7 @@ def test_an_engine_that_stops_ends_a_flight() -> None:
         fly(model, command(), 1.0)
 
 
-def test_a_state_that_is_not_finite_counts_as_diverged() -> None:
+def test_state_that_is_not_finite_counts_as_diverged() -> None:
     model = cessna()
     assert not model.diverged()
     model._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
@@ -303,7 +303,7 @@ def test_parameters_that_do_not_fit_are_refused(changes: dict[str, Any], sentenc
         aircraft_parameters(**SECTION | changes)
 
 
-def test_without_jsbsim_its_aircraft_are_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_jsbsim_aircraft_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     aircraft_names.cache_clear()
     monkeypatch.setitem(sys.modules, "jsbsim", None)  # its import then fails
     with pytest.raises(ParameterError, match=r"^aircraft\.airframe: found no Python package jsbsim, expected it"):
@@ -317,7 +317,7 @@ def test_channels_match_the_tables() -> None:
     assert channels.speed == 46.3
 
 
-def test_sideslip_of_the_f15_grows_while_its_rates_are_held() -> None:
+def test_sideslip_of_f15_grows_while_rates_held() -> None:
     # In flight with p and r held (docs/experiments.md), sideslip grows from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
     assert sideslip_zero(FlightCondition("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
     assert sideslip_zero(CESSNA) < 0.0

@@ -145,7 +145,7 @@ CASES: tuple[tuple[str, dict[str, str], tuple[str, ...], tuple[str, ...]], ...] 
 )
 
 
-def test_every_launch_file_is_installed_and_tested_here() -> None:
+def test_every_launch_file_installed_and_tested_here() -> None:
     names = [path.name.removesuffix(".launch.py") for path in FILES]
     assert set(names) == {name for name, *_ in CASES}
     for path in FILES:
@@ -153,7 +153,7 @@ def test_every_launch_file_is_installed_and_tested_here() -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_every_argument_is_described_and_its_default_is_one_of_its_choices(path: Path) -> None:
+def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> None:
     arguments = every(stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py")))
     assert len({one.name for one in arguments}) == len(arguments) > 3
     for one in arguments:
@@ -187,7 +187,7 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
-def test_the_end_of_any_node_ends_the_launch_with_an_error(case: Case) -> None:
+def test_end_of_any_node_ends_launch_with_error(case: Case) -> None:
     actions, context, *_ = case
     for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
         assert node.on_exit is not None
@@ -199,7 +199,7 @@ def test_the_end_of_any_node_ends_the_launch_with_an_error(case: Case) -> None:
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
 
-def test_a_node_of_another_flight_does_not_start_the_second_stage(tmp_path: Path) -> None:
+def test_node_of_another_flight_does_not_start_second_stage(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
     for key in (f"/controller#{os.getpid()}", f"/controller#{os.getppid()}", "/controller#0", "/controller", "/controller#x"):
         assert publish(actions, context, key) == []
@@ -214,13 +214,13 @@ def test_a_node_of_another_flight_does_not_start_the_second_stage(tmp_path: Path
     ("namespace", "pushed", "full"),
     [("one", "", "/one"), ("one", "/fleet", "/fleet/one"), ("/one", "fleet", "/one"), ("", "fleet", "/fleet")],
 )
-def test_the_states_of_a_flight_are_those_in_its_namespace(namespace: str, pushed: str, full: str, tmp_path: Path) -> None:
+def test_states_of_flight_are_those_in_namespace(namespace: str, pushed: str, full: str, tmp_path: Path) -> None:
     actions, context = started("fly", pushed, namespace=namespace, runs=tmp_path)
     assert publish(actions, context, f"/controller#{PID}", topic=f"{full}/node_state") == []
     assert nodes(all_ready(actions, context, full))
 
 
-def test_no_line_of_the_output_starts_a_stage(tmp_path: Path) -> None:
+def test_no_line_of_output_starts_stage(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
     matchers = [one.event_handler.matcher for one in every(stand_in.RegisterEventHandler, actions)]
     assert matchers
@@ -228,7 +228,7 @@ def test_no_line_of_the_output_starts_a_stage(tmp_path: Path) -> None:
     assert set(context.ros_node.subscriptions) == {"/node_state"}
 
 
-def test_a_node_that_is_not_ready_in_time_is_named(tmp_path: Path) -> None:
+def test_node_that_is_not_ready_in_time_named(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
     (timer,) = every(TimerAction, actions)
     (warn,) = timer.actions
@@ -239,7 +239,7 @@ def test_a_node_that_is_not_ready_in_time_is_named(tmp_path: Path) -> None:
     assert warn.function(context) == []
 
 
-def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_completes_it(tmp_path: Path) -> None:
+def test_flight_ends_after_duration_and_in_lockstep_when_aircraft_completes_it(tmp_path: Path) -> None:
     follow = all_ready(*started("fly", duration=5, runs=tmp_path))
     (timer,) = every(TimerAction, follow)
     assert timer.period == pytest.approx(5.5, abs=0.4)  # and the half second in which nodes discover each other
@@ -256,7 +256,7 @@ def test_a_flight_ends_after_its_duration_and_in_lockstep_when_the_aircraft_comp
 
 
 @pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
-def test_the_live_page_is_served_where_it_is_asked_for_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
+def test_live_page_served_where_it_asked_for_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
     assert not every(ExecuteProcess, started(name, **given, runs=tmp_path)[0])
     actions, context = started(name, **given, watch="true", runs=tmp_path)
     (page,) = every(ExecuteProcess, actions)
@@ -267,7 +267,7 @@ def test_the_live_page_is_served_where_it_is_asked_for_and_may_end(name: str, gi
 
 
 @pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
-def test_rosbag2_records_the_topics_of_the_recorder_in_its_place(name: str, given: dict[str, str], tmp_path: Path) -> None:
+def test_rosbag2_records_topics_of_recorder_in_place(name: str, given: dict[str, str], tmp_path: Path) -> None:
     actions, context = started(name, **given, recorder="rosbag2", namespace="one", runs=tmp_path)
     (process,) = every(ExecuteProcess, actions)
     (run,) = tmp_path.iterdir()
@@ -291,7 +291,7 @@ def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: Path) -> None:
+def test_bridge_is_dry_run_by_default_and_topics_recorded(tmp_path: Path) -> None:
     actions, context = started("bridge", map="ardupilot", runs=tmp_path)
     bridge = overrides(nodes(all_ready(actions, context))["bridge"])
     assert bridge == {"map": str(LIBRARY / "ardupilot.yaml"), "dry_run": True}
@@ -308,7 +308,7 @@ def test_a_bridge_is_a_dry_run_by_default_and_its_topics_are_recorded(tmp_path: 
     assert ends(timer.actions)
 
 
-def test_a_bridge_with_a_flipped_sign_is_refused_before_anything_starts(tmp_path: Path) -> None:
+def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path) -> None:
     content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
     content["inputs"]["rudder"] = {**content["inputs"]["rudder"], "sign": -1}
     (tmp_path / "flipped.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
@@ -317,7 +317,7 @@ def test_a_bridge_with_a_flipped_sign_is_refused_before_anything_starts(tmp_path
     assert not list(tmp_path.glob("*-osprey_gust"))
 
 
-def test_limits_beyond_those_of_the_map_are_refused_before_anything_is_sent(tmp_path: Path) -> None:
+def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
     """The bridge clips u, which the anti-windup of the law does not know."""
     scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"  # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
     sentence = r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of thrust in the map ardupilot"
@@ -364,7 +364,7 @@ def test_topics_without_a_publisher_are_played(given: dict[str, str], topics: st
     assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (1.0, 0.0, False, "now")
 
 
-def test_playing_follows_the_arguments_and_the_end_of_the_log_is_the_end(short: Path, tmp_path: Path) -> None:
+def test_playing_follows_arguments_and_end_of_log_is_end(short: Path, tmp_path: Path) -> None:
     given = {"rate": "2", "start": "0.1", "loop": "true", "lockstep": "true", "recorder": "true"}
     actions, context = started("replay", run=short, runs=tmp_path, **given)
     assert overrides(nodes(actions)["controller"]) == {"lockstep": True, "y_rate": 500.0}
@@ -377,7 +377,7 @@ def test_playing_follows_the_arguments_and_the_end_of_the_log_is_the_end(short: 
         process.on_exit(ProcessExited("play-3", 2), context)
 
 
-def test_without_nodes_the_log_is_played_at_once(short: Path) -> None:
+def test_without_nodes_log_played_at_once(short: Path) -> None:
     actions, context = started("replay", run=short, controller="false")
     process = player(actions)
     assert options(process)["topics"] == "/internals,/pose,/truth,/u,/y,/y_m"

@@ -47,21 +47,21 @@ def test_literal_sign_gives_the_hand_worked_inputs() -> None:
     assert respond(one_channel(Sign.LITERAL), [1.0, 1.2, 0.9]) == pytest.approx([0.53, 0.745], abs=1e-15)
 
 
-def test_implicit_sign_applies_the_saturated_sign_in_the_same_tick() -> None:
+def test_implicit_sign_applies_saturated_sign_in_same_tick() -> None:
     # e_hat = 1.2 + 0.2 - 0.1 2 (0.2 + 3 0.11) = 1.294, over dt^2 omega beta = 0.04 is above 1: s = 1, Pi = 0.4
     # v = 1.06 + 0.4
     assert respond(one_channel(Sign.IMPLICIT), [1.0, 1.2]) == pytest.approx([0.73], abs=1e-15)
 
 
 @pytest.mark.equation(21)
-def test_implicit_sign_takes_the_value_that_makes_the_predicted_error_zero() -> None:
+def test_implicit_sign_takes_value_that_makes_predicted_error_zero() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
     assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
 
 
 @pytest.mark.equation(21)
-def test_softened_sign_is_proportional_inside_its_width_and_one_outside() -> None:
+def test_softened_sign_is_proportional_inside_width_and_one_outside() -> None:
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) + 0.2 = 0.315
     assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
     # e = 1.2 from 1: s = 1, as with the implicit sign
@@ -69,7 +69,7 @@ def test_softened_sign_is_proportional_inside_its_width_and_one_outside() -> Non
 
 
 @pytest.mark.equation(3)
-def test_input_is_zero_at_engagement_whatever_the_error() -> None:
+def test_input_is_zero_at_engagement_whatever_error() -> None:
     # (20) with t = 0: u = -D K (e(0) - e(0)) - D Pi(0) = 0; the first step adds the integrals of one tick only.
     state = engage(np.array([5.0, -3.0]), np.array([1.0, 1.0]))
     assert state.e_0.tolist() == [4.0, -4.0]

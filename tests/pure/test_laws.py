@@ -166,7 +166,7 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
 
 @EVERY_LAW
 @pytest.mark.parametrize("size", [1e-6, 0.1, 1e6])
-def test_a_law_engages_without_a_jump_at_any_error(name: str, size: float) -> None:
+def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
     parameters, u = controller(name, lower=None, upper=None), np.array([0.1, -0.2, 0.3, -0.4])
     e = size * np.array([1.0, -2.0, 3.0, -4.0])
     engaged = tick(parameters, guard.initial_state(4)._replace(u=u), 0, e)
@@ -191,7 +191,7 @@ def test_limits_that_are_not_reached_change_no_bit(name: str, bound: float) -> N
 
 
 @EVERY_LAW
-def test_limits_of_magnitude_and_rate_are_kept_for_any_error(name: str) -> None:
+def test_limits_of_magnitude_and_rate_kept_for_any_error(name: str) -> None:
     parameters = controller(name, lower=[-0.02] * 4, upper=[0.01] * 4, slew=[0.05] * 4)
     # u_o of lqg is 0.6 of the limits within 0.1 s: 0.09 /s
     generator, state, us = np.random.default_rng(1), guard.initial_state(4), [np.zeros(4)]
@@ -249,7 +249,7 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
     np.testing.assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
 
 
-def test_the_integral_of_pi_keeps_its_value_and_e_0_takes_the_difference() -> None:
+def test_integral_of_pi_keeps_value_and_e_0_takes_difference() -> None:
     old, new = (controller("pi", K=[K] * 4, Lambda=[2.0] * 4).tuned_law() for K in (10.0, 4.0))
     state, _ = random_flight(old, 0.1)
     after = old.control_law.retune(state, old.params, new.params)
@@ -263,7 +263,7 @@ def test_the_integral_of_pi_keeps_its_value_and_e_0_takes_the_difference() -> No
 
 
 @EVERY_LAW
-def test_every_law_flies_and_a_replay_equals_the_flight_in_every_bit(name: str) -> None:
+def test_every_law_flies_and_replay_equals_flight_in_every_bit(name: str) -> None:
     scenario = flight(name)
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
@@ -278,13 +278,13 @@ def test_every_law_flies_and_a_replay_equals_the_flight_in_every_bit(name: str) 
 
 
 @pytest.mark.parametrize(("name", "groups"), [("rise_di", {"integral_e", "Pi"}), ("pi", {"integral_e"}), ("l1", set())])
-def test_a_layout_shows_the_integrals_that_the_law_has(name: str, groups: set[str]) -> None:
+def test_layout_shows_integrals_that_law_has(name: str, groups: set[str]) -> None:
     channels = layouts.channels_of(flight(name))
     text = layouts.foxglove(channels) + layouts.plotjuggler(channels)
     assert {group for group in ("integral_e", "Pi") if f"{group}.q" in text} == groups
 
 
-def test_gains_change_in_flight_but_neither_the_law_nor_an_observer() -> None:
+def test_gains_change_in_flight_but_neither_law_nor_observer() -> None:
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
         assert not controller(name).tunable() & {"law", "observer", "feedforward", "outputs", "D", "rate"}
@@ -301,7 +301,7 @@ def test_a_replay_equals_a_flight_through_failsafes(name: str) -> None:
 
 @EVERY_LAW
 @pytest.mark.parametrize("dropout", [0.0, 0.3])
-def test_a_replay_behind_a_gap_of_the_log_continues_from_the_recorded_state(name: str, dropout: float) -> None:
+def test_replay_behind_gap_of_log_continues_from_recorded_state(name: str, dropout: float) -> None:
     scenario = flight(name, {"sensors": {"dropout": dropout, "seed": 3}}, max_age=0.3)
     tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
     result = replay(tape, scenario.controller)
@@ -311,7 +311,7 @@ def test_a_replay_behind_a_gap_of_the_log_continues_from_the_recorded_state(name
 
 
 @EVERY_LAW
-def test_a_change_in_flight_is_replayed_and_another_gain_is_found(name: str) -> None:
+def test_change_in_flight_replayed_and_another_gain_found(name: str) -> None:
     scenario = flight(name)
     key = {"lqg": "hold", "l1": "K"}.get(name.partition(",")[0], "Lambda")
     change = {key: (0.9 * np.array(getattr(scenario.controller, key))).tolist()}
@@ -322,7 +322,7 @@ def test_a_change_in_flight_is_replayed_and_another_gain_is_found(name: str) -> 
     assert result.notes == (f"parameters changed before tick 30: {key}",)
 
 
-def test_another_law_or_an_observer_is_refused_in_flight() -> None:
+def test_another_law_or_observer_refused_in_flight() -> None:
     controller_of_pi = Controller(controller("pi"))
     for name in ("rise_di", "pid", "pi, observer"):
         expected = r"controller\.law: found \w+, expected the law and the observer that fly: these change at a restart"
@@ -334,7 +334,7 @@ def test_another_law_or_an_observer_is_refused_in_flight() -> None:
 
 
 @EVERY_LAW
-def test_the_linear_model_predicts_the_step_of_the_law(name: str) -> None:
+def test_linear_model_predicts_step_of_law(name: str) -> None:
     law = controller(name).tuned_law()
     linear, generator = linear_law(law, 4, DT), np.random.default_rng(1)
     state = law.control_law.engage(at(0.0), law.params)
@@ -367,7 +367,7 @@ def responses(name: str, parameters: Any, z: complex) -> FloatArray:
 
 
 @pytest.mark.parametrize("name", ["rise_di", "pi", "l1", "pid"])
-def test_the_linear_model_has_the_frequency_response_of_the_law(name: str) -> None:
+def test_linear_model_has_frequency_response_of_law(name: str) -> None:
     parameters = controller(name)
     A, B, C, D = linear_law(parameters.tuned_law(), 4, DT)
     for omega in (0.1, 1.0, 10.0, 100.0):  # rad/s
@@ -391,7 +391,7 @@ def test_a_state_is_restored_from_its_fields(name: str) -> None:
 
 
 @EVERY_LAW
-def test_a_law_is_the_same_under_numpy_and_jax_and_over_many_aircraft(name: str) -> None:
+def test_law_is_same_under_numpy_and_jax_and_over_many_aircraft(name: str) -> None:
     law = controller(name).tuned_law()
 
     def column(value: Any) -> Any:
@@ -436,7 +436,7 @@ def matrices(parameters: ControllerConfig) -> Matrices:
     return Matrices(*parameters.observer.matrices(nominal))
 
 
-def test_the_observer_is_a_kalman_filter_with_a_linear_feedback() -> None:
+def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     generator = np.random.default_rng(1)
     s, m, wide = 6, 2, np.full(2, np.inf)
     Phi, Gamma, L, F = (0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s)))
@@ -461,7 +461,7 @@ def lqg_with_observer() -> ControlLaw:
     return controller("lqg, observer").tuned_law().control_law
 
 
-def test_correction_and_prediction_are_the_same_for_many_aircraft_with_their_own_matrices() -> None:
+def test_correction_and_prediction_are_same_for_many_aircraft_with_own_matrices() -> None:
     generator = np.random.default_rng(1)
     s, m, N = 6, 2, 5
     limits = Limits(-np.full((m, 1), 0.5), np.full((m, 1), 0.5), np.full((m, 1), 20.0))
@@ -542,7 +542,7 @@ def test_an_observer_with_the_same_matrices_continues(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OBSERVED)
-def test_an_observer_with_other_matrices_restarts_without_a_jump(name: str) -> None:
+def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
     parameters, state = controller(name), guard.initial_state(4)
     e = 1e-3 * np.array([1.0, -1.0, 2.0, -2.0])
     for k in range(50):
@@ -573,7 +573,7 @@ def refused(sentence: str, values: dict[str, Any]) -> None:
     assert len(str(error.value).splitlines()) == 1
 
 
-def test_the_page_names_every_registered_law_and_its_parameters() -> None:
+def test_page_names_every_registered_law_and_parameters() -> None:
     page = (REPOSITORY / "docs" / "laws.md").read_text(encoding="utf-8")
     for name in laws.names():
         own = [] if name in {"lqi", "indi"} else set(laws.schema(name).model_fields) - set(ControllerConfig.model_fields)
@@ -581,20 +581,20 @@ def test_the_page_names_every_registered_law_and_its_parameters() -> None:
             assert f"`{word}`" in page, word
 
 
-def test_a_law_that_is_not_registered_is_refused_with_those_that_are() -> None:
+def test_law_that_is_not_registered_refused_with_those_that_are() -> None:
     registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
     refused(f"controller.law: found 'adrc', expected a registered law: {registered}", COMMON | {"law": "adrc"})
     refused(f"controller.law: found 3, expected a registered law: {registered}", COMMON | {"law": 3})
     refused(f"controller.law: found ['pi'], expected a registered law: {registered}", COMMON | {"law": ["pi"]})
 
 
-def test_a_law_of_more_than_y_is_refused() -> None:
+def test_law_of_more_than_y_refused() -> None:
     topics = "expected a law of y and y_m: the topics have no more"
     refused(f"controller.law: found 'lqi', which needs the full state, {topics}", COMMON | {"law": "lqi"})
     refused(f"controller.law: found 'indi', which needs the positions of the actuators, {topics}", COMMON | {"law": "indi"})
 
 
-def test_an_entry_point_that_is_no_law_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     values = {
         "absent": ["absent_package.law:Parameters"],
         "empty": ["control_laws.pi:Absent"],
@@ -638,7 +638,7 @@ class Short(PiConfig):
         return super().control_law()._replace(engage=lambda measured, params: State(measured.y.sum()))
 
 
-def test_a_state_that_the_log_cannot_hold_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_state_that_log_cannot_hold_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = EntryPoints(EntryPoint(name, f"{__name__}:{name}", laws.GROUP) for name in ("Colliding", "Short"))
     monkeypatch.setattr(EntryPoint, "load", lambda entry: globals()[entry.name])
     monkeypatch.setattr(laws, "_registered", lambda: entries)
@@ -674,7 +674,7 @@ def test_a_parameter_of_another_law_is_refused() -> None:
         ("lqg, observer", {"observer": None}, "controller.observer: found none, expected a section: it is the feedback of lqg"),
     ],
 )
-def test_an_invalid_parameter_of_a_law_is_refused(name: str, changes: dict[str, Any], sentence: str) -> None:
+def test_invalid_parameter_of_law_refused(name: str, changes: dict[str, Any], sentence: str) -> None:
     refused(sentence, sections()[name] | changes)
 
 
@@ -700,7 +700,7 @@ def test_an_invalid_observer_is_refused(name: str) -> None:
     refused("controller.observer.part: found 1.5, expected less than or equal to 1", observed(part=1.5))
 
 
-def test_a_feedforward_with_other_signs_or_a_zero_in_the_right_half_plane_is_refused() -> None:
+def test_feedforward_with_other_signs_or_zero_in_right_half_plane_refused() -> None:
     values = sections()["pi, observer"]
     B = np.reshape(values["feedforward"]["B"], (-1, 4))
     negative = values | {"feedforward": values["feedforward"] | {"B": (-B).ravel().tolist()}}
@@ -712,7 +712,7 @@ def test_a_feedforward_with_other_signs_or_a_zero_in_the_right_half_plane_is_ref
     refused("controller.feedforward.A: found zero dynamics with an eigenvalue at ", growing)
 
 
-def test_the_digest_knows_the_law_and_logs_without_a_law_keep_theirs() -> None:
+def test_digest_knows_law_and_logs_without_law_keep_theirs() -> None:
     digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
     assert len(set(digests.values())) == len(digests)
     named = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
@@ -720,7 +720,7 @@ def test_the_digest_knows_the_law_and_logs_without_a_law_keep_theirs() -> None:
     assert named.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()
 
 
-def test_a_log_is_varied_only_within_its_law() -> None:
+def test_log_varied_only_within_law() -> None:
     assert vary(controller("pi"), {"K": [1.0] * 4}).model_dump()["K"] == (1.0,) * 4
     with pytest.raises(ParameterError, match=r"controller\.k_g: found a parameter of rise_di, expected those of pi: K, Lambda"):
         vary(controller("pi"), {"k_g": 1.0})

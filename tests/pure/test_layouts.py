@@ -67,7 +67,7 @@ def test_the_command_writes_both_layouts(tmp_path: Path) -> None:
     assert result.output.split() == [str(tmp_path / "new" / name) for name in sorted(files)]
 
 
-def test_every_path_of_foxglove_leads_to_the_channel_that_its_label_names(tape: Tape) -> None:
+def test_every_path_of_foxglove_leads_to_channel_that_label_names(tape: Tape) -> None:
     curves = []
     for panel in json.loads(JSON)["configById"].values():
         for path in panel.get("paths", ()):
@@ -96,7 +96,7 @@ def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
     assert {name.split("!")[0] for name in count} == {"Plot"}
 
 
-def test_every_plot_of_foxglove_has_the_settings_of_a_plot_panel() -> None:
+def test_every_plot_of_foxglove_has_settings_of_plot_panel() -> None:
     panels = json.loads(JSON)["configById"]
     del panels["Tab!rise_di"]
     for panel in panels.values():
@@ -112,7 +112,7 @@ def test_every_plot_of_foxglove_has_the_settings_of_a_plot_panel() -> None:
             assert COLOUR.fullmatch(path["color"])
 
 
-def test_every_curve_of_plotjuggler_is_a_channel_of_a_run(tape: Tape) -> None:
+def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
     curves = []
     for curve in ElementTree.fromstring(XML).iter("curve"):
         root, topic, channel, position = curve.attrib["name"].split("/")
@@ -122,7 +122,7 @@ def test_every_curve_of_plotjuggler_is_a_channel_of_a_run(tape: Tape) -> None:
     assert Counter(curves) == Counter(CURVES)
 
 
-def test_a_guided_flight_has_a_map_and_what_guidance_holds() -> None:
+def test_guided_flight_has_map_and_what_guidance_holds() -> None:
     scenario = find_scenario("osprey_route").vary(flight={"duration": 0.1})
     log, channels = simulate(scenario)["guidance"], channels_of(scenario)
     assert channels["guidance"] == log.names

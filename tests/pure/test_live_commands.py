@@ -40,7 +40,7 @@ def reference(**live: Any) -> Reference:
     return Reference(ReferenceModelConfig.validate_mapping(SECTION | {"live": live}, "reference_model"))
 
 
-def test_a_command_beyond_its_bound_is_refused_and_changes_nothing() -> None:
+def test_command_beyond_bound_refused_and_changes_nothing() -> None:
     model = reference(bounds={"p": 0.5})
     with pytest.raises(ChannelError, match="beyond the bounds") as refused:
         model.take(0, np.array([0.0, 0.0, 0.6, 0.0]))
@@ -48,14 +48,14 @@ def test_a_command_beyond_its_bound_is_refused_and_changes_nothing() -> None:
     assert model.source() == "profile"
 
 
-def test_a_command_that_is_not_newer_is_refused() -> None:
+def test_command_that_is_not_newer_refused() -> None:
     model = reference()
     model.take(0, np.zeros(4))
     with pytest.raises(ChannelError, match="u_m"):
         model.take(0, np.zeros(4))
 
 
-def test_a_command_acts_from_the_step_after_it_and_no_earlier() -> None:
+def test_command_acts_from_step_after_it_and_no_earlier() -> None:
     model = reference()
     before = model.sample(10)
     model.take(10 * 5 * MS, np.array([0.1, 0.0, 0.0, 0.0]))
@@ -63,7 +63,7 @@ def test_a_command_acts_from_the_step_after_it_and_no_earlier() -> None:
     assert model.sample(11)[0] > 0.0
 
 
-def test_a_bank_is_dead_reckoned_by_the_y_m_that_was_published_where_samples_are_skipped() -> None:
+def test_bank_is_dead_reckoned_by_y_m_that_was_published_where_samples_skipped() -> None:
     model, bank, flown = reference(speed=25.0), math.radians(20.0), 0
     model.take(0, np.array([0.0, 0.0, 0.35, 0.0]), np.array([bank, 0.0]))
     p = model.sample(0)[2]
@@ -74,7 +74,7 @@ def test_a_bank_is_dead_reckoned_by_the_y_m_that_was_published_where_samples_are
     assert abs(math.degrees(bank)) < 1.0  # of an aircraft that tracks; 6 deg by the rates of the skipped samples
 
 
-def test_without_an_attitude_a_command_that_times_out_becomes_zero() -> None:
+def test_without_attitude_command_that_times_out_becomes_zero() -> None:
     model = reference(speed=25.0)
     model.take(0, np.array([0.1, 1.0, 0.2, 0.0]))
     model.sample(40)  # 0.2 s: the age limit
@@ -93,7 +93,7 @@ def test_levelling_needs_the_rates_and_the_speed(outputs: list[str]) -> None:
         ReferenceModelConfig.validate_mapping(section | {"live": {"speed": 25.0}}, "reference_model")
 
 
-def test_in_lockstep_u_m_comes_at_instants_of_the_reference() -> None:
+def test_in_lockstep_u_m_comes_at_instants_of_reference() -> None:
     with pytest.raises(ParameterError, match="u_m_rate"):
         ReferenceModelConfig.validate_mapping(SECTION | {"u_m_rate": 60.0}, "reference_model")
 
@@ -137,7 +137,7 @@ def flight(scenario: Scenario, bank_deg: float, lost: float, duration: float) ->
 
 @pytest.mark.parametrize("lost", [1.1, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("name", AIRCRAFT)
-def test_wings_are_level_ten_seconds_after_guidance_fell_silent_in_a_roll_in(name: str, lost: float) -> None:
+def test_wings_are_level_ten_seconds_after_guidance_fell_silent_in_roll_in(name: str, lost: float) -> None:
     make, bank_deg = AIRCRAFT[name]
     t, phi = flight(make(), bank_deg, lost, lost + 11.0).T
     after = t > lost

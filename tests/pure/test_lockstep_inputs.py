@@ -38,7 +38,7 @@ class Arriving:
         return list(self.inputs.complete())
 
 
-def test_a_step_waits_for_the_second_signal_of_its_instant_and_other_instants_do_not() -> None:
+def test_step_waits_for_second_signal_of_instant_and_other_instants_do_not() -> None:
     flight = Arriving()
     flight.others.append(sample(0))
     flight.y += [sample(Y_NS * k) for k in range(6)]
@@ -50,7 +50,7 @@ def test_a_step_waits_for_the_second_signal_of_its_instant_and_other_instants_do
     assert not flight.inputs.has_y
 
 
-def test_an_empty_y_is_an_instant_and_an_invalid_sample_of_the_other_signal_is_none() -> None:
+def test_empty_y_is_instant_and_invalid_sample_of_other_signal_is_none() -> None:
     flight = Arriving()
     flight.y += [None, sample(Y_NS)]
     flight.others += [None]
@@ -61,7 +61,7 @@ def test_an_empty_y_is_an_instant_and_an_invalid_sample_of_the_other_signal_is_n
 
 
 @given(st.lists(st.booleans(), min_size=80, max_size=80))
-def test_the_instants_do_not_depend_on_the_order_of_arrival(order: list[bool]) -> None:
+def test_instants_do_not_depend_on_order_of_arrival(order: list[bool]) -> None:
     flight, found = Arriving(), []
     y, others = [sample(Y_NS * k) for k in range(21)], [sample(Y_NS * k) for k in range(21)]
     for of_y in [*order, *[True] * 21, *[False] * 21]:

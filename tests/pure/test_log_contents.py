@@ -57,7 +57,7 @@ def recorder_attachments(scenario: Scenario, run: Path, *, one_process: bool) ->
     return LogAttachments(scenario.path, tuple(map(Path, map(str, attach))), Path(str(metadata)))
 
 
-def test_logged_parameters_are_a_scenario_of_that_flight(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_logged_parameters_are_scenario_of_that_flight(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
     again = load_scenario(stored(recorded, "parameters.yaml", tmp_path))
     assert again.flight.duration == 0.5  # that of the flight, not of the file
     for name in SCHEMAS:
@@ -74,7 +74,7 @@ def test_every_scenario_is_restored_from_its_parameters(name: str, tmp_path: Pat
         assert getattr(again, section) == getattr(scenario, section)
 
 
-def test_the_parameters_include_the_overrides_of_the_nodes(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_parameters_include_overrides_of_nodes(osprey_gust: Scenario, tmp_path: Path) -> None:
     for one_process in (False, True):
         files = recorder_attachments(osprey_gust, tmp_path, one_process=one_process)
         again = load_scenario(stored(files, "parameters.yaml", tmp_path))
@@ -86,13 +86,13 @@ def test_the_parameters_include_the_overrides_of_the_nodes(osprey_gust: Scenario
         assert again.recorder.directory == str(tmp_path)
 
 
-def test_no_file_is_written_for_a_node_other_than_the_recorder(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_no_file_written_for_node_other_than_recorder(osprey_gust: Scenario, tmp_path: Path) -> None:
     overrides = parameter_overrides(AIRCRAFT, osprey_gust, tmp_path, 12.5, lockstep=False)
     assert overrides == {"lockstep": False, "start_time": 12.5}
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_airframe_in_a_log_is_the_one_that_flew(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_airframe_in_log_is_one_that_flew(recorded: RecordedRun, osprey_gust: Scenario, tmp_path: Path) -> None:
     assert load_airframe(str(stored(recorded, "airframe.yaml", tmp_path))) == load_airframe("osprey")
     sampled = osprey_gust.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.1, "seed": 7}})
     again = load_airframe(str(stored(attachments_for(sampled, tmp_path), "airframe.yaml", tmp_path)))
@@ -116,16 +116,16 @@ def test_the_metadata_hold_versions_command_and_host(recorded: RecordedRun) -> N
     assert recorded.metadata["rise_di_host"]["cores"] == str(os.cpu_count())
 
 
-def test_the_versions_cover_all_packages_of_the_stack() -> None:
+def test_versions_cover_all_packages_of_stack() -> None:
     assert set(STACK) == {path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml")}
 
 
-def test_the_host_name_is_not_in_the_log(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_host_name_is_not_in_log(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["rise-di", "fly"])
     assert socket.gethostname() not in yaml.safe_dump(provenance()).split()
 
 
-def test_the_metadata_of_a_flight_over_topics_equal_those_in_one_process(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_metadata_of_flight_over_topics_equal_those_in_one_process(osprey_gust: Scenario, tmp_path: Path) -> None:
     file = recorder_attachments(osprey_gust, tmp_path, one_process=False).metadata
     assert file is not None
     metadata = read_metadata_records(file)
@@ -133,7 +133,7 @@ def test_the_metadata_of_a_flight_over_topics_equal_those_in_one_process(osprey_
     assert metadata.keys() == provenance().keys()
 
 
-def test_the_revision_is_the_commit_and_marks_local_changes(tmp_path: Path) -> None:
+def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
     git = shutil.which("git")
     if git is None:
         pytest.skip("no git here")
@@ -159,12 +159,12 @@ def test_a_host_without_git_has_no_revision(monkeypatch: pytest.MonkeyPatch) -> 
     assert revision(Path(__file__)) == {}
 
 
-def test_a_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
         attachments_for(osprey_gust, tmp_path / "nowhere")
 
 
-def test_a_pose_whose_first_samples_lack_a_channel_is_read_with_it(tmp_path: Path) -> None:
+def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> None:
     # The topics of an autopilot begin at different times: its first poses may be without climb.
     with BagWriter(tmp_path / "run") as bag:
         topic = bag.add_topic("/pose", JOINT_STATE, "")

@@ -68,7 +68,7 @@ def tail(signal: np.ndarray[Any, Any], t: np.ndarray[Any, Any], after: float) ->
 
 
 @pytest.mark.equation(48)
-def test_the_rise_of_V2_is_a_sampling_term_of_first_order() -> None:
+def test_rise_of_V2_is_sampling_term_of_first_order() -> None:
     # Where e crosses zero between two ticks, s is wrong for one of them: V2 gains at most 2 dt sum beta_i abs(r_i) there.
     # Measured 5.4, 5.4, 2.2 and 1.4 thousandths, that is 0.27 to 0.56 times dt, of a V2 that falls by 3.
     rises = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS]
@@ -77,7 +77,7 @@ def test_the_rise_of_V2_is_a_sampling_term_of_first_order() -> None:
 
 
 @pytest.mark.equation(4, 31, 46, 48)
-def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None:
+def test_V2_falls_by_integral_of_quadratic_form_up_to_sampling() -> None:
     # Measured 0.14, 0.090, 0.064 and 0.037 of a fall of 3: one derivation of V2_dot, another of V2, none of them the law's.
     worst = []
     for dt in PERIODS:
@@ -90,7 +90,7 @@ def test_V2_falls_by_the_integral_of_its_quadratic_form_up_to_sampling() -> None
 
 
 @pytest.mark.equation(28)
-def test_e_and_r_settle_on_a_band_of_second_order_where_the_conditions_hold() -> None:
+def test_e_and_r_settle_on_band_of_second_order_where_conditions_hold() -> None:
     # The disturbance and the reference are persistent, yet halving dt quarters both: measured 4.0 times each.
     cases = [fly_example(dt, 12.0)[2] for dt in PERIODS]
     for name in ("e", "r"):
@@ -107,7 +107,7 @@ def test_r_is_the_error_filtered_by_Lambda() -> None:
     assert np.abs(r - found.r)[settled].max() < 0.02 * np.abs(params.Lambda * found.e)[settled].max()
 
 
-def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
+def test_constant_of_lemma_2_is_hand_worked_one() -> None:
     # e falls from 2 to 0 in 2 s with N_d = 0.5, Lambda = 3, beta = 2, U = 1: zeta = 0.5, gamma_2 = 3 (2 / 0.5 - 1) = 9
     # gamma_1 = max(-2, 1 - 9 1.5 - 1, 2 - 9 2) = -2, zeta_b = beta 2 + gamma_1 zeta = 4 - 1 = 3
     one = np.ones((1, 1))
@@ -118,7 +118,7 @@ def test_the_constant_of_lemma_2_is_the_hand_worked_one() -> None:
 
 
 @pytest.mark.equation(3, 47)
-def test_P_stays_positive_with_the_constant_of_lemma_2() -> None:
+def test_P_stays_positive_with_constant_of_lemma_2() -> None:
     case, params, found = fly_example(0.005, 12.0)
     assert np.linalg.eigvalsh(decay_matrix(case.plant, params)).min() > 0.9  # measured 0.93: steps 2 and 3 of the theorem hold
     zeta_b = lemma_2(case.plant, found, params)
@@ -142,7 +142,7 @@ def test_with_beta_too_small_P_falls_below_every_constant_and_e_stays() -> None:
 
 
 @pytest.mark.equation(31)
-def test_with_beta_too_small_V2_still_falls_so_that_its_fall_alone_proves_nothing() -> None:
+def test_with_beta_too_small_V2_still_falls_so_that_fall_alone_proves_nothing() -> None:
     _, params, _ = fly_example(0.01, 1.0)
     _, _, bad = fly_example(0.01, 30.0, beta=TOO_SMALL * params.beta)
     assert largest_rise(bad.V2) == 0.0
@@ -159,7 +159,7 @@ def test_with_K_too_small_V2_rises_at_every_period() -> None:
         assert tail(found.e, found.t, 15.0) < 1e-3  # the conditions are sufficient, not necessary
 
 
-def test_the_literal_sign_lets_V2_rise_by_a_chatter_that_fades_with_the_period() -> None:
+def test_literal_sign_lets_V2_rise_by_chatter_that_fades_with_period() -> None:
     # It reverses at every tick at rest, so its sampling term adds up over the flight: measured 0.86, 0.43 and 0.20 in 6 s.
     rises = [largest_rise(fly_example(dt, 6.0, sign=Sign.LITERAL)[2].V2) for dt in PERIODS[1:]]
     implicit = [largest_rise(fly_example(dt, 6.0)[2].V2) for dt in PERIODS[1:]]
@@ -167,7 +167,7 @@ def test_the_literal_sign_lets_V2_rise_by_a_chatter_that_fades_with_the_period()
     assert all(literal > 50.0 * quiet for literal, quiet in zip(rises, implicit, strict=True))
 
 
-def test_along_the_osprey_V2_rises_by_a_sampling_term_only() -> None:
+def test_along_osprey_V2_rises_by_sampling_term_only() -> None:
     # Engaged in trim, e(0) = 0: V2 has nothing to lose, all it does is sampling. Measured 2.0e-3, 5.0e-4, 7.9e-5.
     rises = [largest_rise(osprey(rate)[2].V2) for rate in (100.0, 200.0, 400.0)]
     assert rises[0] < 4e-3
@@ -175,7 +175,7 @@ def test_along_the_osprey_V2_rises_by_a_sampling_term_only() -> None:
 
 
 @pytest.mark.equation(1)
-def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
+def test_along_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> None:
     # In the implicit sign's layer s = e / (dt^2 omega beta), and D U D beta s = N_d: so e = dt^2 omega (D U D)^-1 N_d.
     for rate in (100.0, 200.0):
         scenario, plant, found = osprey(rate)
@@ -186,7 +186,7 @@ def test_along_the_osprey_e_is_dt_squared_times_what_beta_has_to_cancel() -> Non
 
 
 @pytest.mark.equation(16, 17, 18, 47)
-def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
+def test_along_osprey_P_needs_beta_above_largest_N_d() -> None:
     scenario, _, good = osprey(200.0)
     beta = np.array(scenario.rise_di().beta)
     assert np.all(np.max(np.abs(good.N_d), axis=0) < beta)  # q, p, r, V: 23.8, 0.9, 7.4, 7.2 against 29.4, 22.5, 10.2, 7.8
@@ -196,7 +196,7 @@ def test_along_the_osprey_P_needs_beta_above_the_largest_N_d() -> None:
     assert np.max(np.abs(bad.e[:, 0])) > 100.0 * np.max(np.abs(good.e[:, 0]))  # pitch rate: 0.14 against 5.9e-4 rad/s
 
 
-def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
+def test_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
     scenario, plant, _ = osprey(100.0, duration=0.1)
     law = scenario.controller.law_params()
     assert np.linalg.eigvalsh(decay_matrix(plant, law)).min() < -7.0  # measured -7.8
@@ -204,7 +204,7 @@ def test_the_osprey_flies_with_gains_below_what_steps_2_and_3_ask_for() -> None:
     assert np.linalg.eigvalsh(decay_matrix(plant, raised)).min() > 0.25  # measured 0.30
 
 
-def test_a_tape_without_truth_at_the_ticks_is_refused() -> None:
+def test_tape_without_truth_at_ticks_refused() -> None:
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
     tape = simulate(scenario)
     truth = tape["truth"]

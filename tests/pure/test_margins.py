@@ -116,7 +116,7 @@ def test_disk_margin_of_the_spinning_satellite() -> None:
     assert disk_gain(np.array(1.0)) == 3.0
 
 
-def test_scaled_norm_of_a_product_is_the_sum_of_its_diagonal() -> None:
+def test_scaled_norm_of_product_is_sum_of_diagonal() -> None:
     # mu of u v' with independent complex scalars is sum abs(u_i v_i), which the scaling reaches (Packard, Doyle 1993)
     random = np.random.default_rng(1)
     u, v = (random.normal(size=(20, 4)) * 10.0 ** random.uniform(-3.0, 3.0, (20, 4)) for _ in range(2))
@@ -124,7 +124,7 @@ def test_scaled_norm_of_a_product_is_the_sum_of_its_diagonal() -> None:
     np.testing.assert_allclose(scaled_norm(matrices), np.abs(u * v).sum(axis=1), rtol=1e-3)
 
 
-def test_scaled_norm_of_a_triangle_is_its_diagonal() -> None:
+def test_scaled_norm_of_triangle_is_diagonal() -> None:
     triangle = np.array([[[2.0, 1e3, 5.0], [0.0, -3.0, 1e2], [0.0, 0.0, 1.0]]], dtype=complex)
     assert scaled_norm(triangle)[0] == pytest.approx(3.0, rel=1e-2)
 
@@ -200,7 +200,7 @@ def law_of(scenario: Scenario) -> LinearLaw:
 
 
 @pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
-def test_phase_margin_over_crossover_is_the_delay_margin(name: str) -> None:
+def test_phase_margin_over_crossover_is_delay_margin(name: str) -> None:
     # delay_margin bisects the eigenvalues of the delayed loop; a delay costs w tau of phase at the crossover. The two differ
     # by the sampled delay, 0.1 ms of bisection and a further crossover: 3 %
     scenario = find_scenario(name)

@@ -34,7 +34,7 @@ def test_a_part_without_samples_has_nan_metrics() -> None:
     assert all(math.isnan(metric) for metric in metrics.error_metrics(np.zeros(0)))
 
 
-def test_error_is_formed_at_the_stamps_of_y_by_name() -> None:
+def test_error_formed_at_stamps_of_y_by_name() -> None:
     y = signal([0, 1, 2], q=[1.0, 2.0, 3.0], V=[0.0, 0.0, 0.0])
     y_m = signal([0, 2], V=[1.0, 1.0], q=[0.0, 4.0])  # q is 2 half way
     error = metrics.tracking_error(tape(y=y, y_m=y_m))
@@ -52,7 +52,7 @@ def test_a_span_extends_beyond_its_end() -> None:
     assert metrics.in_spans(np.array([0.9, 1.0, 2.0, 2.5, 2.6]), [(1.0, 2.0)], 0.5).tolist() == [False, True, True, True, False]
 
 
-def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
+def test_each_instant_belongs_to_one_part_of_flight() -> None:
     transients = [
         Transient("engagement", "", 0.0, 0.0),
         Transient("command", "q", 3.0, 3.1),
@@ -68,7 +68,7 @@ def test_each_instant_belongs_to_one_part_of_the_flight() -> None:
     }
 
 
-def test_turn_and_capture_replace_the_commands_of_a_guided_flight() -> None:
+def test_turn_and_capture_replace_commands_of_guided_flight() -> None:
     transients = [Transient("capture", "", 1.0, 2.0), Transient("turn", "", 2.5, 3.0), Transient("gust", "vertical", 3.5, 4.0)]
     t = np.array([0.5, 1.5, 2.2, 2.9, 3.8, 6.0])
     masks = {part: t[mask].tolist() for part, mask in metrics.part_masks(t, transients, settle=1.0).items()}
@@ -97,11 +97,11 @@ def guided(**channels: Any) -> list[Any]:
         ({"phi_c": 0.3, "xtrack": 100.0}, [("turn", 5.0, 8.0)]),  # a turn first of all
     ],
 )
-def test_turns_and_captures_follow_from_the_commands_of_guidance(channels: Any, expected: Any) -> None:
+def test_turns_and_captures_follow_from_commands_of_guidance(channels: Any, expected: Any) -> None:
     assert guided(**channels) == [(kind, pytest.approx(start), pytest.approx(stop)) for kind, start, stop in expected]
 
 
-def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undisturbed_error() -> None:
+def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() -> None:
     flight = tape(y=signal([0, 1000, 2000], q=[3.0, 4.0, 0.0]), y_m=signal([0, 2000], q=[0.0, 0.0]))
     table = metrics.errors_by_part(flight, [Transient("gust", "g", 0.9, 1.1)], settle=0.0)
     assert table["q"]["gust"] == (4.0, 4.0)
@@ -109,7 +109,7 @@ def test_errors_are_split_by_part_and_the_ultimate_bound_is_the_largest_undistur
     assert table["q"]["whole"].max == 4.0
 
 
-def test_engagements_are_changes_of_the_mode_to_engaged() -> None:
+def test_engagements_are_changes_of_mode_to_engaged() -> None:
     mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
     internals = signal([0, 10, 20, 30, 40], mode=mode)
     assert [one.start for one in metrics.engagements(tape(internals=internals))] == [0.0, 0.04]
@@ -125,12 +125,12 @@ def test_close_live_commands_are_one_transient() -> None:
     ]
 
 
-def test_the_attitude_beside_live_commands_is_no_command() -> None:
+def test_attitude_beside_live_commands_is_no_command() -> None:
     u_m = signal([0.0, 500.0, 1000.0], q=[0.0, 0.1, 0.1], phi=[0.1, 0.2, 0.3], theta=0.1)
     assert metrics.live_commands(tape(u_m=u_m, y_m=signal([0.0], q=[0.0]))) == [Transient("command", "q", 0.5, 0.5)]
 
 
-def test_settling_time_ends_where_the_error_begins_to_stay_in_the_band() -> None:
+def test_settling_time_ends_where_error_begins_to_stay_in_band() -> None:
     t = np.arange(6.0) + 10.0
     for e, settling in (
         ([0.0, 3.0, -2.0, 1.0, 0.5, 0.0], 3.0),
@@ -144,13 +144,13 @@ def test_settling_time_ends_where_the_error_begins_to_stay_in_the_band() -> None
     assert metrics.settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
 
 
-def test_the_settling_band_is_a_fraction_of_the_reference_or_of_the_error_without_one() -> None:
+def test_settling_band_is_fraction_of_reference_or_of_error_without_one() -> None:
     y = signal([0, 10], q=[0.5, -3.0], p=[0.25, 0.0])
     y_m = signal([0, 10], q=[0.0, -2.0], p=[0.0, 0.0])
     assert metrics.settling_bands(tape(y=y, y_m=y_m)) == {"q": 0.02, "p": 0.0025}
 
 
-def test_the_settling_band_of_a_measured_error_is_at_least_four_noise_floors() -> None:
+def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None:
     # Second differences of +-1 are +-4: the floor is 4 / (0.6745 sqrt(6)). Four floors exceed 1 % of a reference of 10.
     stamps = [10.0 * k for k in range(100)]
     noisy, y_m = signal(stamps, q=[1.0, -1.0] * 50), signal(stamps, q=10.0)
@@ -160,7 +160,7 @@ def test_the_settling_band_of_a_measured_error_is_at_least_four_noise_floors() -
     assert metrics.settling_bands(tape(y=noisy, y_m=y_m, truth=truth)) == {"q": pytest.approx(0.1)}
 
 
-def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
+def test_settling_measured_up_to_next_transient_of_channel() -> None:
     # q leaves the band at 1 s and at 5 s, each time for 0.2 s; its reference of 1 makes it 0.01 wide.
     stamps = [100.0 * k for k in range(81)]
     t = np.array(stamps) / 1000.0
@@ -180,7 +180,7 @@ def test_settling_is_measured_up_to_the_next_transient_of_the_channel() -> None:
     assert gust.time == {"q": pytest.approx(0.2), "p": 0.0}
 
 
-def test_control_effort_is_the_rms_about_trim_and_the_mean_rate() -> None:
+def test_control_effort_is_rms_about_trim_and_mean_rate() -> None:
     # 0 -> 2 -> -2 -> -2 in 0.1 s each: a total variation of 6 in 0.3 s. sqrt((0 + 4 + 4 + 4) / 4) = sqrt(3).
     flight = tape(u=signal([0, 100, 200, 300], elevator=[0.0, 2.0, -2.0, -2.0]))
     whole = metrics.inputs_by_part(flight, [])["elevator"]["whole"]
@@ -201,13 +201,13 @@ def test_saturated_ticks_are_counted_by_kind() -> None:
     assert metrics.saturation_shares(tape()) == {}
 
 
-def test_sign_switches_are_counted_on_the_increments_of_pi() -> None:
+def test_sign_switches_counted_on_increments_of_pi() -> None:
     # Increments +, 0, +, -, -, +: two changes in 0.06 s; an increment of 0 is no direction.
     internals = signal([10.0 * k for k in range(7)], **{"Pi.q": [0.0, 1.0, 1.0, 2.0, 1.0, 0.0, 1.0]})
     assert metrics.sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
 
 
-def test_sign_switches_without_internals_are_those_of_the_error() -> None:
+def test_sign_switches_without_internals_are_those_of_error() -> None:
     y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
     assert metrics.sign_switches(tape(y=y, y_m=y_m)) == {"q": pytest.approx(2 / 0.02)}
 
@@ -217,7 +217,7 @@ def test_the_noise_floor_is_the_recorded_noise() -> None:
     assert metrics.noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
 
 
-def test_the_noise_floor_is_estimated_from_y_without_truth() -> None:
+def test_noise_floor_estimated_from_y_without_truth() -> None:
     # Normal noise of rms 0.02 on a slow sine of 1; with 20 000 samples the estimate is within some per cent.
     k = np.arange(20_000)
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
@@ -225,13 +225,13 @@ def test_the_noise_floor_is_estimated_from_y_without_truth() -> None:
     assert metrics.noise_floor(flight)["q"] == pytest.approx(0.02, rel=0.05)
 
 
-def test_the_noise_floor_is_at_least_the_rounding_of_y() -> None:
+def test_noise_floor_is_at_least_rounding_of_y() -> None:
     constant = tape(y=signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4))
     # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first.
     assert metrics.noise_floor(constant) == {"q": 2.0**-56, "V": 0.0}
 
 
-def test_the_spectrum_of_a_sine_peaks_at_its_frequency_and_has_its_variance() -> None:
+def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
     # 5 Hz of amplitude 2: variance 2, the integral of the squared density over all frequencies.
     k = np.arange(6000)
     u = Signal(EPOCH + k * 10 * MS, ("elevator",), 2.0 * np.sin(2 * np.pi * 5.0 * k / 100.0)[:, None])
@@ -267,7 +267,7 @@ def test_periods_without_a_tick_are_counted() -> None:
     assert result.jitter == 0.0  # the last took two whole periods
 
 
-def test_jitter_is_the_deviation_from_a_whole_number_of_periods() -> None:
+def test_jitter_is_deviation_from_whole_number_of_periods() -> None:
     # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
     result = metrics.tick_metrics(tape(internals=signal([0, 10.3, 19.9, 39.9], late=0.0, age=0.0)), 10 * MS)
     assert result is not None
@@ -281,7 +281,7 @@ def test_latency_has_metrics_if_it_is_recorded() -> None:
     assert metrics.latency_metrics(tape()) is None
 
 
-def test_a_flight_of_one_tick_has_no_tick_metrics() -> None:
+def test_flight_of_one_tick_has_no_tick_metrics() -> None:
     assert metrics.tick_metrics(tape(internals=signal([0], late=[0.0], age=[0.0])), 10 * MS) is None
 
 
@@ -293,7 +293,7 @@ def test_groups_of_channels_lose_their_prefix() -> None:
         tape["x"]
 
 
-def test_a_lost_sample_counts_like_a_missed_tick() -> None:
+def test_lost_sample_counts_like_missed_tick() -> None:
     # Ticks at 0, 10, 30 ms: at 20 ms there was no new y, and no tick was late.
     result = metrics.tick_metrics(tape(internals=signal([0, 10, 30], late=0.0, age=0.0)), 10 * MS)
     assert result is not None

@@ -85,7 +85,7 @@ MATTER = ("B[V, thrust]", "B[q, elevator]", "A[p, p]", "B[p, aileron]", "A[beta,
 
 
 @pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
-def test_entries_that_matter_are_found_within_their_deviations(air: str, uncertainty: float) -> None:
+def test_entries_that_matter_found_within_deviations(air: str, uncertainty: float) -> None:
     found = identified(air, uncertainty)
     true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), found.entries)
     by_name = {one.name: one for one in found.entries}
@@ -100,7 +100,7 @@ def test_entries_that_matter_are_found_within_their_deviations(air: str, uncerta
 
 
 @pytest.mark.parametrize(("air", "uncertainty"), FLIGHTS)
-def test_innovations_of_the_held_out_samples_are_smaller_and_whiter(air: str, uncertainty: float) -> None:
+def test_innovations_of_held_out_samples_are_smaller_and_whiter(air: str, uncertainty: float) -> None:
     found = identified(air, uncertainty)
     assert found.refusal == ""
     assert found.after.log_likelihood > found.before.log_likelihood + 0.1
@@ -126,7 +126,7 @@ def test_the_true_model_is_left_alone() -> None:
     assert abs(found.after.log_likelihood - found.before.log_likelihood) < 0.02
 
 
-def test_a_flight_without_excitation_is_refused_with_the_channel_and_the_factor() -> None:
+def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
     found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
     pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs [\d.]+ times the amplitude"
@@ -168,7 +168,7 @@ def test_lost_samples_are_predicted_over() -> None:
 # Parts with a known result
 
 
-def test_y_is_taken_at_the_stamps_of_u() -> None:
+def test_y_taken_at_stamps_of_u() -> None:
     tape = flight("calm", 0.5)
     y, u = tape["y"], tape["u"]
     fast = np.repeat(y.values, 5, axis=0) + np.tile([[0.0], [9.0], [9.0], [9.0], [9.0]], (len(y.values), 1))
@@ -179,13 +179,13 @@ def test_y_is_taken_at_the_stamps_of_u() -> None:
     assert recorded.period == 0.01
 
 
-def test_a_late_input_is_the_mean_that_acts_in_a_period() -> None:
+def test_late_input_is_mean_that_acts_in_period() -> None:
     u = np.array([[0.0], [1.0], [3.0], [3.0]])
     np.testing.assert_allclose(innovation_filters.delayed(u, 0.25), [[0.0], [0.75], [2.5], [3.0]])
     np.testing.assert_allclose(innovation_filters.delayed(u, 1.0), [[0.0], [0.0], [1.0], [3.0]])
 
 
-def test_the_noise_of_a_moving_output_is_measured() -> None:
+def test_noise_of_moving_output_measured() -> None:
     t = 0.01 * np.arange(6000)
     y = np.stack([0.4 * np.sin(2.0 * t), 2.0 * np.cos(0.5 * t)], axis=1)
     y += np.array([0.0017, 0.03]) * np.random.default_rng(1).standard_normal(y.shape)
@@ -202,7 +202,7 @@ def test_the_osprey_has_two_blocks() -> None:
     assert names == [{"V", "alpha", "q", "theta"}, {"beta", "p", "r", "phi"}]
 
 
-def test_innovations_of_the_right_model_are_white_and_of_unit_covariance() -> None:
+def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     block = innovation_filters.blocks(osprey_model())[0]
     model = block.of(osprey_model())
     model = model._replace(A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity)
@@ -225,7 +225,7 @@ def test_innovations_of_the_right_model_are_white_and_of_unit_covariance() -> No
     assert whiteness(e, np.ones(len(e), dtype=bool)).max() < 2.0
 
 
-def test_whiteness_is_one_for_white_noise_and_that_of_its_autocorrelation_for_coloured_noise() -> None:
+def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_coloured_noise() -> None:
     generator, held_out = np.random.default_rng(1), np.arange(60_000) % 300 >= 200
     white = generator.standard_normal((60_000, 50))
     # n (1 + 0.8 rho_1^2 ..): the mean of 50 figures has a standard deviation of 0.32 / sqrt(50)
@@ -254,7 +254,7 @@ def command(*arguments: Any) -> Any:
     return CliRunner().invoke(application(["identify"]), ["identify", *map(str, arguments)])
 
 
-def test_the_command_writes_an_airframe_and_a_page_of_its_innovations(tmp_path: Path) -> None:
+def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None:
     model = tmp_path / "model.yaml"
     result = command("--log", run_folder(tmp_path), "--airframe", "osprey", "--delay", 0, "--write", model, "--json")
     assert result.exit_code == 0

@@ -60,7 +60,7 @@ def uncertain(count: int) -> NominalModel:
     return osprey()._replace(A=A, B=B)
 
 
-def test_the_names_of_the_states_say_what_each_estimate_is() -> None:
+def test_names_of_states_say_what_each_estimate_is() -> None:
     design = observer_design.aircraft_observer(osprey(), NAMES, weights())
     assert len(design.states) == len(design.Phi) == 8 + 4 + 3 + 4
     assert {"x.alpha", "position.elevator", "wind.vertical", "disturbance.q"} <= set(design.states)
@@ -69,7 +69,7 @@ def test_the_names_of_the_states_say_what_each_estimate_is() -> None:
     assert extended.states[::5] == ("x.q", "position.thrust", "disturbance.p", "disturbance_rate.r")
 
 
-def test_a_step_of_the_aircraft_model_is_the_motion_of_its_equations() -> None:
+def test_step_of_aircraft_model_is_motion_of_equations() -> None:
     model, wind_time = osprey(), np.array([4.7, 0.6, 1.9])
     sampled = observer_design.aircraft_model(model, NAMES, wind_time)
     generator = np.random.default_rng(2)
@@ -85,7 +85,7 @@ def test_a_step_of_the_aircraft_model_is_the_motion_of_its_equations() -> None:
     np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
-def test_a_step_of_the_extended_state_model_is_the_motion_of_its_equations() -> None:
+def test_step_of_extended_state_model_is_motion_of_equations() -> None:
     model, decay = osprey(), np.array([7.3, 5.8, 2.8, 4.6])
     sampled = observer_design.extended_state_model(model, NAMES, decay)
     generator = np.random.default_rng(3)
@@ -103,7 +103,7 @@ def one_of(design: ObserverDesign, k: int) -> ObserverDesign:
     return design._replace(Phi=design.Phi[k], Gamma=design.Gamma[k], L=design.L[k], F=design.F[k])
 
 
-def test_many_aircraft_and_weights_side_by_side_are_the_designs_of_each() -> None:
+def test_many_aircraft_and_weights_side_by_side_are_designs_of_each() -> None:
     models, sets = uncertain(3), weights(3)
     many = observer_design.aircraft_observer(models, NAMES, sets)
     for k in range(3):
@@ -116,7 +116,7 @@ def test_many_aircraft_and_weights_side_by_side_are_the_designs_of_each() -> Non
 
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])
-def test_the_gains_are_those_of_the_riccati_solver_of_scipy(kind: str) -> None:
+def test_gains_are_those_of_riccati_solver_of_scipy(kind: str) -> None:
     model, size = osprey(), np.array([0.1, 1.0, 0.1, 0.1])
     chosen: Weights | ExtendedStateWeights
     if kind == "aircraft":
@@ -139,7 +139,7 @@ def test_the_gains_are_those_of_the_riccati_solver_of_scipy(kind: str) -> None:
     np.testing.assert_allclose(design.L, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
 
-def test_the_extended_state_observer_holds_an_aircraft_with_unknown_dynamics() -> None:
+def test_extended_state_observer_holds_aircraft_with_unknown_dynamics() -> None:
     # the osprey under a constant moment and force: the estimate of the disturbance contains them and all of A
     model = osprey()
     design = observer_design.extended_state_observer(model, NAMES, extended_weights())

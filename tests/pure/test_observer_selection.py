@@ -64,7 +64,7 @@ def Omega() -> FloatArray:  # noqa: N802 - the paper's name
     return model.Omega
 
 
-def test_the_shipped_scenarios_have_the_observer_that_the_command_writes(tmp_path: Path) -> None:
+def test_shipped_scenarios_have_observer_that_command_writes(tmp_path: Path) -> None:
     written = tmp_path / "gains.yaml"
     result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--observer", "--write", str(written)])
     assert result.exit_code == 0, result.output
@@ -80,7 +80,7 @@ def test_the_shipped_scenarios_have_the_observer_that_the_command_writes(tmp_pat
             np.testing.assert_allclose(getattr(shipped.observer, key), getattr(again.observer, key), rtol=1e-6, atol=1e-9)
 
 
-def test_the_margin_of_a_selected_observer_holds_and_is_the_one_that_was_asked_for() -> None:
+def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> None:
     for margin in (0.03, 0.045):
         selected = by_rule(margin)
         controller = selected.controller
@@ -99,7 +99,7 @@ def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray
     return nominal.A + nominal.gravity, nominal.B, nominal.C
 
 
-def test_a_delay_beyond_the_margin_makes_the_flight_oscillate_and_one_within_it_does_not() -> None:
+def test_delay_beyond_margin_makes_flight_oscillate_and_one_within_it_does_not() -> None:
     # y delayed by whole samples: 20 ms is within the margin of 30 ms, 80 ms is far beyond it
     controller = by_rule().controller
     calm = with_observer(controller).vary(flight={"duration": 12.0}, aircraft={"gusts": {}})
@@ -111,13 +111,13 @@ def test_a_delay_beyond_the_margin_makes_the_flight_oscillate_and_one_within_it_
     assert beyond[0] > 5.0 * within[0]
 
 
-def test_the_observer_by_rule_halves_the_error_of_speed_roll_and_yaw() -> None:
+def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
     # q, V, p, r in gusts: measured 0.94, 0.15, 0.14, 0.46; the rule is a start, and the gains of a search are better still
     alone, observed = rms_alone(), rms(simulate(with_observer(by_rule().controller)))
     assert (observed < [1.0, 0.5, 0.5, 0.5] * alone).all()
 
 
-def test_an_extended_state_observer_needs_no_model_and_lowers_every_error() -> None:
+def test_extended_state_observer_needs_no_model_and_lowers_every_error() -> None:
     # The model y_dot = Omega u has none of the aircraft's damping: 12 ms there are 26 ms on the osprey. Only K of p is lowered.
     selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.012)
     assert selected.delay_margin >= 0.012
@@ -152,7 +152,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
         (["--observer", "--margin", "0.9"], "error: --margin: found 0.9, expected 0 to 0.5 s"),
     ],
 )
-def test_the_command_refuses_options_that_contradict_each_other(arguments: list[str], sentence: str) -> None:
+def test_command_refuses_options_that_contradict_each_other(arguments: list[str], sentence: str) -> None:
     with pytest.raises(ParameterError) as refused:
         CliRunner().invoke(application(["gains"]), ["gains", "osprey", *arguments], catch_exceptions=False)
     assert f"error: {refused.value}".startswith(sentence)

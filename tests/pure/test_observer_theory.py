@@ -164,7 +164,7 @@ def rosenbrock(plant: Plant, s: complex) -> FloatArray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_observer_keeps_C_B_and_so_S_D_U_and_the_relative_degree(seed: int) -> None:
+def test_observer_keeps_C_B_and_so_S_D_U_and_relative_degree(seed: int) -> None:
     plant = random_plant(seed, U_12=0.7)
     both = extended(plant, observer_of(plant))
     assert np.array_equal(both.C @ both.B, plant.C @ plant.B)
@@ -178,7 +178,7 @@ def arbitrary_observer(rng: np.random.Generator) -> Observer:
     return Observer(A_z, rng.normal(size=(s, M)), H, 10.0 * rng.normal(size=(M, s)), L)
 
 
-def test_the_zeros_with_an_observer_are_those_of_the_aircraft_and_the_poles_of_its_filter() -> None:
+def test_zeros_with_observer_are_those_of_aircraft_and_poles_of_filter() -> None:
     unstable = 0
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -196,7 +196,7 @@ def test_the_zeros_with_an_observer_are_those_of_the_aircraft_and_the_poles_of_i
     assert unstable > 0  # the zeros do not depend on the stability of the compensator
 
 
-def test_on_the_osprey_the_observer_adds_only_its_own_filter_to_the_zeros() -> None:
+def test_on_osprey_observer_adds_only_own_filter_to_zeros() -> None:
     _, plant = osprey()
     observer = osprey_observer()
     both, poles = extended(plant, observer), eigvals(observer.error_matrix)
@@ -232,7 +232,7 @@ def slew_left(plant: Plant, wave: Wave, observer: Observer | None) -> FloatArray
 
 
 @pytest.mark.parametrize("omega", [0.3, 3.0, 30.0])
-def test_N_d_of_the_extended_plant_is_the_slew_that_feedforward_and_observer_leave(omega: float) -> None:
+def test_N_d_of_extended_plant_is_slew_that_feedforward_and_observer_leave(omega: float) -> None:
     # The right side of (c) against the definition of N_d, (17) with all reference terms, on the extended plant.
     rng = np.random.default_rng(7)
     for seed in range(3):
@@ -278,7 +278,7 @@ def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
     return np.array(rows[0]), np.mean(rows[1:], axis=0)
 
 
-def test_on_the_osprey_the_observer_halves_the_slew_of_elevator_and_rudder_in_the_gusts() -> None:
+def test_on_osprey_observer_halves_slew_of_elevator_and_rudder_in_gusts() -> None:
     # Pulses and gusts of osprey_servo within 8 s, ideal actuators: elevator, aileron, rudder in deg/s, thrust in %/s
     nominal, sampled = slews_of_the_osprey()
     names = list(load_airframe("osprey").inputs)
@@ -291,7 +291,7 @@ def test_on_the_osprey_the_observer_halves_the_slew_of_elevator_and_rudder_in_th
     )
 
 
-def test_without_a_fade_in_the_observer_moves_the_inputs_at_once() -> None:
+def test_without_fade_in_observer_moves_inputs_at_once() -> None:
     # zeta(0) = H'e(0) for e(0) = 0.1, 0.2, 0.1 rad/s of q, p, r and 2 m/s: -F H'e(0)
     airframe, _ = osprey()
     observer, e_0 = osprey_observer(), {"q": 0.1, "p": 0.2, "r": 0.1, "V": 2.0}
@@ -348,7 +348,7 @@ def form_of(terms: CrossTerms, of_r: FloatArray, P: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("with_observer", [False, True])
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_above_k_star_a_matrix_P_makes_the_form_of_lemma_A_positive(seed: int, with_observer: bool) -> None:
+def test_above_k_star_matrix_P_makes_form_of_lemma_A_positive(seed: int, with_observer: bool) -> None:
     # The lemma of Kalman, Yakubovich and Popov, by its Riccati equation: r is eliminated, then e.
     plant = random_plant(seed)
     flown = extended(plant, observer_of(plant)) if with_observer else plant
@@ -401,7 +401,7 @@ def largest_error(plant: Plant, seed: int, observer: Observer | None, params: La
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_with_the_gains_of_lemma_A_the_error_falls_with_the_square_of_the_period(seed: int) -> None:
+def test_with_gains_of_lemma_A_error_falls_with_square_of_period(seed: int) -> None:
     plant = random_plant(seed)
     observer = observer_of(plant)
     K, omega = 1.2 * least_gain(extended(plant, observer)), 1.2 * np.abs(np.diag(plant.C @ plant.B))
@@ -473,7 +473,7 @@ def largest_w(plant: Plant, K: FloatArray, kind: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_error_stays_within_lemma_B_for_any_bounded_slew_of_the_observer(seed: int) -> None:
+def test_error_stays_within_lemma_B_for_any_bounded_slew_of_observer(seed: int) -> None:
     plant, K = random_plant(seed, U_12=0.5), np.array([40.0, 30.0])
     flown = {kind: largest_w(plant, K, kind) for kind in ("adverse", "bounded", "square")}
     bound = ultimate_bound(plant, K, flown["adverse"][1])
@@ -486,7 +486,7 @@ def test_the_error_stays_within_lemma_B_for_any_bounded_slew_of_the_observer(see
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_inside_the_softened_sign_the_error_is_N_d_over_the_integral_gain(seed: int) -> None:
+def test_inside_softened_sign_error_is_N_d_over_integral_gain(seed: int) -> None:
     # e_i = N_d,i / (K_i (Lambda_i + 1 / T_eps,i)) for a slow N_d and a K that is large against the other terms of (24)
     plant, K, T_eps = random_plant(seed), 40.0, 0.1
     for observer in (None, observer_of(plant)):
@@ -560,7 +560,7 @@ def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> 
         ("rise_observer", "late", 4),
     ],
 )
-def test_behind_servos_the_tuned_law_scores_as_a_PI_with_its_integral_gain(
+def test_behind_servos_tuned_law_scores_as_PI_with_integral_gain(
     course: tuning.Benchmark, law: str, objective: str, channels: int
 ) -> None:
     # Lambda + 1 / T_eps in place of Lambda, and no sign. Measured -1.4 to 1.3 %, and -4.3 % on uncertain aircraft with the
@@ -569,8 +569,6 @@ def test_behind_servos_the_tuned_law_scores_as_a_PI_with_its_integral_gain(
 
 
 @pytest.mark.parametrize("objective", ["nominal", "late"])
-def test_the_airspeed_saturates_its_sign_with_gains_tuned_on_the_nominal_aircraft(
-    course: tuning.Benchmark, objective: str
-) -> None:
+def test_airspeed_saturates_sign_with_gains_tuned_on_nominal_aircraft(course: tuning.Benchmark, objective: str) -> None:
     # Its softened sign is 0.06 m/s wide. Without the limit of the sign the score is 13 and 10 % larger.
     assert as_pi(course, "rise", objective, 4)[0] > 1.05

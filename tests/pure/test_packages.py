@@ -115,7 +115,7 @@ def test_pytest_runs_the_tests_of_a_package() -> None:
     assert set(re.findall(r"test_\w+\.py", done.stdout)) == {path.name for path in files_of("flight_core")}
 
 
-def test_the_page_on_ros_names_what_rosdep_cannot_install() -> None:
+def test_page_on_ros_names_what_rosdep_cannot_install() -> None:
     page = (SOURCES.parents[1] / "docs" / "ros.md").read_text(encoding="utf-8")
     assert not {name for name in WITHOUT_KEY if f"`{name.replace('_', '-')}`" not in page}
 

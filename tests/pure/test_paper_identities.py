@@ -241,13 +241,13 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
 
 
 @pytest.mark.equation(4)
-def test_e_dot_and_so_r_of_4_are_the_derivative_of_3(loop: Loop) -> None:
+def test_e_dot_and_so_r_of_4_are_derivative_of_3(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
 
 
 @pytest.mark.equation(10, 11)
-def test_r_of_10_in_terms_of_the_plant_is_r_of_4(loop: Loop) -> None:
+def test_r_of_10_in_terms_of_plant_is_r_of_4(loop: Loop) -> None:
     p = loop.p
     for t in INSTANTS:
         x, x_m, _, _ = loop.unpack(t)
@@ -257,7 +257,7 @@ def test_r_of_10_in_terms_of_the_plant_is_r_of_4(loop: Loop) -> None:
 
 
 @pytest.mark.equation(10, 11)
-def test_decomposition_finds_the_factors_that_made_the_plant(loop: Loop) -> None:
+def test_decomposition_finds_factors_that_made_plant(loop: Loop) -> None:
     S, D, U = decompose(loop.p.C @ loop.p.B)
     assert close(S, loop.p.S, EXACT)
     assert close(D, loop.p.D, EXACT)
@@ -265,13 +265,13 @@ def test_decomposition_finds_the_factors_that_made_the_plant(loop: Loop) -> None
 
 
 @pytest.mark.equation(12)
-def test_r_dot_of_12_is_the_derivative_of_r(loop: Loop) -> None:
+def test_r_dot_of_12_is_derivative_of_r(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.r_dot(t), differenced(loop.r, t), DIFFERENCED)
 
 
 @pytest.mark.equation(13, 14, 15)
-def test_13_to_15_put_the_input_into_the_form_D_U_u_dot(loop: Loop) -> None:
+def test_13_to_15_put_input_into_form_D_U_u_dot(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.M @ loop.r_dot(t), loop.N(t) - loop.e(t) + loop.p.D * (loop.p.U @ loop.u_dot(t)), EXACT)
 
@@ -284,7 +284,7 @@ def test_16_to_18_N_is_N_d_plus_N_tilde(loop: Loop) -> None:
 
 
 @pytest.mark.equation(23)
-def test_23_is_the_derivative_of_20_with_21(loop: Loop) -> None:
+def test_23_is_derivative_of_20_with_21(loop: Loop) -> None:
     for t in INSTANTS:
         assert close(loop.u_dot(t), differenced(loop.u, t), DIFFERENCED)
 
@@ -299,7 +299,7 @@ def test_closed_loop_24(loop: Loop) -> None:
 
 
 @pytest.mark.equation(25, 26)
-def test_25_and_26_give_Phi_without_its_last_entry(loop: Loop) -> None:
+def test_25_and_26_give_Phi_without_last_entry(loop: Loop) -> None:
     p = loop.p
     for t in INSTANTS:
         r = loop.r(t)
@@ -322,7 +322,7 @@ def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
 
 
 @pytest.mark.equation(32)
-def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
+def test_V1_dot_of_32_has_gain_22_as_three_squares(loop: Loop) -> None:
     k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
@@ -334,7 +334,7 @@ def test_V1_dot_of_32_has_the_gain_22_as_three_squares(loop: Loop) -> None:
 
 
 @pytest.mark.equation(24, 32, 46, 48)
-def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
+def test_V2_dot_is_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
     # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
     Q = decay_matrix(loop.p.plant(), loop.p.law())
     for t in INSTANTS:
@@ -345,7 +345,7 @@ def test_V2_dot_is_a_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> 
 
 @pytest.mark.equation(20)
 @pytest.mark.parametrize("sign", [Sign.LITERAL, Sign.IMPLICIT])
-def test_the_sampled_law_converges_to_20_with_its_period(loop: Loop, sign: Sign) -> None:
+def test_sampled_law_converges_to_20_with_period(loop: Loop, sign: Sign) -> None:
     # First order, because u is held over a period: half of the period halves the distance (measured 1.9 to 2.1).
     distance = []
     for ticks in (60, 120, 240):
@@ -368,7 +368,7 @@ def at_rest() -> Loop:
 
 
 @pytest.mark.equation(16, 17, 18)
-def test_at_rest_N_d_is_minus_D_U_times_the_slew_of_the_ideal_input() -> None:
+def test_at_rest_N_d_is_minus_D_U_times_slew_of_ideal_input() -> None:
     # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; beta has to exceed its slew along the flight.
     loop = at_rest()
     p = loop.p
@@ -399,7 +399,7 @@ def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -
 
 
 @pytest.mark.equation(19)
-def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: Loop) -> None:
+def test_N_tilde_vanishes_with_z_once_reference_term_moved_to_N_d(loop: Loop) -> None:
     _, N_tilde, _ = at_rest().split(0.0)
     assert np.linalg.norm(N_tilde) < 1e-12
     p = loop.p  # for z != 0 it is linear in z, so (19) holds with a constant rho
@@ -412,7 +412,7 @@ def test_N_tilde_vanishes_with_z_once_the_reference_term_is_moved_to_N_d(loop: L
 
 
 @pytest.mark.equation(30)
-def test_the_bound_in_30_has_two_indices_for_each_row_sums_its_own_entries_of_U() -> None:
+def test_bound_in_30_has_two_indices_for_each_row_sums_own_entries_of_U() -> None:
     # Psi = (D U D - I) beta Sgn(e): over all signs the maximum of its i-th entry is sum_(j>i) abs(U_ij) beta_j.
     p = random_problem(4)
     DUD = p.D[:, None] * p.U * p.D
@@ -454,14 +454,14 @@ def lemma_1_ratio(T: float) -> float:
 
 
 @pytest.mark.equation(40)
-def test_40_fails_for_a_bounded_e_that_tends_to_zero_with_a_bounded_derivative() -> None:
+def test_40_fails_for_bounded_e_that_tends_to_zero_with_bounded_derivative() -> None:
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls with T. For e = sin(t^2)/t,
     # abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1, gamma_2 exist.
     assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx([7.3, 41.8, 283.8], rel=0.01)
 
 
 @pytest.mark.equation(40)
-def test_gamma_2_of_the_sampled_law_with_the_literal_sign_grows_as_the_period_falls() -> None:
+def test_gamma_2_of_sampled_law_with_literal_sign_grows_as_period_falls() -> None:
     # Chatter decreases with dt, its slope more slowly: (29) with this gamma_2 requires a beta that grows without bound.
     ratios = []
     for dt in (0.02, 0.01, 0.005, 0.0025):
@@ -493,7 +493,7 @@ def replayed(cycle: counterexample.Cycle, e_dot_0: float, dt: float = 2e-4, acts
 
 
 @pytest.mark.equation(29)
-def test_for_every_beta_some_f_within_the_same_bounds_keeps_the_error_from_zero() -> None:
+def test_for_every_beta_some_f_within_same_bounds_keeps_error_from_zero() -> None:
     # K = 10, Lambda = 1, so Q = diag(1, 9) > 0, and abs(f_dot) <= 1. The formula is the limit of a large beta: 2.6 % at 2.
     for beta, tolerance in ((2.0, 0.03), (1000.0, 1e-3)):
         cycle = counterexample.limit_cycle(beta)
@@ -504,14 +504,14 @@ def test_for_every_beta_some_f_within_the_same_bounds_keeps_the_error_from_zero(
         assert np.all(cycle.multipliers < 1.0)
 
 
-def test_the_recorded_f_as_a_function_of_time_has_the_same_limit_under_the_sampled_law() -> None:
+def test_recorded_f_as_function_of_time_has_same_limit_under_sampled_law() -> None:
     # From 10 % beside the cycle. Measured 2.9 % below it at 0.2 ms and 0.3 % at 0.05 ms.
     cycle = counterexample.limit_cycle(2.0)
     assert replayed(cycle, 1.1 * cycle.e_dot[0]) == pytest.approx(np.max(cycle.e), rel=0.05)
     assert replayed(cycle, 1.1 * cycle.e_dot[0], acts=0.0) < 1e-9
 
 
-def test_the_same_f_lets_the_error_vanish_from_rest_or_at_a_longer_period() -> None:
+def test_same_f_lets_error_vanish_from_rest_or_at_longer_period() -> None:
     # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from every start. At beta = 20 the
     # cycle attracts so weakly that the sampling of 0.2 ms takes the law off it.
     cycle, weak = counterexample.limit_cycle(2.0), counterexample.limit_cycle(20.0)
@@ -520,7 +520,7 @@ def test_the_same_f_lets_the_error_vanish_from_rest_or_at_a_longer_period() -> N
 
 
 @pytest.mark.equation(47)
-def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_lemma_1() -> None:
+def test_with_U_identity_classical_condition_keeps_P_positive_without_lemma_1() -> None:
     # beta_i > sup abs(N_d,i) + sup abs(N_d,i_dot) / Lambda_i and zeta_b = sum beta_i abs(e_i(0)) - e(0)' N_d(0).
     case = example(0.005, 15.0)
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
@@ -535,7 +535,7 @@ def test_with_U_the_identity_the_classical_condition_keeps_P_positive_without_le
     assert np.min(zeta_b + signals.P) > 0.0
 
 
-def test_a_matrix_without_a_leading_minor_has_no_decomposition_though_it_can_be_inverted() -> None:
+def test_matrix_without_leading_minor_has_no_decomposition_though_it_can_be_inverted() -> None:
     # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
@@ -553,7 +553,7 @@ def hidden_state(pole: float) -> tuple[float, float]:
 
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
-def test_an_unstable_zero_leaves_a_state_unbounded_and_then_the_error() -> None:
+def test_unstable_zero_leaves_state_unbounded_and_then_error() -> None:
     # Assumption 3 excludes it. Omega = 1 and the gains are the same; only the hidden state diverges.
     state, e = hidden_state(1.0)
     assert state > 1e4
@@ -567,7 +567,7 @@ def test_a_stable_zero_leaves_that_state_bounded() -> None:
     assert e < 1e-3
 
 
-def test_a_servo_between_u_and_the_plant_makes_Omega_zero() -> None:
+def test_servo_between_u_and_plant_makes_Omega_zero() -> None:
     # x_s_dot = (u - x_s) / tau drives the plant: relative degree 2, C B = 0, and (10)-(11) cannot be applied.
     p = random_problem(4)
     B = np.vstack([np.zeros((6, 3)), np.eye(3) / 0.02])
@@ -585,7 +585,7 @@ def behind_a_servo(T_eps: float) -> float:
     return float(np.max(np.abs(flight.x[-2000:, 0])) / eps)
 
 
-def test_the_softened_sign_settles_behind_a_servo_within_the_limit_of_routh() -> None:
+def test_softened_sign_settles_behind_servo_within_limit_of_routh() -> None:
     # Lambda + 1/T_eps < 1/tau, so T_eps > 20.4 ms at Lambda = 1, and somewhat more for the lag of sampling, 0.75 ms.
     assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, because s saturates
     assert behind_a_servo(1.2 * 0.0204) < 0.01  # measured 8e-4 and falling
@@ -608,19 +608,19 @@ def gravity_slope(q: float) -> float:
 
 
 @pytest.mark.equation("Assumption 2")
-def test_f_dot_of_gravity_grows_with_the_pitch_rate_so_that_assumption_2_presumes_a_bounded_flight() -> None:
+def test_f_dot_of_gravity_grows_with_pitch_rate_so_that_assumption_2_presumes_bounded_flight() -> None:
     assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == pytest.approx([-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY])
 
 
 @pytest.mark.equation("Assumption 2")
-def test_f_dot_of_gravity_is_bounded_by_z_once_the_part_with_q_minus_q_m_is_in_N_tilde() -> None:
+def test_f_dot_of_gravity_bounded_by_z_once_part_with_q_minus_q_m_is_in_N_tilde() -> None:
     q_m = 0.1
     for e_q in (-10.0, -0.1, 0.1, 10.0):
         assert abs(gravity_slope(q_m + e_q) - gravity_slope(q_m)) <= GRAVITY * abs(e_q) * (1.0 + 1e-6)
 
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
-def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_a_gust_while_e_is_zero() -> None:
+def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_gust_while_e_is_zero() -> None:
     # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)
     C, B = aircraft.C, aircraft.B
@@ -643,14 +643,14 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     return float(np.max(np.abs(np.diff(y_m, 2, axis=0)))) / dt**2
 
 
-def test_a_step_command_through_a_first_order_model_makes_N_d_unbounded() -> None:
+def test_step_command_through_first_order_model_makes_N_d_unbounded() -> None:
     # y_m_ddot contains C B_m u_m_dot = 4 / rise: a tenth of the rise needs ten times the beta, and no beta suffices for a step.
     first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
     peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
     assert peaks == pytest.approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
 
 
-def test_a_second_order_model_keeps_N_d_bounded_whatever_the_step() -> None:
+def test_second_order_model_keeps_N_d_bounded_whatever_step() -> None:
     # C B_m = 0, and y_m_ddot <= omega^2 = 16.
     model = second_order(np.array([4.0]), np.array([0.9]))
     assert all(largest_y_m_ddot(model, rise) < 16.1 for rise in (0.1, 0.01, 0.001))

@@ -151,7 +151,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
 
 
 @pytest.mark.parametrize(("section", "values", "sentence"), [(key, *row) for key, rows in BAD_AIRCRAFT.items() for row in rows])
-def test_an_invalid_section_of_the_aircraft_is_refused_by_name(section: str, values: Any, sentence: str) -> None:
+def test_invalid_section_of_aircraft_refused_by_name(section: str, values: Any, sentence: str) -> None:
     with pytest.raises(ParameterError, match=rf"^aircraft\.{section}{sentence}"):
         aircraft_parameters(rate=500.0, **{section: values})
 
@@ -163,7 +163,7 @@ def test_an_invalid_section_of_the_aircraft_is_refused_by_name(section: str, val
         ("inertial_coupling", 0.5, r"found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling"),
     ],
 )
-def test_a_section_without_data_in_the_airframe_is_refused(section: str, values: Any, sentence: str) -> None:
+def test_section_without_data_in_airframe_refused(section: str, values: Any, sentence: str) -> None:
     with pytest.raises(ParameterError, match=rf"^aircraft\.{section}: {sentence}"):
         aircraft_parameters(airframe="f16_lateral", **{section: values})
 
@@ -177,7 +177,7 @@ def test_a_section_without_data_in_the_airframe_is_refused(section: str, values:
         ("inertial_coupling", [PRODUCT | {"into": "w"}], r"\[0\]\.into: found 'w', expected a state"),
     ],
 )
-def test_an_invalid_section_of_an_airframe_is_refused_by_name(section: str, values: Any, sentence: str) -> None:
+def test_invalid_section_of_airframe_refused_by_name(section: str, values: Any, sentence: str) -> None:
     with pytest.raises(ParameterError, match=rf"^airframe\.{section}{sentence}"):
         Airframe.validate_mapping(load_airframe("osprey").model_dump() | {section: values}, "airframe")
 
@@ -186,19 +186,19 @@ def test_an_integer_is_accepted_as_a_number(osprey_gust: Scenario) -> None:
     assert osprey_gust.vary(controller={"k_g": 1, "Lambda": [5, 5, 3, 1]}).rise_di().Lambda == (5.0, 5.0, 3.0, 1.0)
 
 
-def test_the_error_for_an_unknown_scenario_lists_the_scenarios() -> None:
+def test_error_for_unknown_scenario_lists_scenarios() -> None:
     with pytest.raises(ParameterError, match=r"scenario: found 'osprey', expected one of .*osprey_gust.*, or the path"):
         find_scenario("osprey")
 
 
 @pytest.mark.parametrize("name", [5000 * "a", 5000 * "a" + ".yaml"])
-def test_a_name_too_long_for_a_file_is_an_unknown_name(name: str) -> None:
+def test_name_too_long_for_file_is_unknown_name(name: str) -> None:
     for find in (find_scenario, load_airframe):
         with pytest.raises(ParameterError, match=r": found 'aaaa.*, expected one of .*osprey"):
             find(name)
 
 
-def test_an_airframe_file_with_invalid_yaml_or_a_duplicate_key_is_one_sentence(tmp_path: Path) -> None:
+def test_airframe_file_with_invalid_yaml_or_duplicate_key_is_one_sentence(tmp_path: Path) -> None:
     bad = tmp_path / "bad.yaml"
     whole = (LIBRARY / "osprey.yaml").read_text(encoding="utf-8")
     for text, what in (
@@ -211,7 +211,7 @@ def test_an_airframe_file_with_invalid_yaml_or_a_duplicate_key_is_one_sentence(t
             load_airframe(str(bad))
 
 
-def test_a_key_may_override_the_same_key_of_a_merged_mapping(tmp_path: Path) -> None:
+def test_key_may_override_same_key_of_merged_mapping(tmp_path: Path) -> None:
     file = tmp_path / "merged.yaml"
     file.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\n", encoding="utf-8")
     assert read_yaml(file, "file", "anything")["b"] == {"x": 1, "y": 3}
@@ -231,13 +231,13 @@ def test_nest_is_the_inverse_of_flatten(tree: dict[str, object]) -> None:
     assert nest(dict(flatten(tree))) == tree
 
 
-def test_a_name_cannot_be_a_value_and_a_group() -> None:
+def test_name_cannot_be_value_and_group() -> None:
     for flat in ({"a": 1, "a.b": 2}, {"a.b": 2, "a": 1}):
         with pytest.raises(ParameterError, match="both a value and a group"):
             nest(flat)
 
 
-def test_a_period_is_a_whole_number_of_nanoseconds() -> None:
+def test_period_is_whole_number_of_nanoseconds() -> None:
     periods = [period_ns(rate, "rate") for rate in (1.0, 100.0, 500.0, 1000.0, 62.5)]
     assert periods == [10**9, 10**7, 2 * 10**6, 10**6, 16 * 10**6]
     for rate in (3.0, 300.0, 999.0):
@@ -251,7 +251,7 @@ def test_divide_returns_the_number_of_parts() -> None:
         divide(10, 0, "step", "it")
 
 
-def test_an_output_that_cannot_be_written_is_one_sentence() -> None:
+def test_output_that_cannot_be_written_is_one_sentence() -> None:
     path = "/proc/none/file"
     for key, place in (("--csv", f"--csv: {path}"), ("", path)):
         with pytest.raises(ParameterError) as rejected, writing(key, path, "the path of a file"):

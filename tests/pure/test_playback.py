@@ -28,7 +28,7 @@ def run(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path
     return write_run(tape, tmp_path_factory.mktemp("playback") / "run", LogAttachments(osprey_gust.path)).parent
 
 
-def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path) -> None:
+def test_every_message_of_flight_in_one_process_is_due_at_stamp(run: Path) -> None:
     playback = read_playback(run)
     assert len(playback.messages) == 3 * 501 + 2 * 101 + 51
     assert dict.fromkeys(playback.types.values()) == {JOINT_STATE: None}
@@ -42,7 +42,7 @@ def test_every_message_of_a_flight_in_one_process_is_due_at_its_stamp(run: Path)
     assert (playback.t(due[0]), playback.t(due[-1])) == (0.0, 1.0)
 
 
-def test_topics_are_selected_by_full_or_last_name_and_the_start_by_flight_time(run: Path) -> None:
+def test_topics_selected_by_full_or_last_name_and_start_by_flight_time(run: Path) -> None:
     playback = read_playback(run, ["y", "/u"], start=0.5)
     assert list(playback.types) == ["/u", "/y"]
     assert len(playback.messages) == 251 + 51
@@ -56,7 +56,7 @@ def test_topics_are_selected_by_full_or_last_name_and_the_start_by_flight_time(r
         ([], 1.5, r"start: found 1.5 s, expected a flight time before the end of the log, 1 s"),
     ],
 )
-def test_a_topic_or_start_outside_the_log_is_rejected(topics: list[str], start: float, sentence: str, run: Path) -> None:
+def test_topic_or_start_outside_log_rejected(topics: list[str], start: float, sentence: str, run: Path) -> None:
     with pytest.raises(ParameterError, match=sentence):
         read_playback(run, topics, start)
 
@@ -78,7 +78,7 @@ def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
     return folder
 
 
-def test_in_real_time_a_message_is_due_when_it_was_sent_not_when_it_was_received(tmp_path: Path) -> None:
+def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(tmp_path: Path) -> None:
     begin = EPOCH - 5_000 * MS  # t = 0
     sent = [
         ("/truth", begin + 2001 * MS, begin + 2000 * MS, 2.0),
@@ -89,7 +89,7 @@ def test_in_real_time_a_message_is_due_when_it_was_sent_not_when_it_was_received
     assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [2.001, 2.003, 2.006]
 
 
-def test_in_lockstep_a_message_is_due_at_its_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
+def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
     # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's time.
     sent = [
         ("/truth", EPOCH + MS, 0, 0.0),
@@ -108,7 +108,7 @@ def test_in_lockstep_a_message_is_due_at_its_stamp_but_not_before_those_sent_bef
     ]
 
 
-def test_the_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> None:
+def test_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> None:
     topics = ("/clock", "/y", "/diagnostics", "/rosout")
     bag = bag_of(tmp_path / "run", [(topic, EPOCH + k * MS, EPOCH + k * MS, 0.0) for k, topic in enumerate(topics)])
     assert list(read_playback(bag).types) == ["/y"]
@@ -129,5 +129,5 @@ def test_the_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) 
         ("std_msgs/msg/Empty", False),
     ],
 )
-def test_types_that_begin_with_a_stamp_are_recognised(type_name: str, expected: bool) -> None:
+def test_types_that_begin_with_stamp_recognised(type_name: str, expected: bool) -> None:
     assert begins_with_stamp(definition(type_name).text) is expected

@@ -31,13 +31,13 @@ QUIET: dict[str, Any] = {"gusts": {}, "sensors": {}}
 
 
 @pytest.mark.parametrize("angle", [-9.0, -math.pi, -1.0, 0.0, 3.0, math.pi, 3.2, 20.0])
-def test_a_heading_is_wrapped_to_half_a_turn_either_way(angle: float) -> None:
+def test_heading_wrapped_to_half_turn_either_way(angle: float) -> None:
     wrapped = pose.wrapped(angle)
     assert -math.pi < wrapped <= math.pi
     assert (math.sin(wrapped), math.cos(wrapped)) == pytest.approx((math.sin(angle), math.cos(angle)), abs=1e-12)
 
 
-def test_velocity_over_ground_is_the_airspeed_turned_from_body_axes_to_north_east_down() -> None:
+def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_down() -> None:
     speed, alpha, beta, phi, theta, psi = 40.0, 0.1, -0.05, 0.6, 0.2, 2.5
     body = speed * np.array([math.cos(alpha) * math.cos(beta), math.sin(beta), math.sin(alpha) * math.cos(beta)])
     north, east, down = Rotation.from_euler("ZYX", [psi, theta, phi]).apply(body)  # scipy's intrinsic rotations
@@ -51,7 +51,7 @@ def euler_rates(x: dict[str, float]) -> dict[str, float]:
     return dict(zip(airframe.states, dynamics.x_dot(0.0, state, np.zeros(4), aircraft).tolist(), strict=True))
 
 
-def test_euler_kinematics_turn_body_rates_as_an_attitude_turns() -> None:
+def test_euler_kinematics_turn_body_rates_as_attitude_turns() -> None:
     # The derivative of the rotation matrix of (phi, theta, psi) is R times the skew matrix of (p, q, r).
     phi, theta, (p, q, r) = 0.7, 0.3, (0.2, -0.1, 0.25)
     rates = euler_rates({"phi": phi, "theta": theta, "p": p, "q": q, "r": r})
@@ -63,7 +63,7 @@ def test_euler_kinematics_turn_body_rates_as_an_attitude_turns() -> None:
     assert heading_rate(phi, theta, q, r) == pytest.approx(psi_after / dt, abs=1e-6)
 
 
-def test_a_level_turn_keeps_the_attitude_and_costs_lift() -> None:
+def test_level_turn_keeps_attitude_and_costs_lift() -> None:
     # q = psi_dot sin(phi), r = psi_dot cos(phi), psi_dot = (g/V) tan(phi): the rates of a level turn hold phi and theta.
     phi, turn = 0.5, GRAVITY / 25.0 * math.tan(0.5)
     rates = euler_rates({"phi": phi, "q": turn * math.sin(phi), "r": turn * math.cos(phi)})
@@ -90,14 +90,12 @@ def test_linear_kinematics_are_those_of_the_matrices() -> None:
         ("jsbsim:c172p", {"kinematics": "euler", "speed": 46.3, "altitude": 1200.0, "step": 0.005}, "kinematics"),
     ],
 )
-def test_kinematics_and_wind_that_an_aircraft_cannot_have_are_refused(
-    airframe: str, values: dict[str, Any], sentence: str
-) -> None:
+def test_kinematics_and_wind_that_aircraft_cannot_have_refused(airframe: str, values: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         aircraft_parameters(airframe=airframe, **values)
 
 
-def test_the_pose_of_an_airframe_agrees_with_another_integrator() -> None:
+def test_pose_of_airframe_agrees_with_another_integrator() -> None:
     """From an aileron step on: heading and position by SciPy's integrator with the rotations of SciPy."""
     simulator = Simulator(aircraft_parameters(kinematics="euler"))
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()
@@ -126,7 +124,7 @@ def guided(signal: Signal) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("scenario", [OSPREY, C172P], ids=lambda one: one.name)
-def test_a_steady_wind_moves_the_position_and_nothing_else(scenario: Any) -> None:
+def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
     short = scenario.vary(flight={"duration": 3.0}, aircraft=QUIET)
     still, windy = simulate(short), simulate(short.vary(aircraft={"wind": [-4.0, 3.0]}))
     for topic in ("y", "u", "truth"):
@@ -136,14 +134,14 @@ def test_a_steady_wind_moves_the_position_and_nothing_else(scenario: Any) -> Non
         assert after[name] - before[name] == pytest.approx(np.broadcast_to(moved, t.shape), abs=1e-10), name
 
 
-def test_the_pose_comes_at_50_hz_at_most_and_from_the_start() -> None:
+def test_pose_comes_at_50_hz_at_most_and_from_start() -> None:
     tape = simulate(OSPREY.vary(flight={"duration": 1.0}))
     assert tape["pose"].stamp_ns.tolist() == list(range(0, 1_000_000_001, 20_000_000))
     assert pose.every(30.0) == 1
     assert pose.every(120.0) == 3
 
 
-def test_the_pose_of_jsbsim_is_absolute_and_consistent() -> None:
+def test_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     tape = simulate(C172P.vary(flight={"duration": 20.0}, aircraft=QUIET))
     found, t, truth = tape["pose"], tape.time("pose"), tape["truth"].group("x")
     speed, altitude = C172P.aircraft.speed, C172P.aircraft.altitude
@@ -158,7 +156,7 @@ def test_the_pose_of_jsbsim_is_absolute_and_consistent() -> None:
     assert np.abs(found["phi"]).max() > 0.1  # the scenario banks
 
 
-def test_the_place_of_jsbsim_is_that_of_its_own_latitude_and_longitude() -> None:
+def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
     """60 s in still air, with a turn after an aileron pulse."""
     aircraft = C172P.vary(aircraft=QUIET).aircraft
     simulator = Simulator(aircraft)

@@ -26,7 +26,7 @@ def locked(*senders: tuple[str, int]) -> PublisherLock:
     return lock
 
 
-def test_samples_of_a_conflicting_publisher_are_ignored_until_the_first_one_times_out() -> None:
+def test_samples_of_conflicting_publisher_ignored_until_first_one_times_out() -> None:
     lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
     for other in ("/aircraft#2", "/foreign", ""):
         sentence = f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
@@ -36,7 +36,7 @@ def test_samples_of_a_conflicting_publisher_are_ignored_until_the_first_one_time
     lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time
 
 
-def test_a_restarted_node_takes_over_after_the_age_limit_and_another_node_later() -> None:
+def test_restarted_node_takes_over_after_age_limit_and_another_node_later() -> None:
     lock = locked(("/aircraft#1", 0))
     lock.check("/aircraft#2", MAX_AGE + 1, MAX_AGE, TAKEOVER)
     with pytest.raises(ChannelError):
@@ -46,7 +46,7 @@ def test_a_restarted_node_takes_over_after_the_age_limit_and_another_node_later(
     assert not lock.timed_out(MAX_AGE, MAX_AGE)
 
 
-def test_an_overrun_of_the_receiver_is_no_silence_of_the_publisher() -> None:
+def test_overrun_of_receiver_is_no_silence_of_publisher() -> None:
     lock = locked(("/aircraft#1", 0))
     lock.overran(5000)
     now_ns = 5000 + TAKEOVER
@@ -67,7 +67,7 @@ def test_a_change_of_publisher_is_returned_once() -> None:
 
 
 @pytest.mark.parametrize(("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})])
-def test_a_delayed_reference_is_awaited_up_to_the_age_limit(late: float, modes: set[Mode], osprey_gust: Scenario) -> None:
+def test_delayed_reference_awaited_up_to_age_limit(late: float, modes: set[Mode], osprey_gust: Scenario) -> None:
     """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once above it."""
     controller, period_ns = Controller(osprey_gust.controller), 10_000_000
     visited, stamps = set(), []

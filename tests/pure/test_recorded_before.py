@@ -36,7 +36,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / str(request.param)
 
 
-def test_every_sample_is_that_of_an_independent_reader(run: Path) -> None:
+def test_every_sample_is_that_of_independent_reader(run: Path) -> None:
     samples: dict[str, list[tuple[int, tuple[str, ...], bytes]]] = {name: [] for name in TOPICS}
     with next(run.glob("*.mcap")).open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -57,7 +57,7 @@ def test_every_sample_is_that_of_an_independent_reader(run: Path) -> None:
         assert len(read) > 30  # ticks of 10 ms in the shorter flight
 
 
-def test_the_summary_is_equal_to_the_last_digit(run: Path) -> None:
+def test_summary_equal_to_last_digit(run: Path) -> None:
     recorded = json.loads((run / "summary.json").read_text(encoding="utf-8"))
     assert recorded["outcome"] == "completed"
     assert json.loads(json.dumps(read_flight(run).summary)) == recorded | {"guidance": None}  # a key that came later
@@ -74,7 +74,7 @@ def test_every_bit_is_replayed(run: Path) -> None:
     assert result.notes == ()
 
 
-def test_the_page_and_the_commands_read_the_scenario(run: Path) -> None:
+def test_page_and_commands_read_scenario(run: Path) -> None:
     flight, recorded = Flight(run), read_run(run).scenario
     flight.update()
     assert recorded is not None
@@ -83,7 +83,7 @@ def test_the_page_and_the_commands_read_the_scenario(run: Path) -> None:
     assert flight.scenario.controller == recorded_scenario(recorded).controller == recorded_parameters(recorded)
 
 
-def test_the_log_is_intact_and_keeps_its_attachments_and_metadata(run: Path) -> None:
+def test_log_intact_and_keeps_attachments_and_metadata(run: Path) -> None:
     assert not repair(run).wrote_metadata
     recorded = read_run(run)
     assert recorded.scenario is not None

@@ -38,7 +38,7 @@ PULSES = {
 }
 
 
-def test_a_pulse_rises_holds_and_falls_over_its_edges() -> None:
+def test_pulse_rises_holds_and_falls_over_edges() -> None:
     profile = parameters(pulses=PULSES).profile()
     at = [float(command(t, profile)[0]) for t in (0.9, 1.0, 1.05, 1.1, 1.9, 2.05, 2.2, 3.5, 9.0)]
     assert at == pytest.approx([0.0, 0.0, 0.05, 0.1, 0.1, 0.05, 0.0, -0.2, 0.0], abs=1e-12)
@@ -53,7 +53,7 @@ def test_commands_have_a_bounded_derivative(t: float, dt: float) -> None:
     assert (change <= np.array([0.2, 0.4, 0.0]) / 0.1 * dt + 1e-12).all()
 
 
-def test_a_coordinated_turn_follows_the_integral_of_the_bank_rate() -> None:
+def test_coordinated_turn_follows_integral_of_bank_rate() -> None:
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": 25.0}
     sines = {"p": {"amplitude": 0.3, "frequency": 2.0, "phase": 0.4}}
     profile = parameters(pulses=PULSES, sines=sines, coordinated_turn=turn).profile()
@@ -69,7 +69,7 @@ def simulate(params: ReferenceModelConfig, duration: float, dt: float) -> FloatA
 
 
 @pytest.mark.equation(2)
-def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
+def test_equation_2_agrees_with_exact_linear_simulation() -> None:
     params = parameters(pulses=PULSES)
     matrices, profile = params.model(), params.profile()
     t = np.arange(0, 3001) * 0.002
@@ -78,7 +78,7 @@ def test_equation_2_agrees_with_an_exact_linear_simulation() -> None:
     assert simulate(params, 6.0, 0.002) == pytest.approx(exact, abs=1e-9)
 
 
-def test_a_step_is_one_runge_kutta_step_of_equation_2() -> None:
+def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     params = parameters(pulses=PULSES)
     matrices, profile, dt = params.model(), params.profile(), 0.05
     x_m = np.linspace(-0.2, 0.3, 6)
@@ -98,7 +98,7 @@ def test_a_long_pulse_ends_at_its_value() -> None:
     assert simulate(params, 10.0, 0.01)[-1] == pytest.approx([0.1, 0.0, 0.0], abs=1e-9)
 
 
-def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None:
+def test_general_form_and_second_order_form_are_same_model() -> None:
     same = parameters().model()
     A_m, B_m = same.A_m.ravel().tolist(), same.B_m.ravel().tolist()
     linear = {"states": ["q", "q_rate", "p", "p_rate", "r", "r_rate"], "A_m": A_m, "B_m": B_m}
@@ -106,7 +106,7 @@ def test_the_general_form_and_the_second_order_form_are_the_same_model() -> None
         assert (general_matrix == matrix).all()
 
 
-def test_a_rate_at_which_the_runge_kutta_steps_diverge_is_refused() -> None:
+def test_rate_at_which_runge_kutta_steps_diverge_refused() -> None:
     # 1 + z + z^2/2 + z^3/6 + z^4/24 = 1 at z = -2.785, here a pole of 278.5 1/s at 100 Hz.
     def first_order(pole: float) -> ReferenceModelConfig:
         linear = {"states": ["q"], "A_m": [-pole], "B_m": [pole]}

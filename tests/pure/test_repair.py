@@ -44,7 +44,7 @@ def last(run: Path) -> float:
 
 
 @pytest.mark.parametrize("fraction", [0.35, 0.6, 0.9, 0.999])
-def test_a_repaired_truncated_log_is_read_in_full_by_rosbags(fraction: float, recorded: Path, run: Path) -> None:
+def test_repaired_truncated_log_read_in_full_by_rosbags(fraction: float, recorded: Path, run: Path) -> None:
     before = truncate(run, fraction)
     readable = read_run(run)
     done = repair(run)
@@ -74,7 +74,7 @@ def test_an_intact_or_repaired_log_is_unchanged(repaired: bool, run: Path) -> No
 
 
 @pytest.mark.parametrize("content", [None, "", "rosbag2_bagfile_information: 3\n", "{"])
-def test_a_missing_or_damaged_metadata_yaml_is_restored(content: str | None, recorded: Path, run: Path) -> None:
+def test_missing_or_damaged_metadata_yaml_restored(content: str | None, recorded: Path, run: Path) -> None:
     (run / "metadata.yaml").unlink()
     if content is not None:
         (run / "metadata.yaml").write_text(content, encoding="utf-8")
@@ -98,7 +98,7 @@ def test_damage_inside_loses_only_its_chunk(recorded: Path, run: Path) -> None:
     assert all(chunk.message_start_time <= stamp_ns <= chunk.message_end_time for _, stamp_ns, _ in every - kept)
 
 
-def test_a_log_that_is_being_recorded_is_unchanged(run: Path) -> None:
+def test_log_that_is_being_recorded_unchanged(run: Path) -> None:
     truncate(run, 0.5)
     with unchanged(run), (run / "run_0.mcap").open("ab") as stream:
         fcntl.flock(stream, fcntl.LOCK_EX)
@@ -118,14 +118,14 @@ def test_a_failed_repair_changes_nothing(run: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("size", [0, 30, 500])
-def test_a_log_without_a_message_is_rejected_and_unchanged(size: int, run: Path) -> None:
+def test_log_without_message_rejected_and_unchanged(size: int, run: Path) -> None:
     file = run / "run_0.mcap"
     file.write_bytes(file.read_bytes()[:size])
     with unchanged(run), pytest.raises(ParameterError, match="found no message that could be read"):
         repair(run)
 
 
-def test_changed_bytes_never_cause_a_traceback_or_false_messages(recorded: Path, run: Path) -> None:
+def test_changed_bytes_never_cause_traceback_or_false_messages(recorded: Path, run: Path) -> None:
     file, generator = run / "run_0.mcap", np.random.default_rng(2)
     content, repaired = file.read_bytes(), 0
     data = {(topic, bytes_) for topic, _, bytes_ in messages(recorded)}
@@ -144,7 +144,7 @@ def test_changed_bytes_never_cause_a_traceback_or_false_messages(recorded: Path,
     assert repaired > 10
 
 
-def test_a_second_repair_keeps_the_first_damaged_file(run: Path) -> None:
+def test_second_repair_keeps_first_damaged_file(run: Path) -> None:
     first = truncate(run, 0.9)
     repair(run)
     second = truncate(run, 0.5)
@@ -153,7 +153,7 @@ def test_a_second_repair_keeps_the_first_damaged_file(run: Path) -> None:
     assert (run / "run_0.mcap.damaged-2").read_bytes() == second
 
 
-def test_the_command_prints_the_kept_messages_and_the_missing_time(run: Path) -> None:
+def test_command_prints_kept_messages_and_missing_time(run: Path) -> None:
     def command() -> str:
         words = [sys.executable, "-m", "flight_cli.cli", "repair", "run"]
         return subprocess.run(words, cwd=run.parent, capture_output=True, text=True, check=True).stdout

@@ -65,7 +65,7 @@ def equal(result: ReplayResult) -> bool:
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_replay_equals_the_flight_in_every_bit(name: str) -> None:
+def test_replay_equals_flight_in_every_bit(name: str) -> None:
     scenario = SCENARIOS[name]
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
@@ -141,7 +141,7 @@ PATIENT = vary(GUST.controller, {"max_age": 0.03, "hold": 0.05, "ramp": 0.2})
 
 @settings(deadline=None)
 @given(ticks=TICKS, hold=st.booleans(), with_feedforward=st.booleans())
-def test_a_replay_equals_a_flight_with_late_and_lost_samples(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
+def test_replay_equals_flight_with_late_and_lost_samples(ticks: list[Tick], hold: bool, with_feedforward: bool) -> None:
     changes = QUICK | {"on_deactivate": "hold" if hold else "trim", "slew": [0.3] * 4}
     parameters = vary(LEADING if with_feedforward else GUST.controller, changes)
     result = replay(driven(parameters, [FLY, FLY, *ticks]), parameters)
@@ -172,7 +172,7 @@ def test_a_replay_passes_the_same_modes(events: list[Tick], modes: list[Mode]) -
     assert [mode for k, mode in enumerate(recorded) if k == 0 or recorded[k - 1] != mode] == modes
 
 
-def test_a_second_controller_in_a_log_is_noted() -> None:
+def test_second_controller_in_log_noted() -> None:
     tape = driven(GUST.controller, [FLY] * 20 + [Tick(event="replaced")] + [FLY] * 20)
     result = replay(tape, GUST.controller)
     assert result.first() is None
@@ -224,7 +224,7 @@ BUSY = {
         ("y", ["r"]),
     ],
 )
-def test_one_bit_of_one_sample_is_found_and_only_there(topic: str, channels: list[str]) -> None:
+def test_one_bit_of_one_sample_found_and_only_there(topic: str, channels: list[str]) -> None:
     tape = simulate(GUST.vary(reference_model={"pulses": BUSY}))
     for channel in channels:
         row = np.searchsorted(tape[topic].stamp_ns, 1_000 * MS)
@@ -241,7 +241,7 @@ def test_one_bit_of_one_sample_is_found_and_only_there(topic: str, channels: lis
         assert result.number[result.different().any(axis=1)].max() <= 102
 
 
-def test_differences_are_counted_in_units_in_the_last_place() -> None:
+def test_differences_counted_in_units_in_last_place() -> None:
     cases = ((1.0, math.nextafter(1.0, 2), 1), (-5e-324, 5e-324, 2), (0.0, -0.0, 0), (1.0, math.nan, None))
     for recorded, computed, ulps in cases:
         yes = np.ones(1, dtype=bool)
@@ -261,7 +261,7 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
-def test_a_log_without_its_beginning_is_checked_after_its_first_tick(name: str) -> None:
+def test_log_without_beginning_checked_after_first_tick(name: str) -> None:
     scenario = SCENARIOS[name]
     result = replay(without(simulate(scenario), lambda number: number > 100), scenario.controller)
     assert result.first() is None
@@ -273,7 +273,7 @@ def test_a_log_without_its_beginning_is_checked_after_its_first_tick(name: str) 
 
 
 @pytest.mark.parametrize("name", ["osprey_gust", "feedforward"])
-def test_one_bit_of_one_gain_is_found_after_a_gap(name: str) -> None:
+def test_one_bit_of_one_gain_found_after_gap(name: str) -> None:
     scenario = SCENARIOS[name].vary(reference_model={"pulses": BUSY})
     tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
     result = replay(tape, scenario.controller)
@@ -284,7 +284,7 @@ def test_one_bit_of_one_gain_is_found_after_a_gap(name: str) -> None:
     assert replay(tape, vary(scenario.controller, {"beta": [flipped(gains[0]), *gains[1:]]})).first() is not None
 
 
-def test_after_a_gap_in_which_the_failsafe_began_checks_resume_at_the_next_engagement() -> None:
+def test_after_gap_in_which_failsafe_began_checks_resume_at_next_engagement() -> None:
     tape = driven(PATIENT, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20 + [LOST_Y] * 20)
     whole = replay(tape, PATIENT)
     first_held = int(whole.number[whole.recorded[:, 0] != Mode.ENGAGED][0])
@@ -300,14 +300,14 @@ def test_after_a_gap_in_which_the_failsafe_began_checks_resume_at_the_next_engag
 
 @settings(deadline=None, max_examples=50)
 @given(ticks=TICKS, lost=st.sets(st.integers(1, 60)), leading=st.booleans())
-def test_lost_samples_of_a_log_cause_no_differences(ticks: list[Tick], lost: set[int], leading: bool) -> None:
+def test_lost_samples_of_log_cause_no_differences(ticks: list[Tick], lost: set[int], leading: bool) -> None:
     parameters = vary(LEADING if leading else GUST.controller, QUICK)
     tape = without(driven(parameters, [FLY, FLY, *ticks]), lambda number: ~np.isin(number, list(lost)))
     if len(tape["internals"].stamp_ns):
         assert replay(tape, parameters).first() is None
 
 
-def test_gains_changed_in_flight_differ_from_the_tick_of_the_change() -> None:
+def test_gains_changed_in_flight_differ_from_tick_of_change() -> None:
     tuned = {"k_g": 2.0, "Lambda": [3.0, 4.0, 2.0, 1.0], "upper": [0.02] * 4}
     tape = driven(GUST.controller, [FLY] * 30 + [Tick(changes=(tuned,))] + [FLY] * 30)
     result = replay(tape, GUST.controller)
@@ -321,7 +321,7 @@ def test_gains_changed_in_flight_differ_from_the_tick_of_the_change() -> None:
     assert result.notes == ("parameters changed before tick 30: Lambda, k_g, upper",)
 
 
-def test_a_replay_applies_successive_gain_changes_one_by_one() -> None:
+def test_replay_applies_successive_gain_changes_one_by_one() -> None:
     changes: list[dict[str, Any]] = [{"k_g": 2.0}, {"Lambda": [3.0, 4.0, 2.0, 1.0]}]
     changes += [{"k_g": 3.3}, {"slew": [0.2] * 4}, {"k_g": 1.0}]
     ticks = [FLY] * 30 + [Tick(changes=(*changes[:3],))] + [FLY] * 10 + [Tick(changes=(change,)) for change in changes[3:]]
@@ -334,7 +334,7 @@ def test_a_replay_applies_successive_gain_changes_one_by_one() -> None:
     assert lost.notes == ()
 
 
-def test_an_open_loop_equals_the_controller_on_the_recorded_inputs() -> None:
+def test_open_loop_equals_controller_on_recorded_inputs() -> None:
     others = vary(GUST.controller, {"Lambda": [3.0, 3.0, 3.0, 1.0], "beta": [20.0, 20.0, 8.0, 6.0], "upper": [0.01] * 4})
     tape = simulate(GUST)
     controller, us = Controller(others), []
@@ -350,7 +350,7 @@ def test_an_open_loop_equals_the_controller_on_the_recorded_inputs() -> None:
     assert np.abs(result.group(result.computed, "u").values - result.group(result.recorded, "u").values).max() > 1e-3
 
 
-def test_an_open_loop_continues_over_gaps_and_lost_inputs() -> None:
+def test_open_loop_continues_over_gaps_and_lost_inputs() -> None:
     tape = driven(PATIENT, [FLY] * 20 + [LOST_Y] * 20 + [FLY] * 20)
     tape = without(tape, lambda number: (number > 5) & (number != 15))
     result = replay(tape, PATIENT, vary(PATIENT, {"k_g": 3.0}))
@@ -374,7 +374,7 @@ def test_a_log_of_other_channels_is_refused() -> None:
         replay(tape, GUST.controller, other)
 
 
-def test_parameters_are_varied_by_dotted_name_and_validated() -> None:
+def test_parameters_varied_by_dotted_name_and_validated() -> None:
     assert vary(SERVO.controller, {"upper": None}).upper is None
     assert vary(LEADING, {"feedforward": None}).feedforward is None
     leads = vary(LEADING, {"feedforward.lead": [0.0] * 4}).feedforward
@@ -386,7 +386,7 @@ def test_parameters_are_varied_by_dotted_name_and_validated() -> None:
         vary(SERVO.controller, {"kg": 1.0})
 
 
-def test_a_change_to_the_same_value_changes_no_bit() -> None:
+def test_change_to_same_value_changes_no_bit() -> None:
     # A bumpless change solves for Pi, which rounds.
     set_again = driven(GUST.controller, [FLY] * 20 + [Tick(changes=({"k_g": 1.0},))] + [FLY] * 20)
     left_alone = driven(GUST.controller, [FLY] * 41)
@@ -431,7 +431,7 @@ def test_the_command_counts_the_ticks(run: Path) -> None:
     assert (result.exit_code, result.stdout) == (0, "201 ticks, every bit equal\n")
 
 
-def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: Tape, tmp_path: Path) -> None:
+def test_command_finds_one_bit_of_one_gain_in_scenario_of_log(tape: Tape, tmp_path: Path) -> None:
     gains = [flipped(5.0), 5.0, 3.0, 0.5]
     run = write_run(tape, tmp_path / "run", LogAttachments(busy_scenario(tmp_path, Lambda=gains))).parent
     result = command(str(run))
@@ -452,7 +452,7 @@ def test_the_command_finds_one_bit_of_one_gain_in_the_scenario_of_the_log(tape: 
     assert summary["first"]["number"] == int(number[1])
 
 
-def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
+def test_log_cut_short_checked_as_far_as_it_goes(run: Path) -> None:
     truncate(run, 0.75)
     summary = json.loads(command(str(run), "--json").stdout)
     assert summary["equal"]
@@ -460,7 +460,7 @@ def test_a_log_cut_short_is_checked_as_far_as_it_goes(run: Path) -> None:
     assert any("is truncated" in note for note in summary["notes"])
 
 
-def test_other_gains_are_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
+def test_other_gains_shown_beside_what_was_recorded(run: Path, tmp_path: Path) -> None:
     csv_file, gains = tmp_path / "u.csv", ("--set", "controller.k_g=3.0", "--set", "controller.upper=[0.01, 1, 1, 1]")
     result = command(str(run), *gains, "--csv", str(csv_file))
     assert result.exit_code == 1
@@ -480,7 +480,7 @@ def test_json_of_figures_that_overflow_has_null(run: Path) -> None:
     assert (figures["rms"], figures["max"] > 1e200) == (None, True)
 
 
-def test_parameters_with_which_the_controller_never_engages_have_no_figures_of_u(tape: Tape, tmp_path: Path) -> None:
+def test_parameters_with_which_controller_never_engages_have_no_figures_of_u(tape: Tape, tmp_path: Path) -> None:
     log = tape["internals"]
     late = log.values.copy()
     late[:, log.names.index("age")] = 0.02
@@ -514,7 +514,7 @@ def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Pa
     assert len(str(result.exception).splitlines()) == 1
 
 
-def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
+def test_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
     scenario = busy_scenario(tmp_path)
     alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", LogAttachments(scenario)).parent
     short = Tape({name: one.until(0) for name, one in tape.signals.items()})
@@ -525,7 +525,7 @@ def test_a_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_pa
         assert str(result.exception).startswith(sentence)
 
 
-def test_changes_of_parameters_are_read_from_the_log(tmp_path: Path) -> None:
+def test_changes_of_parameters_read_from_log(tmp_path: Path) -> None:
     types: dict[str, Any] = STORE.types
     time, value = types["builtin_interfaces/msg/Time"], types["rcl_interfaces/msg/ParameterValue"]
     parameter, event = types["rcl_interfaces/msg/Parameter"], types[PARAMETER_EVENT]

@@ -111,23 +111,23 @@ def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, co
     ]
 
 
-def test_a_log_of_only_y_and_its_reference_has_a_report(tmp_path: Path, servo: Scenario) -> None:
+def test_log_of_only_y_and_reference_has_report(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight())
     assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
     assert "Events" not in page
 
 
-def test_a_pose_without_an_attitude_has_no_replay(tmp_path: Path, servo: Scenario) -> None:
+def test_pose_without_attitude_has_no_replay(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight(pose=held(101, climb=1.0)))
     assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
 
 
-def test_a_flight_of_one_sample_has_a_report(tmp_path: Path, servo: Scenario) -> None:
+def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> None:
     one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
     assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: no wind, no late tick
 
 
-def test_the_page_of_a_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
+def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
     # White noise on all channels at the rates of the scenario hardly compresses. plotly itself takes 0.5 MB. Measured 4.2 MB.
     random = np.random.default_rng(1)
 
@@ -144,7 +144,7 @@ def test_the_page_of_a_minute_of_noise_is_below_five_megabytes(tmp_path: Path, s
     assert 'src="http' not in page
 
 
-def test_the_page_of_the_default_flight_is_below_a_megabyte_and_a_half(tmp_path: Path, osprey_gust: Scenario) -> None:
+def test_page_of_default_flight_is_below_megabyte_and_half(tmp_path: Path, osprey_gust: Scenario) -> None:
     # With its replay; measured 1.495 MB, of which plotly takes 0.5 MB and the replay 0.02 MB.
     assert len(page_of(tmp_path, osprey_gust, simulate(osprey_gust))) < 1.5e6
 
@@ -155,7 +155,7 @@ def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
     assert "<script>alert" not in page
 
 
-def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+def test_every_colour_of_page_has_dark_counterpart(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
     # Colours of modes, saturations and gusts serve light and dark pages alike.
     shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
     specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete))
@@ -164,7 +164,7 @@ def test_every_colour_of_a_page_has_a_dark_counterpart(tmp_path: Path, servo: Sc
     assert len(used) > 5
 
 
-def test_each_event_is_listed_once_in_order_of_its_start() -> None:
+def test_each_event_listed_once_in_order_of_start() -> None:
     modes = ((20, "ENGAGED"), (10, "HOLD"), (20, "ENGAGED"), (5, "HOLD"), (5, "RAMP"), (41, "ENGAGED"))
     mode = [Mode[name] for count, name in modes for _ in range(count)]
     rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
@@ -178,21 +178,21 @@ def test_each_event_is_listed_once_in_order_of_its_start() -> None:
     ]
 
 
-def test_a_span_ends_where_the_next_sample_begins() -> None:
+def test_span_ends_where_next_sample_begins() -> None:
     t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
     assert mask_spans(t, np.array([False, True, True, False, True])) == [(1.0, 4.0), (5.0, 5.0)]
     assert mask_spans(t, np.zeros(5, dtype=bool)) == []
     assert mask_spans(np.zeros(0), np.zeros(0, dtype=bool)) == []
 
 
-def test_close_spans_are_merged_and_short_ones_lengthened() -> None:
+def test_close_spans_merged_and_short_ones_lengthened() -> None:
     t = np.arange(10.0)
     mask = np.array([True, False, True, False, False, False, False, True, False, False])
     assert mask_spans(t, mask) == [(0.0, 1.0), (2.0, 3.0), (7.0, 8.0)]
     assert mask_spans(t, mask, min_length=1.5) == [(0.0, 3.5), (7.0, 8.5)]
 
 
-def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
+def test_every_mode_but_engaged_is_interval_with_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
     modes = [one for one in Mode for _ in range(10)]
@@ -202,7 +202,7 @@ def test_every_mode_but_engaged_is_an_interval_with_its_name() -> None:
     }  # fmt: skip
 
 
-def test_intervals_are_shaded_over_the_whole_height_of_a_figure() -> None:
+def test_intervals_shaded_over_whole_height_of_figure() -> None:
     intervals = [Interval("hold", 0.2, 0.3, "#f2c230", False), Interval("a gust", 0.5, 0.6, "#7f7f7f", True)]
     figure = figures.tracking_figure(context(flight())._replace(intervals=intervals))
     layout = drawn(figure).layout
@@ -217,7 +217,7 @@ def input_flight(**limited: list[Saturation]) -> Tape:
     return flight(u=held(**dict.fromkeys(INPUTS, 0.0) | {"elevator": 2.0 * DEG}), internals=ticks(**limited))
 
 
-def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
+def test_limits_near_input_are_in_view_and_far_ones_are_not(servo: Scenario) -> None:
     units = summary.display_units(servo)
     near = servo.vary(controller={"lower": [-3 * DEG, -1.0, -1.0, -1.0], "upper": [3 * DEG, 1.0, 1.0, 1.0]})
     for scenario, limit, inside in ((near, 3.0, True), (servo, 30.0, False)):
@@ -229,7 +229,7 @@ def test_limits_near_the_input_are_in_view_and_far_ones_are_not(servo: Scenario)
         assert (low <= 2.0 <= high, low <= limit <= high) == (True, inside)
 
 
-def test_end_stops_are_drawn_where_actuators_are_simulated(servo: Scenario) -> None:
+def test_end_stops_drawn_where_actuators_simulated(servo: Scenario) -> None:
     # End stops are in the airframe's order, u in the law's: only thrust has 50 %.
     assert set(input_limits(servo, input_flight())) == {"limits of the controller"}
     stops = input_limits(servo, flight(truth=held(actuator__elevator=0.0)))["end stops"]
@@ -243,7 +243,7 @@ def test_an_input_without_limits_has_no_lines(osprey_gust: Scenario) -> None:
     assert not traces(figure, "limits of the controller")
 
 
-def test_saturation_of_an_input_is_marked_in_its_row_alone() -> None:
+def test_saturation_of_input_marked_in_row_alone() -> None:
     limited = [Saturation.NO] * 101
     limited[50:60], limited[80] = [Saturation.MAGNITUDE] * 10, Saturation.RATE
     figure = figures.input_figure(context(input_flight(limited__aileron=limited)), {})
@@ -253,7 +253,7 @@ def test_saturation_of_an_input_is_marked_in_its_row_alone() -> None:
     assert rate.x[:2] == pytest.approx((0.8, 0.81))
 
 
-def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
+def test_actuator_drawn_over_command_by_name() -> None:
     lagging = flight(u=input_flight()["u"], truth=held(actuator__thrust=0.3, actuator__elevator=0.01))
     figure = figures.input_figure(context(lagging, {"elevator": DisplayUnit("deg", 1 / DEG)}), {})
     assert titles(figure) == ["elevator (deg)", "aileron", "rudder", "thrust"]
@@ -262,7 +262,7 @@ def test_the_actuator_is_drawn_over_the_command_by_name() -> None:
     assert len(traces(figure, "command u")) == 4
 
 
-def test_all_states_are_drawn_in_their_unit_where_it_is_known() -> None:
+def test_all_states_drawn_in_unit_where_it_known() -> None:
     tape = flight(truth=held(x__q=0.25, x__altitude=1200.0))
     figure = figures.state_figure(context(tape, {"q": DisplayUnit("mrad/s", 1e3)}))
     assert titles(figure) == ["q (mrad/s)", "altitude"]
@@ -278,13 +278,13 @@ def test_ideal_sensors_and_still_air_have_no_figure() -> None:
     assert titles(figures.wind_figure(real)) == ["longitudinal (m/s)"]
 
 
-def test_a_range_that_is_no_number_is_left_to_the_page() -> None:
+def test_range_that_is_no_number_left_to_page() -> None:
     figure = figures.input_figure(context(flight(u=held(**dict.fromkeys(INPUTS, np.nan)))), {})
     assert figure is not None
     assert json.loads(html.script_json(figure))["layout"]["yaxis"]["range"] == [None, None]
 
 
-def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> None:
+def test_true_error_drawn_over_measured_one_where_they_differ() -> None:
     states = {f"x__{name}": 0.5 for name in OUTPUTS}
     ideal = figures.error_figure(context(flight(truth=held(**states, noise__q=0.0))))
     assert {trace.name for trace in drawn(ideal).data} == {"e"}
@@ -292,27 +292,27 @@ def test_the_true_error_is_drawn_over_the_measured_one_where_they_differ() -> No
     assert [traces(noisy, name)[0].y[0] for name in ("measured", "true")] == [0.0, 0.5]
 
 
-def test_ticks_have_a_figure_if_one_was_late_or_y_was_old_or_dt_changed() -> None:
+def test_ticks_have_figure_if_one_was_late_or_y_was_old_or_dt_changed() -> None:
     assert figures.tick_figure(context(flight(internals=ticks()))) is None
     for channel, values in (("late", [0.0] * 100 + [1e-4]), ("age", 2e-3), ("dt", [0.0] + [0.01] * 99 + [0.02])):
         figure = figures.tick_figure(context(flight(internals=ticks(**{channel: values}))))
         assert titles(figure) == ["late (ms)", "age (ms)", "dt (ms)"]
 
 
-def test_a_visible_noise_floor_is_drawn_on_both_sides_of_zero() -> None:
+def test_visible_noise_floor_drawn_on_both_sides_of_zero() -> None:
     tape = flight(y=signal([0, 1000], **dict.fromkeys(OUTPUTS, (1.0, 0.0))))
     (floor,) = traces(figures.error_figure(context(tape), {"q": 0.5, "V": 1e-9}), "noise floor")
     assert (floor.yaxis, set(floor.y)) == ("y", {0.5, -0.5})  # only that of q is visible
 
 
-def test_both_integrals_of_an_output_stand_side_by_side() -> None:
+def test_both_integrals_of_output_stand_side_by_side() -> None:
     tape = flight(internals=ticks(Pi__p=[0.0] * 100 + [3.0], integral_e__p=[0.0] * 100 + [2.0]))
     figure = figures.integral_figure(context(tape))
     assert titles(figure)[4:6] == ["∫e p", "Pi p"]
     assert [trace.y[-1] for trace in drawn(figure).data[4:6]] == [2.0, 3.0]
 
 
-def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
+def test_spectrum_of_commanded_sine_has_peak_there() -> None:
     u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
     units = {"elevator": DisplayUnit("deg", 1 / DEG)}
     figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, units)
@@ -322,7 +322,7 @@ def test_the_spectrum_of_a_commanded_sine_has_its_peak_there() -> None:
     assert figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {}) is None  # eleven samples
 
 
-def test_timing_has_a_histogram_if_it_is_not_zero() -> None:
+def test_timing_has_histogram_if_it_is_not_zero() -> None:
     assert figures.timing_figure({"": (flight(internals=ticks()), 10 * MS)}, {"": figures.PLANT}) is None
     delayed = flight(internals=ticks(), latency=signal([0, 10, 20], y_to_u=[1e-3, 1e-3, 3e-3]))
     figure = drawn(figures.timing_figure({"": (delayed, 10 * MS)}, {"": figures.PLANT}))
@@ -339,7 +339,7 @@ def pair(servo: Scenario) -> list[RecordedFlight]:
     return [recorded("a", servo, first), recorded("b", servo, second)]
 
 
-def test_metrics_of_several_flights_are_compared_by_channel_name(pair: list[RecordedFlight]) -> None:
+def test_metrics_of_several_flights_compared_by_channel_name(pair: list[RecordedFlight]) -> None:
     compared = {table.caption: {row.name: row for row in table.rows} for table in comparison.error_tables(pair)}
     assert list(compared) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
     whole = compared["q (mrad/s)"]["rms whole"]
@@ -361,7 +361,7 @@ def test_less_error_is_better_and_less_input_is_neither() -> None:
     assert verdicts(False) == ["same"] * 4
 
 
-def test_curves_of_several_flights_are_drawn_over_one_reference(pair: list[RecordedFlight]) -> None:
+def test_curves_of_several_flights_drawn_over_one_reference(pair: list[RecordedFlight]) -> None:
     figure = drawn(comparison.tracking_figure(comparison.plot_context(pair), pair))
     q = [trace for trace in figure.data if trace.yaxis == "y"]
     assert [trace.name for trace in q] == ["y_m", "a", "b"]
@@ -377,7 +377,7 @@ def test_each_distinct_reference_is_drawn(pair: list[RecordedFlight], servo: Sce
     assert [trace.name for trace in figure.data if trace.yaxis == "y"] == ["y_m a", "y_m c", "a", "b", "c"]
 
 
-def test_each_flight_is_in_the_legend_once_whatever_its_channels(servo: Scenario) -> None:
+def test_each_flight_is_in_legend_once_whatever_channels(servo: Scenario) -> None:
     def only(*names: str) -> Tape:
         y = held(**dict.fromkeys(names, 1.0))
         return Tape({"y": y, "y_m": y, "u": y, "latency": signal([0, 10], y_to_u=[1e-3, 2e-3])}, EPOCH)
@@ -415,7 +415,7 @@ def test_live_commands_replace_those_of_the_scenario(osprey_gust: Scenario) -> N
     assert [one.start for one in commands] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
 
 
-def test_slowest_settling_marks_a_transient_after_which_the_error_did_not_settle() -> None:
+def test_slowest_settling_marks_transient_after_which_error_did_not_settle() -> None:
     def settling(*times: float | None) -> str:
         entries = [{"kind": "gust", "start": 1.0, "until": {"q": 3.5}, "settling": {"q": time}} for time in times]
         return summary.slowest_settling({"transients": entries}, "q", "gust")
@@ -430,7 +430,7 @@ def test_values_have_three_digits() -> None:
     assert [summary.format_value(value) for value in texts] == list(texts.values())
 
 
-def test_a_curve_is_broken_at_a_gap_and_u_is_held() -> None:
+def test_curve_is_broken_at_gap_and_u_held() -> None:
     stamps = [10.0 * k for k in range(101) if not 30 <= k < 60]
     gapped, u = (signal(stamps, **dict.fromkeys(names, 1.0)) for names in (OUTPUTS, INPUTS))
     tape = flight(y=gapped, u=u)
@@ -445,7 +445,7 @@ def unpacked(text: str, kind: str) -> FloatArray:
     return np.ascontiguousarray(shuffled.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
 
 
-def test_all_samples_of_long_curves_are_stored_once() -> None:
+def test_all_samples_of_long_curves_stored_once() -> None:
     count = 5000
     stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
     y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
@@ -462,13 +462,13 @@ def test_all_samples_of_long_curves_are_stored_once() -> None:
     assert len(shared.samples.packed) == 1 + 4 + 1  # one time, four y, and the zeros of all y_m
 
 
-def test_the_extremes_are_the_least_the_greatest_and_the_first_gap_of_each_bin() -> None:
+def test_extremes_are_least_greatest_and_first_gap_of_each_bin() -> None:
     nan = np.nan
     values = [1.0, 5.0, 0.0, 2.0, 7.0, nan, nan, 6.0, 3.0, 3.0, 3.0, 3.0, nan, nan, nan, nan, 8.0]  # four to a bin
     assert plotting.extremes(np.array(values), 10).tolist() == [1, 2, 4, 5, 7, 8, 12, 16]
 
 
-def test_a_curve_of_few_samples_is_drawn_whole_and_not_stored() -> None:
+def test_curve_of_few_samples_drawn_whole_and_not_stored() -> None:
     shared = context(flight())
     assert traces(figures.tracking_figure(shared), "y")[0].meta is None
     assert shared.samples.packed == {}
@@ -480,12 +480,12 @@ def test_overlapping_labels_of_intervals_are_merged() -> None:
     assert [(note.x, note.text) for note in drawn(figure).layout.annotations] == [(10.0, "a, b"), (50.0, "c")]
 
 
-def test_the_time_axis_is_flight_time_whatever_the_stamps() -> None:
+def test_time_axis_is_flight_time_whatever_stamps() -> None:
     y = traces(figures.tracking_figure(context(flight())), "y")[0]
     assert (y.x[0], y.x[-1]) == (0.0, 1.0)
 
 
-def test_the_vendored_plotly_is_that_of_its_hash_and_of_the_release_of_the_python_package() -> None:
+def test_vendored_plotly_is_that_of_hash_and_of_release_of_python_package() -> None:
     vendor = Path(html.__file__).parent / "vendor"
     bundle = (vendor / "plotly-basic.min.js").read_bytes()
     assert hashlib.sha256(bundle).hexdigest() in (vendor / "README.md").read_text(encoding="utf-8")

@@ -47,9 +47,7 @@ def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, cap
     assert parquet.read_bytes()[:4] == b"PAR1"
 
 
-def test_an_engagement_shorter_than_a_sample_leaves_the_figures_of_the_flight(
-    run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_engagement_shorter_than_sample_leaves_figures_of_flight(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = read_run(run)
     instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
     monkeypatch.setattr(run_folder, "read_run", lambda _: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
@@ -59,7 +57,7 @@ def test_an_engagement_shorter_than_a_sample_leaves_the_figures_of_the_flight(
     assert summary["notes"][1] == "the figures are of the whole flight: no y while engaged"
 
 
-def test_a_scenario_beside_a_log_that_is_not_the_one_in_the_log_is_kept(runs: list[Path], tmp_path: Path) -> None:
+def test_scenario_beside_log_that_is_not_one_in_log_kept(runs: list[Path], tmp_path: Path) -> None:
     log, own = tmp_path / "run_0.mcap", tmp_path / "osprey_gust.yaml"
     log.write_bytes(bag_files(runs[0])[0].read_bytes())
     own.write_text("# mine\n", encoding="utf-8")
@@ -89,7 +87,7 @@ def test_two_runs_are_compared(
     assert (runs[0].parent / "comparison.html").is_file()
 
 
-def test_the_tables_fit_a_terminal_of_eighty_columns(
+def test_tables_fit_terminal_of_eighty_columns(
     runs: list[Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
@@ -100,18 +98,18 @@ def test_the_tables_fit_a_terminal_of_eighty_columns(
 
 
 @pytest.mark.parametrize("option", ["html", "png", "csv", "parquet"])
-def test_a_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
+def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
     nowhere: dict[str, Any] = {option: Path("/proc/none/file")}
     with pytest.raises(ParameterError, match=f"^--{option}: /proc/none/file cannot be written "):
         report(runs[:1], **nowhere)
 
 
-def test_a_flight_without_samples_has_a_summary_with_the_same_keys(runs: list[Path]) -> None:
+def test_flight_without_samples_has_summary_with_same_keys(runs: list[Path]) -> None:
     empty = empty_summary(find_scenario("osprey_gust"), "no progress")
     assert empty.keys() == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8")).keys()
 
 
-def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Path) -> None:
+def test_latency_is_time_between_sending_of_y_and_of_u(tmp_path: Path) -> None:
     sent = {"/y": {0: 1, 10: 11, 20: 21}, "/u": {0: 3, 20: 26}}  # ms, by stamp; no u for y(10)
     with BagWriter(tmp_path / "run") as bag:
         for topic, instants in sent.items():
@@ -124,11 +122,11 @@ def test_latency_is_the_time_between_the_sending_of_y_and_of_its_u(tmp_path: Pat
     assert latencies["y_to_u"].tolist() == [2e-3, 5e-3]
 
 
-def test_a_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:
+def test_flight_in_one_process_has_no_latency(runs: list[Path]) -> None:
     assert read_run(runs[0]).latency is None
 
 
-def test_a_summary_or_a_link_that_cannot_be_written_is_a_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_summary_or_link_that_cannot_be_written_is_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
     run = new_run(osprey_gust, tmp_path)
     (tmp_path / "latest").mkdir()
     with pytest.raises(ParameterError, match=r"latest cannot be written \(Is a directory\), expected a link to the last run$"):

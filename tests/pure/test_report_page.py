@@ -90,7 +90,7 @@ def test_the_page_draws_all_figures_without_errors(browser: Browser, page: Path)
     assert all(count > 0 for count in drawn)
 
 
-def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+def test_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, servo: RecordedFlight) -> None:
     open_page(browser, page)
     y = servo.tape["y"]
     whole, _ = curve(browser, 0, "y")
@@ -111,7 +111,7 @@ def test_a_zoom_shows_every_sample_in_all_figures(browser: Browser, page: Path, 
     assert browser.console == []
 
 
-def test_the_replay_shows_the_pose_and_the_surfaces_of_the_flight(browser: Browser, page: Path, servo: RecordedFlight) -> None:
+def test_replay_shows_pose_and_surfaces_of_flight(browser: Browser, page: Path, servo: RecordedFlight) -> None:
     open_page(browser, page)
     browser.wait_for("document.getElementById('replay').dataset.drawn === '0'")
     place = "document.getElementById('replay-time')"
@@ -134,7 +134,7 @@ def test_the_replay_shows_the_pose_and_the_surfaces_of_the_flight(browser: Brows
     assert browser.console == []
 
 
-def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
+def test_zoom_keeps_peaks_of_each_pixel(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
     count = 40_000
     values = np.zeros((count, 4))
     values[30_001, 0], values[31_003, 0] = 5.0, -4.0  # one sample each, between 60 s and 62.1 s
@@ -150,7 +150,7 @@ def test_a_zoom_keeps_the_peaks_of_each_pixel(browser: Browser, tmp_path: Path, 
         assert len(y) < 5000
 
 
-def test_the_dark_page_has_its_own_colours_and_follows_the_scheme(browser: Browser, page: Path) -> None:
+def test_dark_page_has_own_colours_and_follows_scheme(browser: Browser, page: Path) -> None:
     look = f"[getComputedStyle(document.body).backgroundColor, {PLOTS}[0].data[1].line.color, {PLOTS}[0].layout.font.color]"
     open_page(browser, page, "dark")
     dark = browser.run(look)
@@ -162,7 +162,7 @@ def test_the_dark_page_has_its_own_colours_and_follows_the_scheme(browser: Brows
     assert browser.console == []
 
 
-def test_a_page_prints_in_light_colours_and_returns_to_the_screen(browser: Browser, page: Path) -> None:
+def test_page_prints_in_light_colours_and_returns_to_screen(browser: Browser, page: Path) -> None:
     open_page(browser, page, "dark")
     zoom(browser, 2.0, 3.0)
     assert base64.b64decode(browser.call("Page.printToPDF")["data"]).startswith(b"%PDF")
@@ -188,7 +188,7 @@ def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
     assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
 
 
-def test_two_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
+def test_two_minutes_at_500_hz_decimated_and_zoom_shows_every_sample(
     browser: Browser, tmp_path: Path, servo: RecordedFlight
 ) -> None:
     # White noise in y, u and the truth hardly compresses.
@@ -206,7 +206,7 @@ def test_two_minutes_at_500_hz_are_decimated_and_a_zoom_shows_every_sample(
     assert len([t for t in x if 60.0 <= t <= 60.2]) == 101
 
 
-def test_a_very_long_curve_is_drawn_before_its_samples_are_unpacked_and_a_zoom_shows_every_sample(
+def test_very_long_curve_drawn_before_samples_unpacked_and_zoom_shows_every_sample(
     browser: Browser, tmp_path: Path, servo: RecordedFlight, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     count, random = 30_001, np.random.default_rng(1)
@@ -230,7 +230,7 @@ def test_a_very_long_curve_is_drawn_before_its_samples_are_unpacked_and_a_zoom_s
     np.testing.assert_allclose(y, y_of_page, rtol=2.0**-15.9)  # plotting.MANTISSA
 
 
-def test_the_next_figure_drawn_is_the_nearest_to_the_view(browser: Browser, page: Path) -> None:
+def test_next_figure_drawn_is_nearest_to_view(browser: Browser, page: Path) -> None:
     open_page(browser, page)
     order = browser.run(
         """(async () => {

@@ -53,7 +53,7 @@ def identified(y: Signal, u: Signal) -> Response:
     return identify_response(y, u, OUTPUTS, INPUTS)
 
 
-def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_their_errors() -> None:
+def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_errors() -> None:
     found = identified(*flown(0.1))
     assert not any(found.refusal)
     assert (np.abs(found.Omega - OMEGA) < 4.0 * found.Omega_deviation).all()
@@ -62,7 +62,7 @@ def test_doublets_in_open_loop_give_omega_lag_and_delay_back_within_their_errors
     assert found.delay + found.lag == pytest.approx(DELAY + LAG, abs=0.015)
 
 
-def test_only_the_time_in_which_u_acts_on_the_aircraft_counts() -> None:
+def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
     # From 20 s on the log holds a u that does not act, as that of a controller beside an autopilot which flies by itself.
     y, u = flown(0.1)
     engaged_ns = nanoseconds(20.0)
@@ -74,12 +74,12 @@ def test_only_the_time_in_which_u_acts_on_the_aircraft_counts() -> None:
     assert (found.sign_ratio > 10.0).all()
 
 
-def test_an_input_that_hardly_moves_is_refused_with_the_excitation_that_it_needs() -> None:
+def test_input_that_hardly_moves_refused_with_excitation_that_it_needs() -> None:
     found = identified(*flown(2e-4))
     assert all("excite" in sentence and "times as strongly" in sentence for sentence in found.refusal)
 
 
-def test_an_input_that_never_moves_is_refused_by_name() -> None:
+def test_input_that_never_moves_refused_by_name() -> None:
     y, u = flown(0.1)
     still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 0.0]))
     found = identified(y, still)
@@ -88,7 +88,7 @@ def test_an_input_that_never_moves_is_refused_by_name() -> None:
     assert not found.refusal[0]
 
 
-def test_an_output_that_never_moves_is_refused_by_name() -> None:
+def test_output_that_never_moves_refused_by_name() -> None:
     y, u = flown(0.1)
     found = identified(Signal(y.stamp_ns, y.names, np.where([True, False], y.values, 0.3)), u)
     assert found.refusal[1].startswith("r by rudder: found r constant, expected it to move")
@@ -97,13 +97,13 @@ def test_an_output_that_never_moves_is_refused_by_name() -> None:
     assert found.Omega[1, 0] == 0.0
 
 
-def test_a_short_log_is_refused_with_the_time_that_is_needed() -> None:
+def test_short_log_refused_with_time_that_needed() -> None:
     y, u = flown(0.1, seconds=5.0)
     with pytest.raises(ParameterError, match=r"the log: found .* s in which u acts .* expected .* s or more"):
         identified(y, u)
 
 
-def test_a_response_whose_sign_is_not_that_of_its_omega_is_no_fit() -> None:
+def test_response_whose_sign_is_not_that_of_omega_is_no_fit() -> None:
     # 1120 / (s^2 + 23 s + 267), all of it in the slow part: an elevator of 110 rad/s^2 per rad had an Omega of -0.016
     t = np.arange(0.02, 0.8, 0.02)
     assert not begins_with_Omega(t, np.array([0.07, 0.003, -0.016, 23.0, 267.0, 1120.0]))

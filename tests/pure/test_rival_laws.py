@@ -95,7 +95,7 @@ def law_of(name: str, model: NominalModel, **values: Any) -> tuple[ControlLaw, A
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-0.3, 0.3), min_size=8, max_size=8), st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4))
-def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
+def test_inversion_cancels_model_and_leaves_error_own_dynamics(
     osprey: NominalModel, x_of: list[float], y_m_dot_of: list[float]
 ) -> None:
     x, y_m_dot, K = np.array(x_of)[:, None], np.array(y_m_dot_of)[:, None], np.array([[9.0], [8.0], [4.0], [2.0]])
@@ -108,7 +108,7 @@ def test_inversion_cancels_the_model_and_leaves_the_error_its_own_dynamics(
     np.testing.assert_allclose(y_dot - y_m_dot, -0.1 * K, atol=1e-12)
 
 
-def test_inversion_with_vanes_uses_the_state_relative_to_the_air(osprey: NominalModel) -> None:
+def test_inversion_with_vanes_uses_state_relative_to_air(osprey: NominalModel) -> None:
     x, air = np.zeros((8, 1)), np.zeros((8, 1))
     air[1] = 0.05
     y = osprey.C @ x
@@ -121,7 +121,7 @@ def test_inversion_with_vanes_uses_the_state_relative_to_the_air(osprey: Nominal
     np.testing.assert_allclose(osprey.Omega @ u["di_vanes"], -osprey.C @ osprey.A @ air, atol=1e-12)
 
 
-def test_the_integral_of_the_inversion_rejects_a_constant_disturbance() -> None:
+def test_integral_of_inversion_rejects_constant_disturbance() -> None:
     model = integrator()
     without = fly(*law_of("di", model, K=8.0), 2000, 0.0, 1.0, model)
     with_integral = fly(*law_of("di_pi", model, K=8.0, Lambda=2.0), 2000, 0.0, 1.0, model)
@@ -151,7 +151,7 @@ def recursion(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray, steps:
     return np.asarray(np.linalg.solve(R + G.T @ P @ G, G.T @ P @ F))
 
 
-def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None:
+def test_lqi_is_limit_of_long_finite_horizon(osprey: NominalModel) -> None:
     size, weights = osprey.C @ osprey.size, gains(integral=np.full((4, 1), 2.0), effort=np.full((4, 1), 0.1), fade=4.0)
     F, G, E = lqi.design(osprey, 4.0)
     found = lqi.lqi_params(weights, osprey).gain[..., 0]
@@ -165,7 +165,7 @@ def test_lqi_is_the_limit_of_a_long_finite_horizon(osprey: NominalModel) -> None
     assert slow[-7] < np.exp(-0.3 * osprey.period)
 
 
-def test_lqi_leaves_no_error_under_a_constant_disturbance() -> None:
+def test_lqi_leaves_no_error_under_constant_disturbance() -> None:
     model = integrator()
     flight = fly(*law_of("lqi", model, integral=2.0, effort=0.1, fade=4.0), 3000, 0.0, 1.0, model)
     assert abs(flight.y[-1]) < 1e-6
@@ -183,7 +183,7 @@ def test_the_acceleration_based_law_by_hand() -> None:
     assert u.item() == pytest.approx(-(3.0 * (0.2 + 0.06) + 0.625) / 2.0, rel=1e-12)
 
 
-def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
+def test_filtered_difference_of_ramp_converges_to_slope() -> None:
     model = integrator()
     control_law, params = law_of("mackunis", model, K=1.0, Lambda=1.0, beta=1.0, softening=1.0, filter=12.6)
     state = control_law.engage(at(0.0), params)
@@ -193,14 +193,14 @@ def test_the_filtered_difference_of_a_ramp_converges_to_its_slope() -> None:
     assert state.e_dot.item() == pytest.approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
 
 
-def test_the_predictor_of_l1_estimates_a_constant_disturbance_in_one_tick() -> None:
+def test_predictor_of_l1_estimates_constant_disturbance_in_one_tick() -> None:
     model = integrator()
     flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 3, 0.1, 0.7, model)
     x = l1.ADAPTATION_POLE * DT
     assert flight.state.sigma_hat.item() == pytest.approx(0.7 * x / (np.exp(x) - 1.0), rel=1e-9)
 
 
-def test_l1_rejects_a_constant_disturbance_with_a_wrong_input_gain() -> None:
+def test_l1_rejects_constant_disturbance_with_wrong_input_gain() -> None:
     model = integrator()
     flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 1500, 0.0, 0.7, model, Omega=1.4 * model.Omega[0, 0])
     # at rest y_hat - y is constant: K e = d (1 - k) where k = 0.995 is what the pole leaves of the estimate
@@ -208,7 +208,7 @@ def test_l1_rejects_a_constant_disturbance_with_a_wrong_input_gain() -> None:
     assert flight.u[-1] == pytest.approx(-0.7 / (1.4 * model.Omega[0, 0]), rel=1e-6)
 
 
-def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
+def test_l1_with_feedforward_does_not_cancel_disturbance_twice() -> None:
     model = integrator()
     control_law, params = law_of("l1_ff", model, K=3.0, bandwidth=20.0)
     y, state, u = 0.0, None, np.zeros(COLUMN)
@@ -223,14 +223,14 @@ def test_l1_with_feedforward_does_not_cancel_the_disturbance_twice() -> None:
     assert abs(y - y_m_dot * 500 * DT) < 0.01 * 0.7 / 3.0
 
 
-def test_the_weights_of_mrac_converge_to_the_model_error() -> None:
+def test_weights_of_mrac_converge_to_model_error() -> None:
     model = integrator()
     flight = fly(*law_of("mrac", model, K=2.0, adaptation=20.0, bias=20.0, leak=0.0), 4000, 0.3, 0.7, model)
     assert abs(flight.y[-1]) < 1e-6
     assert flight.state.W[0, 1, 0] == pytest.approx(0.7, rel=1e-4)  # the weight of 1 is the disturbance
 
 
-def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
+def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     model = integrator(period=1e-4)
     K, gamma, d = 2.0, 20.0, 0.7
     control_law, params = law_of("mrac", model, K=K, adaptation=gamma, bias=gamma, leak=0.0)
@@ -245,7 +245,7 @@ def test_the_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
 
 
-def test_indi_needs_no_model_except_the_input_gain() -> None:
+def test_indi_needs_no_model_except_input_gain() -> None:
     model = integrator()
     for Omega in (2.0, 1.4, 2.6):
         flight = fly(*law_of("indi", model, K=2.0, bandwidth=60.0, share=1.0), 1500, 0.2, 0.7, model, Omega=Omega)
@@ -260,7 +260,7 @@ def reaching(e_0: float) -> float:
     return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
 
 
-def test_the_reaching_time_of_super_twisting_is_proportional_to_the_root_of_the_initial_error() -> None:
+def test_reaching_time_of_super_twisting_is_proportional_to_root_of_initial_error() -> None:
     # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long from anywhere.
     # 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some ten steps of 1 s
     assert reaching(4.0) == pytest.approx(2.0 * reaching(1.0), rel=0.01)
@@ -285,7 +285,7 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
 
 
-def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(osprey: NominalModel) -> None:
+def test_observer_converges_to_states_wind_and_disturbance_of_model(osprey: NominalModel) -> None:
     values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}  # s: faster than the 30 s below
     _, params = law_of("lqg", osprey, **values)
     Phi, Gamma, H, correction = params.Phi[..., 0], params.Gamma, params.H, params.L[..., 0]
@@ -302,7 +302,7 @@ def test_the_observer_converges_to_states_wind_and_disturbance_of_its_model(ospr
     assert np.abs(np.linalg.eigvals(Phi - Phi @ correction @ H)).max() < 1.0
 
 
-def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> None:
+def test_contribution_of_observer_bounded_for_any_measurement() -> None:
     model = integrator(limit=0.5)
     control_law, params = law_of(
         "rise_observer", model, **initial_gains(LAWS["rise_observer"], model) | {"K": 1e-6, "beta": 1e-6}
@@ -318,7 +318,7 @@ def test_the_contribution_of_the_observer_is_bounded_for_any_measurement() -> No
     assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / observed.WITHIN, rel=1e-9)
 
 
-def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: NominalModel) -> None:
+def test_with_zero_observer_gain_law_is_one_with_feedforward(osprey: NominalModel) -> None:
     control_law, params = law_of("rise_observer", osprey)
     params = params._replace(F=0.0 * params.F)
     rng, laws_ = np.random.default_rng(1), (control_law, LAWS["rise_ff"].control_law(osprey))
@@ -330,13 +330,13 @@ def test_with_zero_observer_gain_the_law_is_the_one_with_feedforward(osprey: Nom
         assert np.array_equal(u, without)  # to the last bit
 
 
-def test_anti_windup_stops_an_integral_in_saturation_and_releases_it_on_the_way_back() -> None:
+def test_anti_windup_stops_integral_in_saturation_and_releases_it_on_way_back() -> None:
     integral = conditional_integration(np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0]))
     assert integral.tolist() == [0.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize("name", list(LAWS))
-def test_every_law_keeps_its_limits_and_recovers_from_saturation(name: str) -> None:
+def test_every_law_keeps_limits_and_recovers_from_saturation(name: str) -> None:
     model = integrator(limit=0.5)
     flight = fly(*law_of(name, model), 3000, 0.0, lambda k: 2.0 if k < 1000 else 0.0, model)
     assert np.abs(flight.u).max() <= 0.5  # 0.5 of 2.0 / Omega = 1.0 that the disturbance would take
@@ -345,7 +345,7 @@ def test_every_law_keeps_its_limits_and_recovers_from_saturation(name: str) -> N
 
 
 @pytest.mark.parametrize("name", list(LAWS))
-def test_every_law_is_the_same_under_numpy_and_jax_and_over_a_fleet(name: str, osprey: NominalModel) -> None:
+def test_every_law_is_same_under_numpy_and_jax_and_over_fleet(name: str, osprey: NominalModel) -> None:
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
     shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
     looks = [Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes)) for _ in range(4)]

@@ -49,7 +49,7 @@ KML_POINTS = "".join(
 
 @pytest.mark.parametrize("latitude", [-89.0, -33.9, 0.0, 47.4, 78.2])
 @pytest.mark.parametrize("longitude", [-179.999, 8.5, 179.999])  # beside the date line
-def test_north_and_east_are_those_of_the_plane_that_touches_the_ellipsoid(latitude: float, longitude: float) -> None:
+def test_north_and_east_are_those_of_plane_that_touches_ellipsoid(latitude: float, longitude: float) -> None:
     for north, east in ((0.0, 0.0), (1e3, -2e3), (-5e4, 5e4)):
         lat, lon, up = pymap3d.enu2geodetic(east, north, 0.0, latitude, longitude, 0.0)
         expected = pymap3d.geodetic2enu(lat, lon, 0.0, latitude, longitude, 0.0)
@@ -59,7 +59,7 @@ def test_north_and_east_are_those_of_the_plane_that_touches_the_ellipsoid(latitu
         assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx((north * share, east * share), abs=0.5)
 
 
-def test_at_the_largest_distance_the_plane_is_4_m_short_of_the_ground() -> None:
+def test_at_largest_distance_plane_is_4_m_short_of_ground() -> None:
     lat, lon = 47.4, 8.5 + math.degrees(MAX_DISTANCE / (SEMI_MAJOR * math.cos(math.radians(47.4))))
     on_ground, _ = vdist(47.4, 8.5, lat, lon)
     assert on_ground - math.hypot(*local(lat, lon, ZURICH)) == pytest.approx(4.1, abs=0.1)
@@ -87,7 +87,7 @@ def test_each_format_holds_the_same_route(ending: str, content: Any, tmp_path: P
     assert flown(tmp_path / f"route{ending}", content) == ROUTE
 
 
-def test_a_speed_is_read_where_a_format_has_one(tmp_path: Path) -> None:
+def test_speed_read_where_format_has_one(tmp_path: Path) -> None:
     path = tmp_path / "r.yaml"
     path.write_text("route: [[0, 0, 100], [500, 0, 120, 25.0], [900, -10, 120.5, 30]]", encoding="utf-8")
     assert read_route(path) == (Waypoint(0, 0, 100), Waypoint(500, 0, 120, 25.0), Waypoint(900, -10, 120.5, 30))
@@ -96,7 +96,7 @@ def test_a_speed_is_read_where_a_format_has_one(tmp_path: Path) -> None:
     assert [waypoint.speed for waypoint in read_route(path, ZURICH)] == [None, 31.5]
 
 
-def test_points_beside_a_line_are_no_part_of_the_route_and_may_be_anything(tmp_path: Path) -> None:
+def test_points_beside_line_are_no_part_of_route_and_may_be_anything(tmp_path: Path) -> None:
     line_alone, both = tmp_path / "r.geojson", tmp_path / "both.geojson"
     line_alone.write_text(json.dumps(line()), encoding="utf-8")
     both.write_text(json.dumps({"features": [point([8.5, 47.4]), line()]}), encoding="utf-8")  # a place without an altitude
@@ -141,7 +141,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.kml", kml("<Point><coordinates>&a;</coordinates></Point>", head=ENTITY), "found a document type, expected the XML"),
     ],
 )
-def test_what_is_no_route_is_refused_with_one_sentence(name: str, content: Any, sentence: str, tmp_path: Path) -> None:
+def test_what_is_no_route_refused_with_one_sentence(name: str, content: Any, sentence: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=sentence):
         flown(tmp_path / name, content)
 
@@ -151,7 +151,7 @@ def test_latitudes_need_an_origin(tmp_path: Path) -> None:
         flown(tmp_path / "r.geojson", line(), origin=None)
 
 
-def test_a_document_type_is_refused_before_its_entities_are_read(tmp_path: Path) -> None:
+def test_document_type_refused_before_entities_read(tmp_path: Path) -> None:
     # Nested entities that would expand to a billion characters, and one that would fetch a file of this machine.
     nested = "".join(f'<!ENTITY a{k + 1} "{f"&a{k};" * 10}">' for k in range(9))
     for entities in (f'<!ENTITY a0 "0">{nested}', '<!ENTITY a9 SYSTEM "file:///etc/hostname">'):

@@ -94,7 +94,7 @@ def test_aileron_recovery_after_a_saturated_roll_command(
     assert commanded[0] <= np.abs(tape["internals"]["u_free.aileron"]).max() / DEG <= commanded[1]
 
 
-def test_anti_windup_loses_the_bank_that_the_saturated_ailerons_missed() -> None:
+def test_anti_windup_loses_bank_that_saturated_ailerons_missed() -> None:
     # The integral of e_p is the bank error, so anti-windup loses bank: measured -0.49 rad, and -0.02 rad without anti-windup,
     # where the wound-up integral restores the bank afterwards. Attitude needs an outer loop.
     deficits = {}
@@ -109,7 +109,7 @@ def test_anti_windup_loses_the_bank_that_the_saturated_ailerons_missed() -> None
 GUST = GUSTS["vertical"] | {"start": 2.0}
 
 
-def test_anti_windup_leaves_a_third_of_the_pitch_rate_error_after_a_gust() -> None:
+def test_anti_windup_leaves_third_of_pitch_rate_error_after_gust() -> None:
     # Measured 0.0373 rad/s guarded, 0.121 unguarded. The prototype: 0.037 and 0.121.
     largest = {}
     for guarded in (True, False):
@@ -147,13 +147,13 @@ def largest_rate(tape: Tape) -> float:
     return float(np.abs(np.diff(tape["truth"].group("actuator")["rudder"])).max()) / 0.01 / DEG
 
 
-def test_a_rate_limit_above_the_demand_changes_nothing() -> None:
+def test_rate_limit_above_demand_changes_nothing() -> None:
     # 60 deg/s is above the 46 deg/s that the gust needs, so the rate limit is not reached: the same to the last bit.
     assert largest_rate(rudder_flight(60.0)) == pytest.approx(45.5, abs=2.0)
     assert error(rudder_flight(60.0)).values.tobytes() == error(rudder_flight(300.0)).values.tobytes()
 
 
-def test_a_rudder_of_40_deg_per_s_settles_and_one_of_30_has_a_limit_cycle() -> None:
+def test_rudder_of_40_deg_per_s_settles_and_one_of_30_has_limit_cycle() -> None:
     # Measured at the end: 3e-4 rad/s at 40 deg/s, 0.42 at 30. beta is 40 deg/s of rudder; in the prototype
     # the limit cycle starts at 40. Both rudders reach their rate limit and keep it.
     for rate_deg in (40.0, 30.0):
@@ -162,14 +162,14 @@ def test_a_rudder_of_40_deg_per_s_settles_and_one_of_30_has_a_limit_cycle() -> N
     assert end_of_r(rudder_flight(30.0)) > 0.3
 
 
-def test_with_the_literal_sign_a_rudder_of_40_deg_per_s_has_a_limit_cycle() -> None:
+def test_with_literal_sign_rudder_of_40_deg_per_s_has_limit_cycle() -> None:
     # Measured at the end: 0.45 rad/s at 40 deg/s; 0.03 at 60, which is the chatter of the literal sign with a servo.
     assert end_of_r(rudder_flight(40.0, sign="literal")) > 0.3
     assert end_of_r(rudder_flight(60.0, sign="literal")) < 0.05
 
 
 @pytest.mark.parametrize("rate_deg", [40.0, 30.0])
-def test_a_controller_with_the_rate_limit_has_no_limit_cycle(rate_deg: float) -> None:
+def test_controller_with_rate_limit_has_no_limit_cycle(rate_deg: float) -> None:
     # The command keeps the rate limit, so the actuator follows it. At 40 deg/s, where the limit of the actuator alone causes no
     # limit cycle, the error in the gust is 0.083 rad/s instead of 0.073; at 30 it is 0.22 instead of a limit cycle of 0.42.
     tape = rudder_flight(rate_deg, limited=True)
@@ -187,7 +187,7 @@ def signals(tape: Tape) -> Mapping[str, bytes]:
     }
 
 
-def test_anti_windup_without_saturation_leaves_the_flight_to_the_last_bit() -> None:
+def test_anti_windup_without_saturation_leaves_flight_to_last_bit() -> None:
     # The whole scenario, gusts and commands, with every limit of the actuators as a limit of the controller: none is reached.
     pulses = find_scenario("osprey_servo").reference_model.model_dump()["pulses"]
     whole = SERVO.vary(aircraft={"gusts": GUSTS}, reference_model={"pulses": pulses})

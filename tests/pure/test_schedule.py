@@ -63,12 +63,12 @@ def y_at(V: float) -> FloatArray:
         (1e6, 0.3),
     ],
 )
-def test_the_scale_is_the_ratio_of_dynamic_pressures_within_its_range(V: float, scale: float) -> None:
+def test_scale_is_ratio_of_dynamic_pressures_within_range(V: float, scale: float) -> None:
     assert SCALE_RANGE == (0.3, 3.0)
     assert target_scale(y_at(V), law().params) == pytest.approx([scale, scale, scale, 1.0])
 
 
-def test_a_change_of_the_scale_leaves_u_as_it_is() -> None:
+def test_change_of_scale_leaves_u_as_it_is() -> None:
     control_law, params = law()
     rng = np.random.default_rng(1)
     zero = np.zeros(4)
@@ -84,7 +84,7 @@ def test_a_change_of_the_scale_leaves_u_as_it_is() -> None:
     assert after == pytest.approx(u, rel=1e-6)
 
 
-def test_engagement_at_another_speed_starts_at_its_scale() -> None:
+def test_engagement_at_another_speed_starts_at_scale() -> None:
     control_law, params = law()
     state = control_law.engage(Measurements(y_at(FASTER), y_at(FASTER), *np.zeros((3, 4))), params)
     assert state.scale == pytest.approx([(46.3 / 62.3) ** 2] * 3 + [1.0])
@@ -96,7 +96,7 @@ def rms(tape: Tape) -> dict[str, float]:
     return {name: 1e3 * float(np.std(tape["y"][name][last])) for name in ("q", "p", "r")}
 
 
-def test_at_1_8_times_the_dynamic_pressure_the_schedule_keeps_a_delayed_loop_at_rest() -> None:
+def test_at_1_8_times_dynamic_pressure_schedule_keeps_delayed_loop_at_rest() -> None:
     # Without it, the loop with 30 ms of delay is in a limit cycle of tens of mrad/s in q. The margin at trim is 18 ms.
     assert rms(flown(False))["q"] > 10.0
     tape = flown(True)
@@ -105,14 +105,14 @@ def test_at_1_8_times_the_dynamic_pressure_the_schedule_keeps_a_delayed_loop_at_
     assert set(tape["internals"]["scale.V"]) == {1.0}
 
 
-def test_a_flight_with_a_schedule_is_replayed_to_the_last_bit() -> None:
+def test_flight_with_schedule_replayed_to_last_bit() -> None:
     scenario = flight(schedule=True, delay=0.03, duration=60.0)
     result = replay(flown(True), scenario.controller)
     assert result.checked.all()
     assert result.equal()
 
 
-def test_the_scale_is_restored_from_a_log_without_its_beginning() -> None:
+def test_scale_restored_from_log_without_beginning() -> None:
     tape = flown(True)
     end = tape["internals"].stamp_ns[-1]
     rest = {name: signal.within([(end - 10**9, end)]) for name, signal in tape.signals.items()}
@@ -121,13 +121,13 @@ def test_the_scale_is_restored_from_a_log_without_its_beginning() -> None:
     assert result.equal()
 
 
-def test_without_the_section_nothing_is_logged_and_nothing_changes() -> None:
+def test_without_section_nothing_logged_and_nothing_changes() -> None:
     assert "scale.q" not in flown(False)["internals"].names
     assert not hasattr(C172P.controller.tuned_law().params, "airspeed")
 
 
 @pytest.mark.parametrize("name", ["osprey_observer"])
-def test_a_model_of_the_trim_beside_a_schedule_is_refused(name: str) -> None:
+def test_model_of_trim_beside_schedule_refused(name: str) -> None:
     with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer beside it, expected neither"):
         find_scenario(name).vary(controller={"schedule": {"speed": 25.0}})
 

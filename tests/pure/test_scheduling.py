@@ -23,7 +23,7 @@ def output(code: str, within: Sequence[str] = ()) -> str:
 
 
 @pytest.mark.skipif(not TIMER_SLACK.exists(), reason="no Linux, or no /proc")
-def test_the_timer_slack_of_the_thread_is_set_to_its_minimum() -> None:
+def test_timer_slack_of_thread_set_to_minimum() -> None:
     # the default of Linux is 50 us (prctl(2), PR_SET_TIMERSLACK)
     code = "from flight_core.scheduling import *; disable_timer_slack(); print(TIMER_SLACK.read_text())"
     assert int(output(code)) == 1
@@ -37,7 +37,7 @@ def kernel() -> tuple[int, ...]:
     kernel() < (6, 12) or not (THREADS.parent / "sched").exists(), reason="needs Linux 6.12, CONFIG_SCHED_DEBUG"
 )
 @pytest.mark.skipif(os.sched_getscheduler(0) != os.SCHED_OTHER, reason="only the default policy has time slices")
-def test_every_thread_of_a_node_has_short_time_slices() -> None:
+def test_every_thread_of_node_has_short_time_slices() -> None:
     code = """
 import threading, time
 from flight_core.scheduling import *
@@ -53,7 +53,7 @@ print([(one / "sched").read_text() for one in THREADS.iterdir()])
     [(("--fifo", "50"), 48), (("--rr", "50"), 48), (("--fifo", "2"), 1), (("--other", "0"), 0)],
     ids=["FIFO", "round robin", "no lower one", "default policy"],
 )
-def test_a_lowered_real_time_priority_is_that_of_the_threads_that_follow(policy: tuple[str, str], priority: int) -> None:
+def test_lowered_real_time_priority_is_that_of_threads_that_follow(policy: tuple[str, str], priority: int) -> None:
     code = """
 import os, threading
 from flight_core.scheduling import lower_real_time_priority
@@ -68,7 +68,7 @@ thread.join()
 
 
 @pytest.mark.parametrize("policy", [("--fifo", "50"), ("--batch", "0")], ids=["FIFO", "no real-time priority"])
-def test_a_command_leaves_the_real_time_priority_with_all_of_its_threads_and_no_other_policy(policy: tuple[str, str]) -> None:
+def test_command_leaves_real_time_priority_with_all_of_threads_and_no_other_policy(policy: tuple[str, str]) -> None:
     code = """
 import os, threading
 from flight_core.scheduling import *

@@ -36,7 +36,7 @@ def samples() -> FloatArray:
     return np.array([noise(k, sensors([1.0] * 4)) for k in range(COUNT)])
 
 
-def test_noise_has_mean_zero_and_the_specified_variance(samples: FloatArray) -> None:
+def test_noise_has_mean_zero_and_specified_variance(samples: FloatArray) -> None:
     # For N samples the standard deviation of the mean is 1/sqrt(N), that of the variance sqrt(2/N). Four of these hold in
     # 99.95 % of seeds for four channels of mean and variance together. The seed is fixed: the test is deterministic.
     assert np.abs(samples.mean(axis=0)).max() < 4.0 / np.sqrt(COUNT)
@@ -57,7 +57,7 @@ def test_noise_is_white_over_samples_and_channels(samples: FloatArray) -> None:
     assert np.abs(np.concatenate([between_samples, between_channels])).max() < 4.0 / np.sqrt(COUNT)
 
 
-def test_the_noise_of_sample_k_depends_on_the_seed_and_not_on_earlier_calls() -> None:
+def test_noise_of_sample_k_depends_on_seed_and_not_on_earlier_calls() -> None:
     params = sensors(NOISE)
     first = noise(1234, params)
     for k in (7, 3, 99):
@@ -67,7 +67,7 @@ def test_the_noise_of_sample_k_depends_on_the_seed_and_not_on_earlier_calls() ->
     assert (noise(1234, params._replace(seed=2)) != first).all()
 
 
-def test_a_channel_without_noise_is_exact_and_does_not_change_the_others() -> None:
+def test_channel_without_noise_exact_and_does_not_change_others() -> None:
     some = noise(5, sensors([0.0, 0.03, 0.0017, 0.0017]))
     assert some[0] == 0.0
     assert (some[1:] == noise(5, sensors(NOISE))[1:]).all()
@@ -75,7 +75,7 @@ def test_a_channel_without_noise_is_exact_and_does_not_change_the_others() -> No
 
 
 @pytest.mark.parametrize("dropout", [0.05, 0.2, 0.5])
-def test_the_fraction_of_dropped_samples_is_the_specified_one(dropout: float) -> None:
+def test_fraction_of_dropped_samples_is_specified_one(dropout: float) -> None:
     lost = np.array([not arrives(k, sensors(NOISE, dropout=dropout)) for k in range(COUNT)])
     tolerance = 4.0 * np.sqrt(dropout * (1.0 - dropout) / COUNT)  # four standard deviations of a fraction
     assert lost.mean() == pytest.approx(dropout, abs=tolerance)
@@ -88,7 +88,7 @@ def test_dropouts_do_not_depend_on_the_noise(samples: FloatArray) -> None:
     assert abs(samples[lost].mean()) < 4.0 / np.sqrt(2.0 * COUNT)  # half of the samples of four channels
 
 
-def test_a_delay_shifts_the_arrival_by_whole_samples_and_keeps_the_stamp() -> None:
+def test_delay_shifts_arrival_by_whole_samples_and_keeps_stamp() -> None:
     params = sensors(NOISE, delay_ms=4)
     delay_line: DelayLine = ()
     history = []
@@ -98,13 +98,13 @@ def test_a_delay_shifts_the_arrival_by_whole_samples_and_keeps_the_stamp() -> No
     assert history == [[], [], [(0, 0.0)], [(2, 1.0)], [(4, 2.0)]]
 
 
-def test_without_delay_and_dropout_every_sample_arrives_at_its_instant() -> None:
+def test_without_delay_and_dropout_every_sample_arrives_at_instant() -> None:
     y = np.array([1.0])
     assert transmit((), 6 * MS, y, sensors(NOISE)) == ((), (StampedVector(6 * MS, y),))
     assert all(arrives(k, sensors(NOISE)) for k in range(100))
 
 
-def test_a_dropped_sample_never_arrives_and_delays_no_other() -> None:
+def test_dropped_sample_never_arrives_and_delays_no_other() -> None:
     params = sensors(NOISE, delay_ms=2)
     delay_line, _ = transmit((), 0, np.array([0.0]), params)
     delay_line, arrived = transmit(delay_line, 2 * MS, None, params)
@@ -122,7 +122,7 @@ def test_after_missed_ticks_due_samples_arrive_together_oldest_first() -> None:
     assert [sample.stamp_ns for sample in delay_line] == [9 * MS]
 
 
-def test_a_sample_is_the_output_with_its_noise_or_is_dropped() -> None:
+def test_sample_is_output_with_noise_or_dropped() -> None:
     parameters = aircraft_parameters(step=0.01, sensors={"noise": NOISE, "dropout": 0.5})
     simulator, model = Simulator(parameters), StateSpaceModel(parameters)
     u = np.array([0.01, 0.1, 0.02, 0.03])
@@ -158,13 +158,13 @@ def test_errors_add_up_and_quantisation_comes_last() -> None:
     assert measured.error == pytest.approx(measured.y - y, abs=1e-15)
 
 
-def test_quantisation_rounds_to_the_nearest_step_and_halves_to_even() -> None:
+def test_quantisation_rounds_to_nearest_step_and_halves_to_even() -> None:
     params = sensors([0.0] * 6)._replace(quantum=np.full(6, 0.25))
     y = np.array([0.1, 0.125, 0.375, -0.1, -0.2, 0.3])  # 0.125 and 0.375 are exact halves
     assert measure(0, y, initial_drift(params), params).y.tolist() == [0.0, 0.0, 0.5, -0.0, -0.25, 0.25]
 
 
-def test_a_bias_is_the_whole_error_of_an_otherwise_ideal_sensor() -> None:
+def test_bias_is_whole_error_of_otherwise_ideal_sensor() -> None:
     params = sensors([0.0] * 2)._replace(bias=np.array([0.5, -0.25]))
     for k in (0, 9):
         measured = measure(k, np.array([1.0, 2.0]), initial_drift(params), params)
@@ -195,7 +195,7 @@ def test_drift_does_not_depend_on_noise_and_dropout_and_differs_by_seed() -> Non
     assert (first != noise(1, sensors([1.0] * 4))).all()  # a stream of its own under the same seed
 
 
-def test_the_variance_of_the_drift_grows_with_time_at_any_rate() -> None:
+def test_variance_of_drift_grows_with_time_at_any_rate() -> None:
     # 0.2 SI per sqrt(s) gives variance 0.04 t. 400 walks at two rates: chi-square of 400 has a standard deviation of 7 %; the
     # limit of four of them holds in 99.99 % of seeds.
     for rate, samples in ((10.0, 20), (40.0, 80)):
@@ -206,7 +206,7 @@ def test_the_variance_of_the_drift_grows_with_time_at_any_rate() -> None:
         assert (variance[[1, 3]] == 0.0).all()
 
 
-def test_ideal_sensors_give_y_to_the_last_bit() -> None:
+def test_ideal_sensors_give_y_to_last_bit() -> None:
     y = np.array([0.1, -1e-300, 3.0, 7.7])
     measured = measure(3, y, initial_drift(sensors([0.0] * 4)), sensors([0.0] * 4))
     assert measured.y.tobytes() == y.tobytes()
@@ -227,7 +227,7 @@ def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:
     return scenario.vary(aircraft={"sensors": scenario.aircraft.sensors.model_dump() | sensors})
 
 
-def test_truth_holds_the_noise_of_every_sample_even_of_dropped_ones(servo: Scenario) -> None:
+def test_truth_holds_noise_of_every_sample_even_of_dropped_ones(servo: Scenario) -> None:
     tape = simulate(with_sensors(servo, dropout=0.3).vary(flight={"duration": 3.0}))
     y, truth = tape["y"], tape["truth"]
     assert 0 < len(y.stamp_ns) < len(truth.stamp_ns) == 301
@@ -237,7 +237,7 @@ def test_truth_holds_the_noise_of_every_sample_even_of_dropped_ones(servo: Scena
         assert (truth[f"noise.{name}"] != 0.0).all()
 
 
-def test_truth_holds_the_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
+def test_truth_holds_whole_error_of_sensors_with_every_fault(servo: Scenario) -> None:
     faults = {"bias": [0.01, 0.5, 0.0, -0.01], "drift": [1e-3, 0.0, 1e-3, 1e-3], "quantisation": [1e-3, 0.0, 1e-3, 5e-4]}
     tape = simulate(with_sensors(servo, dropout=0.3, **faults).vary(flight={"duration": 2.0}))
     y, truth = tape["y"], tape["truth"]
@@ -250,7 +250,7 @@ def test_truth_holds_the_whole_error_of_sensors_with_every_fault(servo: Scenario
     assert again["truth"].values.tobytes() == truth.values.tobytes()
 
 
-def test_the_measured_error_is_the_true_error_plus_noise(servo: Scenario) -> None:
+def test_measured_error_is_true_error_plus_noise(servo: Scenario) -> None:
     tape = simulate(servo.vary(flight={"duration": 3.0}))
     true, measured = error(tape), tracking_error(tape)
     for name in true.names:
@@ -261,7 +261,7 @@ def test_the_measured_error_is_the_true_error_plus_noise(servo: Scenario) -> Non
     assert true_error(Tape(without_truth)) is None
 
 
-def test_a_noisy_flight_is_repeatable_to_the_last_bit(servo: Scenario) -> None:
+def test_noisy_flight_is_repeatable_to_last_bit(servo: Scenario) -> None:
     short = with_sensors(servo, dropout=0.2, delay=0.01).vary(flight={"duration": 3.0})
     first, second = simulate(short), simulate(short)
     for topic, signal in first.signals.items():
@@ -279,7 +279,7 @@ def test_delayed_samples_keep_their_stamps(servo: Scenario) -> None:
     assert set(tape["internals"]["y_m_offset"]) == {0.02}  # y_m is not delayed; it is moved back to the stamp of y
 
 
-def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_loses_track(servo: Scenario) -> None:
+def test_delay_inside_margin_costs_little_and_one_beyond_it_loses_track(servo: Scenario) -> None:
     # Linear theory gives these gains a delay margin of 45 ms. Measured 7.90, 0.0943, 10.1, 6.7 at 20 ms and 7.64, 0.0884, 9.8,
     # 6.5 without delay; 65 mrad/s in r at 50 ms.
     assert (rms(simulate(with_sensors(servo, delay=0.02))) < [8.4, 0.1, 10.8, 7.2]).all()
@@ -289,12 +289,12 @@ def test_a_delay_inside_the_margin_costs_little_and_one_beyond_it_loses_track(se
 @pytest.mark.parametrize(
     ("dropout", "expected"), [(0.05, [7.6, 0.088, 9.9, 6.4]), (0.2, [7.6, 0.088, 9.8, 6.4])], ids=("5 %", "20 %")
 )
-def test_missed_ticks_cost_nothing_as_the_real_dt_is_integrated(servo: Scenario, dropout: float, expected: list[float]) -> None:
+def test_missed_ticks_cost_nothing_as_real_dt_integrated(servo: Scenario, dropout: float, expected: list[float]) -> None:
     # With the nominal dt the prototype had 8.9, 0.093, 11.8, 7.5 at 20 %. Measured 7.66, 0.090, 9.90, 6.80.
     assert rms(simulate(with_sensors(servo, dropout=dropout))) == pytest.approx(expected, rel=0.1)
 
 
-def test_half_of_the_ticks_missed_costs_nothing_while_dt_is_trusted_up_to_the_age_limit(
+def test_half_of_ticks_missed_costs_nothing_while_dt_trusted_up_to_age_limit(
     servo: Scenario, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # One gap in eight is longer than three periods. Measured with dt clipped to three periods: 8.75, 0.0915, 11.0, 8.0; to ten,

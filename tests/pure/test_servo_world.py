@@ -81,7 +81,7 @@ def test_a_flight_agrees_with_the_prototype(name: str) -> None:
     assert_agrees(measured(name), ROWS[name])
 
 
-def test_the_sign_term_loses_its_advantage_with_gyros_as_noisy_as_the_error() -> None:
+def test_sign_term_loses_advantage_with_gyros_as_noisy_as_error() -> None:
     # The prototype's laws are equal at 0.02 rad/s per sample, 7.2 mrad/s each; here they have 7.01 and 6.82.
     q = {
         (sign, gyro): float(measured(f"{sign}, {gyro:g} rad/s")["rms of q"][0])
@@ -92,7 +92,7 @@ def test_the_sign_term_loses_its_advantage_with_gyros_as_noisy_as_the_error() ->
     assert q["soft", 0.05] > 1.1 * q["PI", 0.05]
 
 
-def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype() -> None:
+def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_prototype() -> None:
     # A single flight scatters with the samples that are lost in a gust. Over twelve seeds the rms has standard deviations of
     # 2.2, 0.004, 0.9, 0.6. The means of twelve, 12.7, 0.114, 17.3, 10.8, agree with the prototype to 5 %. The row of 20 % lost
     # is in benchmarks/servo_world.py alone.
@@ -107,7 +107,7 @@ def test_lost_ticks_with_nominal_dt_cost_as_much_as_in_the_prototype() -> None:
         pytest.param(LITERAL, 0.040, 0.045, id="literal"),  # 44 ms
     ],
 )
-def test_the_score_triples_at_the_delay_of_the_prototype(changes: dict[str, Any], below: float, above: float) -> None:
+def test_score_triples_at_delay_of_prototype(changes: dict[str, Any], below: float, above: float) -> None:
     # By bisection 50.1 and 42.1 ms: benchmarks/servo_world.py, also for PI. Delays here come in whole samples of 5 ms.
     scores = [score(delayed(servo_scenario(**changes), delay, 200.0)) for delay in (0.0, below, above)]
     assert scores[1] < servo_world.TRIPLED * scores[0] < scores[2]
@@ -122,7 +122,7 @@ def test_ten_milliseconds_of_topic_delay_cost_three_percent() -> None:
     assert ratio[1] == pytest.approx(1.03, abs=0.01)
 
 
-def test_the_loop_has_a_gain_margin_of_ten() -> None:
+def test_loop_has_gain_margin_of_ten() -> None:
     # The prototype has 11. The linear sampled loop without delay.
     plant, law, loop = linear_loop(servo_scenario())
     stable = {gain: is_stable(plant._replace(B=plant.B * gain), law, loop, np.zeros(4)) for gain in (10.0, 12.0)}
@@ -149,7 +149,7 @@ def turn_with_model_bank(scenario: Scenario) -> Callable[[FloatArray, Profile], 
     return turned
 
 
-def test_r_differs_in_calm_air_as_turns_are_coordinated_to_the_bank_of_the_command(
+def test_r_differs_in_calm_air_as_turns_coordinated_to_bank_of_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # The prototype uses the bank of the reference model: max of r 14 mrad/s with the softened sign, PI 4.7 rms and max 23.
@@ -162,7 +162,7 @@ def test_r_differs_in_calm_air_as_turns_are_coordinated_to_the_bank_of_the_comma
     assert_agrees(measure(pi), pi)
 
 
-def test_integrator_windup_and_anti_windup_of_the_thrust_agree_with_the_prototype() -> None:
+def test_integrator_windup_and_anti_windup_of_thrust_agree_with_prototype() -> None:
     # Thrust +-15 %, V +4 m/s from 10 s to 30 s as in the manoeuvre of the scenario. The prototype: 677 % commanded, undershoot
     # 1.42 m/s, 12.6 s to within 0.1 m/s, rms 0.96 m/s; with anti-windup (conditional integration) 60 %, 0.00, 4.1, 0.44.
     # Measured 681, 1.41, 12.5, 0.946 and 60.6, 0.001, 4.08, 0.438.

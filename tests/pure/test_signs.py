@@ -48,14 +48,14 @@ def first(t: FloatArray, values: FloatArray, bound: float) -> float:
 
 
 @pytest.mark.parametrize("scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
-def test_an_elevator_with_trailing_edge_down_positive_tracks_with_the_right_d(scenario: Scenario, tmp_path: Path) -> None:
+def test_elevator_with_trailing_edge_down_positive_tracks_with_right_d(scenario: Scenario, tmp_path: Path) -> None:
     # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
     sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
     assert sixty_seconds <= 0.0022
 
 
-def test_a_sign_change_in_the_airframe_and_in_d_gives_the_same_flight_to_the_last_bit(tmp_path: Path) -> None:
+def test_sign_change_in_airframe_and_in_d_gives_same_flight_to_last_bit(tmp_path: Path) -> None:
     original = CALM_SERVO.vary(flight={"duration": 4.0})
     changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
     nose_up, nose_down = simulate(original), simulate(changed)
@@ -64,7 +64,7 @@ def test_a_sign_change_in_the_airframe_and_in_d_gives_the_same_flight_to_the_las
     assert np.abs(nose_up["u"]["elevator"]).max() > 0.0
 
 
-def test_an_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_at_the_first_command(tmp_path: Path) -> None:
+def test_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_at_first_command(tmp_path: Path) -> None:
     # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it; the prototype: 2.38 s.
     # It grows further, by a factor of e each 0.08 s, to more than 1e5 rad/s 1.4 s after the command.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
@@ -74,7 +74,7 @@ def test_an_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_a
     assert np.abs(e[-1]) > 1e5
 
 
-def test_saturation_slows_the_divergence_down_to_a_full_turn(tmp_path: Path) -> None:
+def test_saturation_slows_divergence_down_to_full_turn(tmp_path: Path) -> None:
     # With the stops q is bounded. Diverged: a pitch angle of more than a full turn. Measured at 5.45 s; the prototype:
     # 5.27 s with an unknown bound. The elevator is at its stop and q is 2.2 rad/s.
     tape = simulate(trailing_edge_down(CALM_SERVO, tmp_path).vary(flight={"duration": 6.0}))
@@ -110,7 +110,7 @@ def swapped_law(aircraft: Aircraft, D: list[float], factor: float) -> LawParams:
     return law_params([18.0, 2.0, 18.0 * factor, 9.0], [5.0, 0.5, 5.0, 3.0], [29.4, 7.8, 22.5, 10.2], D, input_scale=scale)
 
 
-def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_p(swapped: Aircraft, manoeuvre: FloatArray) -> None:
+def test_rudder_before_aileron_with_right_d_is_poor_and_improves_with_k_p(swapped: Aircraft, manoeuvre: FloatArray) -> None:
     # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
     # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
     rms = {}
@@ -127,7 +127,7 @@ def test_rudder_before_aileron_with_the_right_d_is_poor_and_improves_with_k_p(sw
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.0, 25.0])
-def test_rudder_before_aileron_with_identity_d_diverges_at_the_first_roll(
+def test_rudder_before_aileron_with_identity_d_diverges_at_first_roll(
     swapped: Aircraft, manoeuvre: FloatArray, factor: float
 ) -> None:
     # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, for each K_3. The prototype: at 12 s, its first
@@ -160,14 +160,14 @@ def test_negative_determinant_with_identity_d_diverges_for_every_k(K: list[float
     assert len(fly_small([1.0, 1.0], K)) * 0.01 < 4.0
 
 
-def test_negative_determinant_with_the_right_d_converges_where_k_has_the_order_of_22() -> None:
+def test_negative_determinant_with_right_d_converges_where_k_has_order_of_22() -> None:
     # Measured in the last 3 s: 1.3e-3, a hundredth of the reference.
     errors = fly_small([1.0, -1.0], [20.0, 5.0])
     assert len(errors) == len(SINES)
     assert np.abs(errors[-300:]).max() < 0.002
 
 
-def test_negative_determinant_with_the_right_d_diverges_where_k_lacks_the_order_of_22() -> None:
+def test_negative_determinant_with_right_d_diverges_where_k_lacks_order_of_22() -> None:
     # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5 leaves the damping to A.
     # Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
     assert 6.0 < len(fly_small([1.0, -1.0], [5.0, 5.0])) * 0.01 < 9.0

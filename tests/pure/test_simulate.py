@@ -58,12 +58,12 @@ def rms(osprey_gust: Scenario) -> Rms:
 
 
 @pytest.mark.equation(28)
-def test_error_in_the_gusts_with_beta_above_the_slew_of_the_ideal_control(rms: Rms) -> None:
+def test_error_in_gusts_with_beta_above_slew_of_ideal_control(rms: Rms) -> None:
     # Theorem 1 requires beta above the rate of the disturbance. The gust then adds almost no error.
     assert (rms() <= [0.25, 0.0005, 0.26, 0.15]).all(), rms()
 
 
-def test_error_in_the_gusts_with_beta_below_the_slew_of_the_ideal_control(rms: Rms) -> None:
+def test_error_in_gusts_with_beta_below_slew_of_ideal_control(rms: Rms) -> None:
     # The error is ten times larger in q and 250 times in V: beta violates (29).
     assert (rms(below_slew=True) <= [2.5, 0.035, 0.26, 0.22]).all(), rms(below_slew=True)
     assert (rms(below_slew=True) > rms())[:2].all()
@@ -74,7 +74,7 @@ def test_error_in_calm_air(rms: Rms) -> None:
 
 
 @pytest.mark.equation(28)
-def test_implicit_sign_halving_dt_divides_the_error_by_four(rms: Rms) -> None:
+def test_implicit_sign_halving_dt_divides_error_by_four(rms: Rms) -> None:
     # Second order. The first 30 s have all commands on q, V and p, and most of those on r.
     calm = partial(rms, gusts=False, duration=30.0, aircraft=1000.0)
     ratio = calm() / calm(rate=200.0)

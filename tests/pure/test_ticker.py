@@ -23,7 +23,7 @@ def test_each_deadline_is_returned_once() -> None:
     assert 0.0 < ticker.remaining() <= period_ns / 1e9
 
 
-def test_an_overrun_returns_the_newest_deadline_and_counts_the_missed_ones() -> None:
+def test_overrun_returns_newest_deadline_and_counts_missed_ones() -> None:
     ticker = Ticker(PERIOD_NS, time.monotonic_ns())
     ticker.due()
     time.sleep(3.5 * PERIOD_NS / 1e9)  # a busy host may make it longer
@@ -34,7 +34,7 @@ def test_an_overrun_returns_the_newest_deadline_and_counts_the_missed_ones() -> 
     assert 0 <= tick.late_ns < PERIOD_NS
 
 
-def test_the_wait_ends_at_the_deadline_or_at_its_limit() -> None:
+def test_wait_ends_at_deadline_or_at_limit() -> None:
     begin_ns = time.monotonic_ns()
     ticker = Ticker(PERIOD_NS, begin_ns)
     ticker.due()
@@ -51,7 +51,7 @@ def test_the_wait_ends_at_the_deadline_or_at_its_limit() -> None:
 
 
 @pytest.mark.parametrize(("period_ns", "spin_time"), [(PERIOD_NS, SPIN_TIME), (1_000_000, MAX_SPIN_FRACTION * 1e-3)])
-def test_the_busy_wait_before_a_deadline_is_limited_to_a_fraction_of_the_period(
+def test_busy_wait_before_deadline_limited_to_fraction_of_period(
     period_ns: int, spin_time: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slept: list[float] = []

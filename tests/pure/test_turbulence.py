@@ -77,7 +77,7 @@ def test_lengths_and_intensities_are_those_published(
 
 
 @pytest.mark.parametrize("feet", [1000.0, 2000.0])
-def test_lengths_and_intensities_are_continuous_between_the_models(feet: float) -> None:
+def test_lengths_and_intensities_are_continuous_between_models(feet: float) -> None:
     below, above = (dryden(h * FEET, 7.7, 1.5) for h in (feet - 1e-6, feet + 1e-6))
     assert np.concatenate(above) == pytest.approx(np.concatenate(below), rel=1e-8)
 
@@ -104,7 +104,7 @@ def test_the_filters_have_the_published_spectra(axis: int) -> None:
 
 
 @given(dt=st.floats(1e-6, 10.0), altitude=st.floats(3.048, 600.0))
-def test_a_step_is_the_exact_solution_of_the_filters(dt: float, altitude: float) -> None:
+def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
     # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows: at h = 5 the covariance has
     # lost four digits of sixteen, so the comparison ends there.
     model = dryden(altitude, 7.7, 1.5)
@@ -121,7 +121,7 @@ def test_a_step_is_the_exact_solution_of_the_filters(dt: float, altitude: float)
 
 @pytest.mark.parametrize("dt", [0.002, 0.02, 0.5])
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_samples_have_the_published_correlation_for_any_step(axis: int, dt: float) -> None:
+def test_samples_have_published_correlation_for_any_step(axis: int, dt: float) -> None:
     params = filters(SMALL, V0, dt, ALL, 1)
     stationary = params.stationary @ params.stationary.T
     for lag in (0, 1, 7, 50):
@@ -131,7 +131,7 @@ def test_samples_have_the_published_correlation_for_any_step(axis: int, dt: floa
 
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_the_published_correlations_are_integrals_of_the_published_spectra(axis: int) -> None:
+def test_published_correlations_are_integrals_of_published_spectra(axis: int) -> None:
     # The ensemble tests below use both: sigma^2 and the correlation are integrals of the spectrum over omega.
     for lag in (0.0, 0.3, 2.0):
         weight: dict[str, Any] = {"weight": "cos", "wvar": lag} if lag else {}
@@ -155,7 +155,7 @@ def band(degrees: int, tests: int) -> tuple[float, float]:
     return float(chi2.ppf(0.005 / tests, degrees)) / degrees, float(chi2.ppf(1.0 - 0.005 / tests, degrees)) / degrees
 
 
-def test_the_variance_is_the_specified_one_from_the_first_sample_to_the_last(sampled: tuple[float, FloatArray]) -> None:
+def test_variance_is_specified_one_from_first_sample_to_last(sampled: tuple[float, FloatArray]) -> None:
     # Seeds are independent: their sum of squares is chi-square, with a band of -25 % to +29 %.
     _, winds = sampled
     low, high = band(SEEDS, 9)
@@ -186,7 +186,7 @@ def periodogram_ratio(sampled: tuple[float, FloatArray], axis: int, model: Dryde
 
 
 @pytest.mark.parametrize("axis", ALL, ids=AXES)
-def test_the_spectrum_is_the_published_one_with_its_aliases(sampled: tuple[float, FloatArray], axis: int) -> None:
+def test_spectrum_is_published_one_with_aliases(sampled: tuple[float, FloatArray], axis: int) -> None:
     # Each bin of each seed is chi-square with two degrees of freedom: the band is -18 % to +20 %.
     low, high = band(2 * SEEDS, 12)
     ratio = periodogram_ratio(sampled, axis, SMALL)
@@ -196,7 +196,7 @@ def test_the_spectrum_is_the_published_one_with_its_aliases(sampled: tuple[float
         assert not ((wrong > low) & (wrong < high)).all()
 
 
-def test_the_expected_periodogram_is_the_aliased_published_spectrum() -> None:
+def test_expected_periodogram_is_aliased_published_spectrum() -> None:
     # Sum over m of Phi(omega + 2 pi m / dt); the tail beyond 2000 aliases is an integral. Leakage of the window is negligible.
     dt, axis = 0.1, 2
     omega = np.array([3.0, 10.0, 25.0])
@@ -210,7 +210,7 @@ def test_the_expected_periodogram_is_the_aliased_published_spectrum() -> None:
 
 
 @pytest.mark.equation("Assumption 2")
-def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_the_theorem() -> None:
+def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> None:
     # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they are proportional to dt: 2
     # sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The difference quotient grows without limit.
     for axis, slope in enumerate((2.0, 3.0, 3.0)):
@@ -223,14 +223,14 @@ def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_the_theorem() 
     assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 nearly independent increments: 1.8 % standard deviation
 
 
-def test_the_numbers_of_step_k_do_not_depend_on_the_range() -> None:
+def test_numbers_of_step_k_do_not_depend_on_range() -> None:
     whole = turbulence.normals(0, 300, 5)
     for first, count in ((0, 1), (63, 2), (64, 64), (130, 99), (299, 1)):
         assert (turbulence.normals(first, count, 5) == whole[first : first + count]).all()
     assert (turbulence.normals(0, 300, 6) != whole).all()
 
 
-def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
+def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
     params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.array([0.01, 0.1, 0.0, 0.0])
     whole = plant.advance(0, plant.initial_state(params), u, 400 * MS, params)
     cut = plant.initial_state(params)
@@ -247,7 +247,7 @@ def test_the_turbulence_does_not_depend_on_how_the_flight_is_divided() -> None:
         assert first.truth().tobytes() == second.truth().tobytes()
 
 
-def test_truth_holds_the_wind_that_acts_from_now_on_and_f_includes_it() -> None:
+def test_truth_holds_wind_that_acts_from_now_on_and_f_includes_it() -> None:
     gusts = {"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}}
     parameters = aircraft_parameters(turbulence=TURBULENCE, gusts=gusts)
     simulator, params = Simulator(parameters), parameters.plant()
@@ -266,7 +266,7 @@ def test_truth_holds_the_wind_that_acts_from_now_on_and_f_includes_it() -> None:
             z = turbulence.step(z, normal, air)
 
 
-def test_the_wind_of_an_axis_does_not_depend_on_the_other_axes() -> None:
+def test_wind_of_axis_does_not_depend_on_other_axes() -> None:
     # Each axis has its own noise, used by the airframe or not.
     model = dryden(30.0, 7.7, 0.0)
     whole, lateral = filters(model, V0, 0.01, ALL, 1), filters(model, V0, 0.01, [AXES.index("lateral")], 1)

@@ -36,7 +36,7 @@ def test_entries_are_uniform_and_independent() -> None:
         assert abs(np.corrcoef(d, other)[0, 1]) < 0.09
 
 
-def test_a_sampled_airframe_keeps_zeros_angles_and_everything_but_a_and_b() -> None:
+def test_sampled_airframe_keeps_zeros_angles_and_everything_but_and_b() -> None:
     sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
     A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
     for angle in ("theta", "phi"):
@@ -49,7 +49,7 @@ def test_a_sampled_airframe_keeps_zeros_angles_and_everything_but_a_and_b() -> N
     assert sampled.model_dump(exclude={"A", "B", "gusts"}) == OSPREY.model_dump(exclude={"A", "B", "gusts"})
 
 
-def test_aircraft_that_drift_with_the_wind_do_not_notice_it() -> None:
+def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
     # An aircraft with alpha = w / V0, beta = v / V0 or V = u has no velocity relative to steady air of that wind: A x and the
     # effect of the wind cancel. The airframe file rounds its effect of wind to two or three digits: 3e-3 at most.
     sampled = sample_airframe(OSPREY, 0.5, 0.0, seed=7)
@@ -61,20 +61,20 @@ def test_aircraft_that_drift_with_the_wind_do_not_notice_it() -> None:
         assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis  # what it would feel otherwise
 
 
-def test_the_published_effect_of_wind_remains_as_an_option() -> None:
+def test_published_effect_of_wind_remains_as_option() -> None:
     sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7, wind="published")
     assert sampled.model_dump(exclude={"A", "B"}) == OSPREY.model_dump(exclude={"A", "B"})
     own = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
     assert (own.A, own.B) == (sampled.A, sampled.B)
 
 
-def test_the_effect_of_wind_of_a_published_airframe_is_the_published_one_to_the_last_bit() -> None:
+def test_effect_of_wind_of_published_airframe_is_published_one_to_last_bit() -> None:
     for wind in ("air_relative", "published"):
         assert (gust_directions(OSPREY, OSPREY.matrix_a()[None], wind)[0] == OSPREY.matrix_gusts()).all()
         assert (sample_airframe(OSPREY, 0.0, 0.3, seed=7, wind=wind).matrix_gusts() == OSPREY.matrix_gusts()).all()
 
 
-def test_the_effect_of_wind_on_a_state_without_a_published_entry_stays() -> None:
+def test_effect_of_wind_on_state_without_published_entry_stays() -> None:
     # The vertical wind acts on r here although A[r, alpha] is 0; an airframe without beta keeps its lateral effect.
     gusts = {"vertical": {"alpha": 7.2, "r": 1.0}, "lateral": {"q": 2.0}}
     states = {("sideslip" if state == "beta" else state): unit for state, unit in OSPREY.states.items()}
@@ -86,7 +86,7 @@ def test_the_effect_of_wind_on_a_state_without_a_published_entry_stays() -> None
     assert sampled.gusts["lateral"] == gusts["lateral"]
 
 
-def test_one_uncertainty_leaves_the_other_matrix_as_published() -> None:
+def test_one_uncertainty_leaves_other_matrix_as_published() -> None:
     assert sample_airframe(OSPREY, 0.0, 0.2, seed=7).matrix_a() == pytest.approx(OSPREY.matrix_a(), rel=1e-15)
     assert sample_airframe(OSPREY, 0.2, 0.0, seed=7).matrix_b() == pytest.approx(OSPREY.matrix_b(), rel=1e-15)
     assert sample_airframe(OSPREY, 0.0, 0.0, seed=7) is OSPREY
@@ -101,7 +101,7 @@ def test_a_seed_determines_the_aircraft() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(file.stem for file in LIBRARY.glob("*.yaml")))
-def test_the_yaml_text_of_an_airframe_reads_back_to_the_last_bit(name: str, tmp_path: Path) -> None:
+def test_yaml_text_of_airframe_reads_back_to_last_bit(name: str, tmp_path: Path) -> None:
     for airframe in (load_airframe(name), sample_airframe(load_airframe(name), 0.3, 0.3, seed=1)):
         path = tmp_path / f"{name}.yaml"
         path.write_text(as_yaml(airframe), encoding="utf-8")
@@ -110,7 +110,7 @@ def test_the_yaml_text_of_an_airframe_reads_back_to_the_last_bit(name: str, tmp_
         assert again.matrix_a().tobytes() == airframe.matrix_a().tobytes()
 
 
-def test_a_sampled_airframe_flies_like_its_yaml_text(osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_sampled_airframe_flies_like_yaml_text(osprey_gust: Scenario, tmp_path: Path) -> None:
     # The log holds the text. A flight of it has the same bits.
     short = osprey_gust.vary(flight={"duration": 3.0})
     sampled = short.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.3, "seed": 7}})

@@ -15,12 +15,12 @@ from flight_core.vectors import ChannelError, _NumPy1, array_namespace, require_
 pytestmark = pytest.mark.package("flight_core")
 
 
-def test_values_are_matched_by_name_not_by_position() -> None:
+def test_values_matched_by_name_not_by_position() -> None:
     assert select(["q", "V"], ["V", "r", "q"], [1.0, 2.0, 3.0]).tolist() == [3.0, 1.0]
 
 
 @given(values=st.permutations([("q", 1.0), ("V", 2.0), ("p", 3.0), ("r", 4.0)]))
-def test_the_order_of_the_publisher_does_not_matter(values: list[tuple[str, float]]) -> None:
+def test_order_of_publisher_does_not_matter(values: list[tuple[str, float]]) -> None:
     names, numbers = zip(*values, strict=True)
     assert select(["q", "V", "p", "r"], names, numbers).tolist() == [1.0, 2.0, 3.0, 4.0]
 
@@ -37,22 +37,22 @@ def test_the_order_of_the_publisher_does_not_matter(values: list[tuple[str, floa
         (["q", "V"], [-math.inf, 1.0], "finite"),
     ],
 )
-def test_an_invalid_sample_is_rejected_with_its_reason(names: list[str], values: list[float], reason: str) -> None:
+def test_invalid_sample_rejected_with_reason(names: list[str], values: list[float], reason: str) -> None:
     with pytest.raises(ChannelError) as rejected:
         select(["q", "V"], names, values)
     assert rejected.value.reason == reason
 
 
-def test_a_channel_that_is_not_wanted_may_have_any_value() -> None:
+def test_channel_that_is_not_wanted_may_have_any_value() -> None:
     assert select(["q"], ["q", "T"], [1.0, math.nan]).tolist() == [1.0]
 
 
-def test_the_array_namespace_is_that_of_the_library_of_the_array() -> None:
+def test_array_namespace_is_that_of_library_of_array() -> None:
     assert array_namespace(np.zeros(2)) is array_namespace(np.float64(0.0)) is np
     assert array_namespace(jnp.zeros(2)) is jnp
 
 
-def test_the_functions_of_a_python_float_are_those_of_the_array_at_that_value() -> None:
+def test_functions_of_python_float_are_those_of_array_at_that_value() -> None:
     xp = array_namespace(0.5)
     for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
         assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), name  # JAX in 32 bit
@@ -67,7 +67,7 @@ def test_the_namespace_of_numpy_1_has_concat() -> None:
     assert xp.sin is np.sin
 
 
-def test_stamps_out_of_order_or_ahead_of_the_clock_are_rejected() -> None:
+def test_stamps_out_of_order_or_ahead_of_clock_rejected() -> None:
     require_newer(1, 0)
     require_not_future(12, 10, 2)
     with pytest.raises(ChannelError, match="V: stamp 1 s before the last one") as rejected:

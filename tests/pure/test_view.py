@@ -82,7 +82,7 @@ def followed(flight: Flight) -> tuple[dict[str, Any], dict[str, tuple[NDArray[np
             return head, {name: tuple(map(np.concatenate, zip(*pieces, strict=True))) for name, pieces in parts.items()}  # type: ignore[misc]
 
 
-def test_a_page_gets_the_ticks_of_the_flight_to_the_value(recorded: Path, tape: Tape) -> None:
+def test_page_gets_ticks_of_flight_to_value(recorded: Path, tape: Tape) -> None:
     flight = Flight(recorded)
     assert flight.update()
     _, columns = followed(flight)
@@ -99,7 +99,7 @@ def test_a_page_gets_the_ticks_of_the_flight_to_the_value(recorded: Path, tape: 
 
 
 @pytest.mark.parametrize("piece", [1009, 30_000])
-def test_a_flight_that_is_followed_equals_one_that_is_replayed(piece: int, recorded: Path, tmp_path: Path) -> None:
+def test_flight_that_followed_equals_one_that_replayed(piece: int, recorded: Path, tmp_path: Path) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     live, late = Flight(tmp_path), Flight(recorded)
     late.update()
@@ -116,7 +116,7 @@ def test_a_flight_that_is_followed_equals_one_that_is_replayed(piece: int, recor
     assert (live.state(), late.state()) == ("ended", "ended")
 
 
-def test_the_description_has_units_limits_gusts_and_commands_of_the_scenario(recorded: Path) -> None:
+def test_description_has_units_limits_gusts_and_commands_of_scenario(recorded: Path) -> None:
     flight = Flight(recorded)
     flight.update()
     shown = flight.description
@@ -129,7 +129,7 @@ def test_the_description_has_units_limits_gusts_and_commands_of_the_scenario(rec
     assert set(flight.bands) == {"q", "V", "p", "r"}
 
 
-def test_the_state_tells_a_slow_recorder_from_a_killed_one(recorded: Path, tmp_path: Path) -> None:
+def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Path) -> None:
     now, path = 0.0, tmp_path / "run_0.mcap"
     flight = Flight(tmp_path, now=lambda: now)
     flight.update()
@@ -149,7 +149,7 @@ def test_the_state_tells_a_slow_recorder_from_a_killed_one(recorded: Path, tmp_p
 
 
 @pytest.mark.parametrize(("backlog", "state"), [(0, "reading"), (10**9, "recording")])
-def test_long_logs_are_read_in_slices_and_a_short_backlog_is_live(
+def test_long_logs_read_in_slices_and_short_backlog_is_live(
     backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
@@ -163,7 +163,7 @@ def test_long_logs_are_read_in_slices_and_a_short_backlog_is_live(
     assert followed(flight)[1]["internals"][1].tobytes() == followed(whole)[1]["internals"][1].tobytes()
 
 
-def test_samples_beyond_the_limit_become_coarser_and_keep_their_peaks() -> None:
+def test_samples_beyond_limit_become_coarser_and_keep_peaks() -> None:
     samples, values = Series(("a", "b"), max_rows=400), np.zeros((1000, 2))
     values[123, 0], values[457, 1] = 9.0, -7.0
     for start in range(0, 1000, 30):
@@ -176,7 +176,7 @@ def test_samples_beyond_the_limit_become_coarser_and_keep_their_peaks() -> None:
     assert samples.stamp_ns[[0, -1]].tolist() == [0, 999]
 
 
-def test_a_row_of_a_recovered_overrun_is_kept_in_order_and_one_of_another_time_is_refused() -> None:
+def test_row_of_recovered_overrun_kept_in_order_and_one_of_another_time_refused() -> None:
     samples = Series(("a",))
     for stamps in ([0, 50_000_000], [47_000_000, 60_000_000], [-3_000_000_000, 70_000_000]):
         samples.append(np.array(stamps, dtype=np.int64), np.ones((2, 1)))
@@ -184,7 +184,7 @@ def test_a_row_of_a_recovered_overrun_is_kept_in_order_and_one_of_another_time_i
     assert samples.refused == 1
 
 
-def test_a_flight_of_any_length_becomes_coarser_without_large_temporary_arrays() -> None:
+def test_flight_of_any_length_becomes_coarser_without_large_temporary_arrays() -> None:
     rows, channels = 20_000, 30
     samples, values = (
         Series(tuple(map(str, range(channels))), max_rows=rows),
@@ -202,7 +202,7 @@ def test_a_flight_of_any_length_becomes_coarser_without_large_temporary_arrays()
     assert (samples.stamp_ns[: rows // 2] == np.arange(0, rows, 2)).all()
 
 
-def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> None:
+def test_browser_gets_thinned_samples_again_from_start(recorded: Path) -> None:
     flight = Flight(recorded)
     flight.update()
     head, _ = decoded(answer(flight, {}))
@@ -214,7 +214,7 @@ def test_a_browser_gets_thinned_samples_again_from_the_start(recorded: Path) -> 
     assert topics["internals"] == 0
 
 
-def test_a_page_that_shows_another_run_gets_the_description_of_this_one(recorded: Path) -> None:
+def test_page_that_shows_another_run_gets_description_of_this_one(recorded: Path) -> None:
     flight = Flight(recorded)
     flight.update()
     head, _ = decoded(answer(flight, {"epoch": "of the run before", "described": str(flight.described)}))
@@ -222,7 +222,7 @@ def test_a_page_that_shows_another_run_gets_the_description_of_this_one(recorded
 
 
 @pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
-def test_a_hostile_log_is_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
+def test_hostile_log_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
     path.write_bytes(case.read_bytes())
     now = 0.0
@@ -236,7 +236,7 @@ def test_a_hostile_log_is_shown_as_far_as_it_goes(case: Path, tmp_path: Path) ->
     assert all(sentence.isprintable() for sentence in head["faults"])
 
 
-def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> None:
+def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
     hostile = "<img src=x onerror=alert(1)>\x1b[2J" + "a" * 5000
     with BagWriter(tmp_path / "run") as bag:
         y = bag.add_topic("/y", JOINT_STATE, "")
@@ -252,7 +252,7 @@ def test_names_and_texts_of_a_log_are_bounded_and_printable(tmp_path: Path) -> N
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
-def test_a_pose_is_shown_with_all_channels_that_came_and_one_with_fewer_is_left_out(tmp_path: Path) -> None:
+def test_pose_shown_with_all_channels_that_came_and_one_with_fewer_left_out(tmp_path: Path) -> None:
     names = ["phi", "theta", "psi", "north", "east"]
     with BagWriter(tmp_path / "run") as bag:
         pose = bag.add_topic("/pose", JOINT_STATE, "")
@@ -288,7 +288,7 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
     assert sorted(one[1:] for one in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
 
 
-def test_a_route_that_is_given_in_flight_replaces_that_of_the_scenario(tmp_path: Path) -> None:
+def test_route_that_given_in_flight_replaces_that_of_scenario(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_route")
     store, given = typestore(), [(0.0, 0.0, 50.0), (0.0, 600.0, 55.0), (400.0, 600.0, 55.0)]  # east, north, altitude
     made = {name: store.types[name] for name in (ROUTE_TYPE, *map("geometry_msgs/msg/{}".format, ("PoseStamped", "Pose")))}
@@ -359,7 +359,7 @@ async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN
     )
 
 
-def test_the_page_is_served_with_a_token_alone_and_asks_no_other_host(recorded: Path) -> None:
+def test_page_served_with_token_alone_and_asks_no_other_host(recorded: Path) -> None:
     async def client(server: Server) -> None:
         login = await get(server, f"/?token={TOKEN}", token="")
         assert (login.code, login.headers["Location"]) == (303, "/")
@@ -407,7 +407,7 @@ def test_the_page_is_served_with_a_token_alone_and_asks_no_other_host(recorded: 
         ("/", "HEAD", {}, 405),
     ],
 )
-def test_a_foreign_host_another_path_and_another_method_are_refused(
+def test_foreign_host_another_path_and_another_method_refused(
     path: str, method: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
     async def client(server: Server) -> None:
@@ -427,7 +427,7 @@ def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
     against(recorded)(client)
 
 
-def test_connections_beyond_the_limit_are_closed_and_free_ones_serve_again(recorded: Path) -> None:
+def test_connections_beyond_limit_closed_and_free_ones_serve_again(recorded: Path) -> None:
     async def client(server: Server) -> None:
         idle = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(http.MAX_CONNECTIONS)]
         for _ in range(1000):
@@ -454,7 +454,7 @@ async def rest_of(reader: asyncio.StreamReader) -> bytes:
         return b""
 
 
-def test_a_request_that_arrives_slowly_or_is_too_long_is_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_request_that_arrives_slowly_or_is_too_long_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
 
     async def client(server: Server) -> None:
@@ -477,7 +477,7 @@ def test_a_request_that_arrives_slowly_or_is_too_long_is_closed(recorded: Path, 
     against(recorded)(client)
 
 
-def test_a_browser_that_knows_all_waits_for_news_and_gets_the_next_samples(
+def test_browser_that_knows_all_waits_for_news_and_gets_next_samples(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
@@ -515,7 +515,7 @@ UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Key":
 UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
 
 
-def test_a_websocket_answers_each_message_as_a_request_and_waits_for_news(recorded: Path) -> None:
+def test_websocket_answers_each_message_as_request_and_waits_for_news(recorded: Path) -> None:
     async def client(server: Server) -> None:
         socket = await stream(server)
         await socket.write_message("")
@@ -550,7 +550,7 @@ def test_a_websocket_answers_each_message_as_a_request_and_waits_for_news(record
         ("/news/2", TOKEN, {}, 404),
     ],
 )
-def test_a_websocket_of_another_page_host_user_or_flight_is_refused(
+def test_websocket_of_another_page_host_user_or_flight_refused(
     path: str, token: str, headers: dict[str, str], expected: int, recorded: Path
 ) -> None:
     async def client(server: Server) -> None:
@@ -567,7 +567,7 @@ def test_a_websocket_of_another_page_host_user_or_flight_is_refused(
         ("a" * (http.MAX_REQUEST_BYTES + 1), 1009, "message too big"),
     ],
 )
-def test_a_websocket_whose_message_is_no_request_is_closed(message: str, code: int, reason: str, recorded: Path) -> None:
+def test_websocket_whose_message_is_no_request_closed(message: str, code: int, reason: str, recorded: Path) -> None:
     async def client(server: Server) -> None:
         socket = await stream(server)
         await socket.write_message(f"epoch={decoded((await get(server, '/data/0')).body)[0]['epoch']}&{message}")
@@ -578,9 +578,7 @@ def test_a_websocket_whose_message_is_no_request_is_closed(message: str, code: i
     against(recorded)(client)
 
 
-def test_websockets_that_ask_nothing_and_those_beyond_the_limit_are_closed(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_websockets_that_ask_nothing_and_those_beyond_limit_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async def client(server: Server) -> None:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
         assert (await get(server, "/news/0", **UPGRADE)).code == 503
@@ -596,7 +594,7 @@ def test_websockets_that_ask_nothing_and_those_beyond_the_limit_are_closed(
     against(recorded)(client)
 
 
-def test_a_websocket_has_one_request_at_a_time(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_websocket_has_one_request_at_time(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[str] = []
 
     def parsed(message: str, **_: object) -> list[tuple[str, str]]:
@@ -617,7 +615,7 @@ def test_a_websocket_has_one_request_at_a_time(recorded: Path, monkeypatch: pyte
     against(recorded)(client)
 
 
-def test_a_websocket_that_asks_and_reads_no_answer_makes_few_of_them_and_the_server_ends_quietly(
+def test_websocket_that_asks_and_reads_no_answer_makes_few_of_them_and_server_ends_quietly(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     made: list[bytes] = []
@@ -661,7 +659,7 @@ def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
 # Which run
 
 
-def test_the_run_that_is_recorded_is_chosen_else_the_last_one(recorded: Path, tmp_path: Path) -> None:
+def test_run_that_recorded_is_chosen_else_last_one(recorded: Path, tmp_path: Path) -> None:
     for name in ("20260101T000000Z-a", "20260102T000000Z-b", "20260103T000000Z-c"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run_0.mcap").write_bytes(b"")
@@ -687,7 +685,7 @@ def command(*words: object) -> list[str]:
 
 
 @pytest.mark.parametrize("ignored", [False, True], ids=["in front", "in the background, with SIGINT ignored"])
-def test_watch_prints_an_address_and_ends_quietly_with_ctrl_c(recorded: Path, ignored: bool) -> None:
+def test_watch_prints_address_and_ends_quietly_with_ctrl_c(recorded: Path, ignored: bool) -> None:
     before = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh"] if ignored else []
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*before, *command("watch", recorded, "--port", 0)], **pipes) as process:  # type: ignore[call-overload]
@@ -702,7 +700,7 @@ def test_watch_prints_an_address_and_ends_quietly_with_ctrl_c(recorded: Path, ig
         assert process.stderr.read() == ""
 
 
-def test_a_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
+def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         ended = subprocess.run(command("watch", recorded, "--port", port), capture_output=True, text=True, check=False)
@@ -717,7 +715,7 @@ def test_a_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
         assert (ended.returncode, ended.stderr) == (2, expected)
 
 
-def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path: Path) -> None:
+def test_flight_with_page_prints_address_and_leaves_no_server(tmp_path: Path) -> None:
     words = ("fly", "osprey_gust", "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
     ended = subprocess.run(command(*words), capture_output=True, text=True, check=True)
     assert json.loads(ended.stdout)["outcome"] == "completed"
@@ -727,7 +725,7 @@ def test_a_flight_with_its_page_prints_the_address_and_leaves_no_server(tmp_path
         assert client.connect_ex(("127.0.0.1", int(found[1]))) != 0
 
 
-def test_the_terminal_view_of_a_recorded_flight_ends_by_itself(recorded: Path) -> None:
+def test_terminal_view_of_recorded_flight_ends_by_itself(recorded: Path) -> None:
     ended = subprocess.run(command("watch", recorded, "--text"), capture_output=True, text=True, check=True)
     assert "run  ENDED  ENGAGED  t = 2.0 s" in ended.stdout
 
@@ -742,7 +740,7 @@ def test_a_log_that_vanishes_is_a_sentence(recorded: Path, tmp_path: Path) -> No
         flight.update()
 
 
-def test_the_terminal_shows_the_newest_values_in_the_units_of_the_report(recorded: Path, tape: Tape) -> None:
+def test_terminal_shows_newest_values_in_units_of_report(recorded: Path, tape: Tape) -> None:
     console = Console(width=120, record=True, file=io.StringIO())
     flight = Flight(recorded)
     console.print(picture(flight))  # before there is a sample
@@ -757,7 +755,7 @@ def test_the_terminal_shows_the_newest_values_in_the_units_of_the_report(recorde
     assert "0.00 s  mode: ENGAGED" in text
 
 
-def test_the_terminal_shows_a_pose_without_a_heading(tmp_path: Path) -> None:
+def test_terminal_shows_pose_without_heading(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "run") as bag:
         pose = bag.add_topic("/pose", JOINT_STATE, "")
         bag.write(pose, 1, 1, 0, vector(1, ["phi", "theta"], [0.1, 0.2]))

@@ -64,7 +64,7 @@ def desk(recorded: Path, osprey_gust: Scenario) -> Desk:
     return Desk(recorded, osprey_gust)
 
 
-def test_gains_are_set_together_seen_in_the_log_and_undone(desk: Desk, osprey_gust: Scenario) -> None:
+def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scenario) -> None:
     base = osprey_gust.controller
 
     async def steps(desk: Desk) -> None:
@@ -86,7 +86,7 @@ def test_gains_are_set_together_seen_in_the_log_and_undone(desk: Desk, osprey_gu
 
 
 @pytest.mark.parametrize("state", ["ended", "interrupted"])
-def test_a_page_whose_flight_is_over_commands_no_later_one(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_whose_flight_is_over_commands_no_later_one(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(desk.flight, "state", lambda: state)
     sentence = "the flight of this page is over: rise-di watch --control shows a later one"
 
@@ -102,7 +102,7 @@ def test_a_page_whose_flight_is_over_commands_no_later_one(state: str, desk: Des
     with_desk(desk, steps)
 
 
-def test_gains_may_be_set_before_the_first_tick(desk: Desk) -> None:
+def test_gains_may_be_set_before_first_tick(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         desk.flight.digest = 0
         state = await desk.ask("state")
@@ -112,7 +112,7 @@ def test_gains_may_be_set_before_the_first_tick(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_a_set_on_top_of_the_change_of_another_program_is_refused(desk: Desk) -> None:
+def test_set_on_top_of_change_of_another_program_refused(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         digest = (await desk.ask("state"))["digest"]
         desk.nodes.values["controller"]["k_g"] *= 1.1
@@ -123,7 +123,7 @@ def test_a_set_on_top_of_the_change_of_another_program_is_refused(desk: Desk) ->
     with_desk(desk, steps)
 
 
-def test_a_gain_beyond_its_range_of_no_such_name_or_no_number_is_refused(desk: Desk, osprey_gust: Scenario) -> None:
+def test_gain_beyond_range_of_no_such_name_or_no_number_refused(desk: Desk, osprey_gust: Scenario) -> None:
     k_g = gains_of(osprey_gust.controller)["k_g"]
 
     async def steps(desk: Desk) -> None:
@@ -144,7 +144,7 @@ def test_a_gain_beyond_its_range_of_no_such_name_or_no_number_is_refused(desk: D
     with_desk(desk, steps)
 
 
-def test_the_margins_of_pending_gains_are_those_of_the_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
+def test_margins_of_pending_gains_are_those_of_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
     airframe, _ = osprey_gust.aircraft.load()
     found = check_gains(osprey_gust, study_airframe(airframe, manoeuvre(osprey_gust, airframe), 0.0, 1))
 
@@ -159,7 +159,7 @@ def test_the_margins_of_pending_gains_are_those_of_the_gain_check(desk: Desk, os
     with_desk(desk, steps)
 
 
-def test_a_wrong_key_is_refused_and_delays_the_next_one(desk: Desk) -> None:
+def test_wrong_key_refused_and_delays_next_one(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         assert (await desk.refused("deactivate", key="ABCD-EFGX"))[0] == 403
         assert desk.nodes.notes == []  # who lacks the key does not fill the log
@@ -185,7 +185,7 @@ def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_more_than_five_requests_a_second_are_refused(desk: Desk) -> None:
+def test_more_than_five_requests_second_refused(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         for _ in range(int(BURST) - 1):
@@ -215,7 +215,7 @@ def test_targets_routes_and_services_reach_guidance_and_refusals_come_back(desk:
     with_desk(desk, steps)
 
 
-def test_faults_and_gusts_become_parameters_of_the_aircraft(desk: Desk) -> None:
+def test_faults_and_gusts_become_parameters_of_aircraft(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         state = await desk.ask("state")
         assert state["aircraft"]["axes"] == ["vertical", "lateral", "longitudinal"]
@@ -240,7 +240,7 @@ def test_faults_and_gusts_become_parameters_of_the_aircraft(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_gains_of_a_bridge_that_sends_need_a_further_option(recorded: Path, osprey_gust: Scenario) -> None:
+def test_gains_of_bridge_that_sends_need_further_option(recorded: Path, osprey_gust: Scenario) -> None:
     async def steps(desk: Desk) -> None:
         state = await desk.ask("state")
         assert state["bridge"] == {"map": "plane", "sends": True}
@@ -257,7 +257,7 @@ def test_gains_of_a_bridge_that_sends_need_a_further_option(recorded: Path, ospr
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False, real=True), allowed)
 
 
-def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(recorded: Path, osprey_gust: Scenario) -> None:
+def test_bridge_engages_by_name_of_map_and_disengages_while_it_waits(recorded: Path, osprey_gust: Scenario) -> None:
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         assert (await desk.refused("engage", map="copter"))[0] == 400
@@ -271,7 +271,7 @@ def test_a_bridge_engages_by_the_name_of_its_map_and_disengages_while_it_waits(r
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
-def test_a_controller_under_a_bridge_is_deactivated_by_the_bridge_alone(recorded: Path, osprey_gust: Scenario) -> None:
+def test_controller_under_bridge_deactivated_by_bridge_alone(recorded: Path, osprey_gust: Scenario) -> None:
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         for action in ("activate", "deactivate"):
@@ -282,7 +282,7 @@ def test_a_controller_under_a_bridge_is_deactivated_by_the_bridge_alone(recorded
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
-def test_margins_that_are_computed_do_not_delay_a_deactivation(desk: Desk) -> None:
+def test_margins_that_computed_do_not_delay_deactivation(desk: Desk) -> None:
     begun, end = threading.Event(), threading.Event()
 
     def assess(scenario: Scenario, params: ControllerConfig) -> dict[str, Any]:
@@ -302,7 +302,7 @@ def test_margins_that_are_computed_do_not_delay_a_deactivation(desk: Desk) -> No
     with_desk(desk, steps)
 
 
-def test_an_engagement_that_waits_for_its_turn_is_cancelled_too(recorded: Path, osprey_gust: Scenario) -> None:
+def test_engagement_that_waits_for_turn_cancelled_too(recorded: Path, osprey_gust: Scenario) -> None:
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         first = asyncio.ensure_future(desk.refused("engage", map="plane"))
@@ -340,7 +340,7 @@ async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
     )
 
 
-def test_a_request_needs_token_origin_type_and_key(desk: Desk) -> None:
+def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         server = Server([desk.flight], TOKEN, desk.control)
         server.listen(0)

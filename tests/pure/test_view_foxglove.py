@@ -35,7 +35,7 @@ def command(*words: object) -> list[str]:
 
 
 @needs_extra
-def test_a_viewer_gets_the_messages_of_the_log_with_their_definitions(recorded: Path, tape: Tape, tmp_path: Path) -> None:
+def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape, tmp_path: Path) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
     rest = BytesIO(content[len(content) // 2 :])
@@ -94,7 +94,7 @@ def test_a_viewer_gets_the_messages_of_the_log_with_their_definitions(recorded: 
 
 
 @needs_extra
-def test_an_ended_recording_is_opened_by_a_viewer_itself(recorded: Path) -> None:
+def test_ended_recording_opened_by_viewer_itself(recorded: Path) -> None:
     ended = subprocess.run(command(recorded, "--foxglove"), capture_output=True, text=True, check=False)
     assert ended.returncode == 2
     assert "found a recording that has ended, expected one in progress; viewers open its .mcap file" in ended.stderr

@@ -145,7 +145,7 @@ def press(browser: Browser, key: str, shift: bool = False) -> None:
     browser.run(f"void document.body.dispatchEvent(new KeyboardEvent('keydown', {options}))")
 
 
-def test_a_recorded_flight_is_drawn_and_asks_no_other_host(browser: Browser, recorded: Path) -> None:
+def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded: Path) -> None:
     with shown(browser, recorded) as address:
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
         assert titles[:5] == ["q: y over y_m", "p: y over y_m", "r: y over y_m", "V: y over y_m", "q: error e"]
@@ -172,7 +172,7 @@ CURVES = """(() => {
 })()"""
 
 
-def test_a_flight_with_noise_has_a_dozen_curves_that_are_not_flat(browser: Browser, tmp_path: Path) -> None:
+def test_flight_with_noise_has_dozen_curves_that_are_not_flat(browser: Browser, tmp_path: Path) -> None:
     run = flown(find_scenario("osprey_servo").vary(flight={"duration": 2.0}), tmp_path / "run")
     with shown(browser, run) as address:
         browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=4000, deviceScaleFactor=1, mobile=False)
@@ -212,7 +212,7 @@ def test_keys_step_single_ticks_jump_to_events_and_play(browser: Browser, record
         assert browser.console == []
 
 
-def test_keys_step_seconds_jump_to_a_command_and_choose_window_and_camera(
+def test_keys_step_seconds_jump_to_command_and_choose_window_and_camera(
     browser: Browser, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     def chosen(selector: str) -> str:
@@ -238,7 +238,7 @@ def test_keys_step_seconds_jump_to_a_command_and_choose_window_and_camera(
         assert browser.console == []
 
 
-def test_at_a_tenth_of_the_speed_a_flight_takes_ten_times_as_long(browser: Browser, recorded: Path) -> None:
+def test_at_tenth_of_speed_flight_takes_ten_times_as_long(browser: Browser, recorded: Path) -> None:
     with shown(browser, recorded):
         for _ in range(9):
             press(browser, "-")
@@ -250,7 +250,7 @@ def test_at_a_tenth_of_the_speed_a_flight_takes_ten_times_as_long(browser: Brows
         assert browser.run("performance.now()") - begun > 1900.0
 
 
-def test_a_flight_that_is_recorded_is_followed_to_its_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
+def test_flight_that_recorded_followed_to_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     with serving(tmp_path) as address:
         browser.open(address)
@@ -283,7 +283,7 @@ ASKS = """(() => {
 })()"""
 
 
-def test_a_server_that_hangs_is_no_server_until_it_answers_again(
+def test_server_that_hangs_is_no_server_until_it_answers_again(
     browser: Browser, recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs, update = threading.Event(), Flight.update
@@ -309,7 +309,7 @@ def pictures_of(browser: Browser) -> list[str]:
     return found
 
 
-def test_a_browser_without_webgl_draws_the_same_pixels(browser: Browser, recorded: Path, tmp_path: Path) -> None:
+def test_browser_without_webgl_draws_same_pixels(browser: Browser, recorded: Path, tmp_path: Path) -> None:
     with shown(browser, recorded):
         expected = pictures_of(browser)
     flags = ("--disable-software-rasterizer", "--disable-webgl", "--disable-webgl2", "--disable-3d-apis")
@@ -320,7 +320,7 @@ def test_a_browser_without_webgl_draws_the_same_pixels(browser: Browser, recorde
     assert len(set(expected)) > 10
 
 
-def test_a_second_run_is_drawn_as_a_ghost(browser: Browser, recorded: Path, tape: Tape, tmp_path: Path) -> None:
+def test_second_run_drawn_as_ghost(browser: Browser, recorded: Path, tape: Tape, tmp_path: Path) -> None:
     pose, y = tape["pose"], tape["y"]
     values = pose.values.copy()
     values[:, pose.names.index("east")] += 20.0 + 0.3 * pose["north"]  # m: aside, and not along the pixels
@@ -344,7 +344,7 @@ def test_a_second_run_is_drawn_as_a_ghost(browser: Browser, recorded: Path, tape
             browser.call("Emulation.setEmulatedMedia", features=[])
 
 
-def test_names_that_are_html_are_shown_as_text(browser: Browser, tmp_path: Path) -> None:
+def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> None:
     hostile = "<img src=x onerror=document.title=1>"
     with BagWriter(tmp_path / hostile.replace("/", "")) as bag:
         y = bag.add_topic("/y", JOINT_STATE, "")
@@ -357,7 +357,7 @@ def test_names_that_are_html_are_shown_as_text(browser: Browser, tmp_path: Path)
         assert browser.console == []
 
 
-def test_a_phone_has_one_column_and_the_dark_scheme_its_own_colours(browser: Browser, recorded: Path) -> None:
+def test_phone_has_one_column_and_dark_scheme_own_colours(browser: Browser, recorded: Path) -> None:
     with shown(browser, recorded):
         browser.call("Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=2, mobile=True)
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
@@ -392,7 +392,7 @@ def page(browser: Browser, recorded: Path) -> Iterator[Browser]:
         yield browser
 
 
-def test_the_attitude_is_drawn_with_the_right_signs(page: Browser) -> None:
+def test_attitude_drawn_with_right_signs(page: Browser) -> None:
     nose, right, level = "[1, 0, 0]", "[0, 1, 0]", "0, 0, 0"
     (x, y), (x_level, y_level) = seen(page, f"[at({right}, 0.3, 0, 0), at({right}, {level})]")
     assert x_level > 200  # the right wing is on the right, seen from behind
@@ -403,7 +403,7 @@ def test_the_attitude_is_drawn_with_the_right_signs(page: Browser) -> None:
     assert x > x_level  # nose right
 
 
-def test_the_rotation_is_the_euler_sequence_of_the_textbook(page: Browser) -> None:
+def test_rotation_is_euler_sequence_of_textbook(page: Browser) -> None:
     # Stevens, Lewis, Aircraft Control and Simulation, eq. (1.3-20), here as a product of plane rotations.
     phi, theta, psi = 0.7, -0.4, 2.1
 
@@ -417,7 +417,7 @@ def test_the_rotation_is_the_euler_sequence_of_the_textbook(page: Browser) -> No
     assert np.array(seen(page, f"m.rotation({phi}, {theta}, {psi})")) == pytest.approx(expected, abs=1e-12)
 
 
-def test_surfaces_deflect_in_the_sense_of_their_input(page: Browser) -> None:
+def test_surfaces_deflect_in_sense_of_input(page: Browser) -> None:
     # The trailing edges are the last points of a surface. Down is +z, right is +y.
     edges = "m.aircraft({%s}).filter(one => one.part === 'surface').map(one => one.points[2])"
     still = np.array(seen(page, edges % ""))
@@ -437,7 +437,7 @@ def test_surfaces_deflect_in_the_sense_of_their_input(page: Browser) -> None:
         ("jsbsim_c172p", {"elevator": -1, "aileron": 1, "rudder": -1}),  # positive is nose down, roll right, nose left
     ],
 )
-def test_a_surface_is_drawn_in_the_sense_that_its_aircraft_gives_the_input(
+def test_surface_drawn_in_sense_that_aircraft_gives_input(
     page: Browser, tmp_path: Path, scenario: str, senses: dict[str, int]
 ) -> None:
     truth = Signal(np.array([0], dtype=np.int64), tuple(f"actuator.{name}" for name in senses), np.full((1, 3), 0.1))
@@ -448,7 +448,7 @@ def test_a_surface_is_drawn_in_the_sense_that_its_aircraft_gives_the_input(
     assert {name: np.sign(angle) for name, angle in found.items()} == senses
 
 
-def test_the_horizon_falls_when_the_nose_rises_and_turns_left_in_a_roll_to_the_right(page: Browser) -> None:
+def test_horizon_falls_when_nose_rises_and_turns_left_in_roll_to_right(page: Browser) -> None:
     def sky(pose: str, x: float, y: float) -> bool:
         """Whether a point of the instrument shows the sky; x and y in fractions of its radius from its centre."""
         script = f"""import('./scene.js').then(m => {{
@@ -484,7 +484,7 @@ def test_a_zoomed_out_line_keeps_its_peaks(page: Browser) -> None:
     assert (largest, least) == (7, -5)
 
 
-def test_a_log_without_pose_shows_the_attitude_of_truth(browser: Browser, tape: Tape, tmp_path: Path) -> None:
+def test_log_without_pose_shows_attitude_of_truth(browser: Browser, tape: Tape, tmp_path: Path) -> None:
     stamps = np.arange(50, dtype=np.int64) * 20_000_000
     truth = Signal(stamps, ("t", "x.phi", "x.theta"), np.column_stack([stamps / 1e9, np.full(50, 0.5), np.full(50, -0.1)]))
     write_run(Tape({"truth": truth, "y": tape["y"]}), tmp_path / "run", LogAttachments())
@@ -499,7 +499,7 @@ def test_a_log_without_pose_shows_the_attitude_of_truth(browser: Browser, tape: 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb")
 
 
-def test_a_guided_flight_shows_its_route_and_its_modes(browser: Browser, tmp_path: Path) -> None:
+def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -> None:
     names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude")
     stamps = np.arange(200, dtype=np.int64) * 20_000_000
     guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0], (200, 1)))
@@ -537,7 +537,7 @@ SAID = """(() => {
 @pytest.mark.parametrize(
     ("names", "expected"), [(("phi", "theta", "climb"), []), (("climb",), ["NO ATTITUDE IN THE LOG", "NO ATTITUDE"])]
 )
-def test_the_pose_of_a_bridge_is_drawn_where_it_has_an_attitude(
+def test_pose_of_bridge_drawn_where_it_has_attitude(
     names: tuple[str, ...], expected: list[str], browser: Browser, tmp_path: Path
 ) -> None:
     stamps, values = np.arange(50, dtype=np.int64) * 20_000_000, {"phi": 0.5, "theta": -0.1, "climb": 2.0}
@@ -572,7 +572,7 @@ def take(browser: Browser, key: str = "abcd-efgh") -> None:
     browser.run("void document.getElementById('control-take').click()")
 
 
-def test_the_desk_has_the_parts_of_the_nodes_that_run(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+def test_desk_has_parts_of_nodes_that_run(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
     nodes, controls = NodesInMemory(osprey_gust, "controller"), list[Control]()
 
     with shown(browser, recorded, control=lambda flight: a_control(flight, nodes, controls)):
@@ -585,9 +585,7 @@ def test_the_desk_has_the_parts_of_the_nodes_that_run(browser: Browser, recorded
     controls[0].close()
 
 
-def test_the_desk_starts_from_the_faults_of_the_aircraft_and_keeps_them(
-    browser: Browser, recorded: Path, osprey_gust: Scenario
-) -> None:
+def test_desk_starts_from_faults_of_aircraft_and_keeps_them(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
     nodes, controls = NodesInMemory(osprey_gust, "aircraft"), list[Control]()
     nodes.values["aircraft"] |= {"actuators.stuck_at": [math.inf, 3.5, math.inf, math.inf], "sensors.dropout": 0.25}
 
@@ -607,7 +605,7 @@ def test_the_desk_starts_from_the_faults_of_the_aircraft_and_keeps_them(
     controls[0].close()
 
 
-def test_gains_are_pending_until_they_are_applied_and_can_be_undone(
+def test_gains_are_pending_until_they_applied_and_can_be_undone(
     browser: Browser, recorded: Path, osprey_gust: Scenario
 ) -> None:
     nodes = NodesInMemory(osprey_gust, "aircraft", "controller", "guidance")

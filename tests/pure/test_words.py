@@ -66,7 +66,6 @@ def docstring_words(tree: list[ast.AST]) -> list[str]:
     return re.findall(r"[a-z']+", " ".join(docstrings).lower())
 
 
-@pytest.mark.xfail(strict=True, reason="names of tests have 10 words in the median")
 def test_names_of_tests_are_short() -> None:
     functions = {
         name: [node.name for node in tree if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")]

@@ -22,7 +22,7 @@ def aileron(peer_node: Peer) -> list[float]:
     return [m.position[m.name.index("actuator.aileron")] for m in peer_node.received["truth"]]
 
 
-def test_u_that_times_out_is_held_then_ramped_to_trim_and_may_return(start_node: Start, peer_node: Peer) -> None:
+def test_u_that_times_out_held_then_ramped_to_trim_and_may_return(start_node: Start, peer_node: Peer) -> None:
     process = start_node("aircraft_sim", "-p", "max_age:=0.1", "-p", "hold:=0.1", "-p", "ramp:=0.2")
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
     peer_node.received["truth"].clear()
@@ -37,7 +37,7 @@ def test_u_that_times_out_is_held_then_ramped_to_trim_and_may_return(start_node:
     process.wait_for("receiving u from second")
 
 
-def test_a_u_older_than_the_age_limit_does_not_end_the_failsafe(start_node: Start, peer_node: Peer) -> None:
+def test_u_older_than_age_limit_does_not_end_failsafe(start_node: Start, peer_node: Peer) -> None:
     process = start_node("aircraft_sim", "-p", "max_age:=0.1", "-p", "hold:=0.0", "-p", "ramp:=0.0")
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.0])
@@ -52,7 +52,7 @@ def test_a_u_older_than_the_age_limit_does_not_end_the_failsafe(start_node: Star
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.02], each=lambda: command(peer_node, "first", 0.02))
 
 
-def test_a_second_controller_is_ignored_while_the_first_one_publishes(start_node: Start, peer_node: Peer) -> None:
+def test_second_controller_ignored_while_first_one_publishes(start_node: Start, peer_node: Peer) -> None:
     process = start_node("aircraft_sim")
     peer_node.until(lambda: aileron(peer_node)[-1:] == [0.01], each=lambda: command(peer_node, "first", 0.01))
 

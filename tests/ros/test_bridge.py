@@ -179,7 +179,7 @@ def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, float]:
     return ratios
 
 
-def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_releases_the_channels(
+def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channels(
     setup: BridgeSetup,
 ) -> None:
     assert CliRunner().invoke(app, ["check-signs", setup.map, "--scenario", str(SCENARIO)]).exit_code == 0
@@ -213,7 +213,7 @@ def test_the_unchanged_controller_tracks_through_the_map_and_when_killed_release
     setup.until_logged(restarted, "-> INACTIVE", HANG)  # so that its integrals do not wind up
 
 
-def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the_channels(setup: BridgeSetup) -> None:
+def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channels(setup: BridgeSetup) -> None:
     setup.change_map("silence", max_age=1e3)  # a delay of the host does not release them for the age of u
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
@@ -269,7 +269,7 @@ def test_pilot_override_stopped_autopilot_and_end_of_the_bridge_each_release_the
     assert not released
 
 
-def test_a_step_of_the_system_clock_leaves_the_engagement_and_its_release_as_they_are(
+def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
     setup: BridgeSetup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step, command = tmp_path / "step", partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
@@ -294,7 +294,7 @@ def test_a_step_of_the_system_clock_leaves_the_engagement_and_its_release_as_the
     assert all(map(math.isnan, setup.joys[-1].axes))
 
 
-def test_a_stopped_bridge_releases_the_channels_and_can_be_engaged_again(setup: BridgeSetup) -> None:
+def test_stopped_bridge_releases_channels_and_can_be_engaged_again(setup: BridgeSetup) -> None:
     command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
@@ -305,7 +305,7 @@ def test_a_stopped_bridge_releases_the_channels_and_can_be_engaged_again(setup: 
     setup.engage_while(command)
 
 
-def test_a_second_autopilot_and_a_lost_terminal_each_release_the_channels(setup: BridgeSetup) -> None:
+def test_second_autopilot_and_lost_terminal_each_release_channels(setup: BridgeSetup) -> None:
     command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
     setup.change_age_limits(1e3)  # a delay of the host does not release them before
     setup.autopilot()
@@ -323,7 +323,7 @@ def test_a_second_autopilot_and_a_lost_terminal_each_release_the_channels(setup:
     assert all(map(math.isnan, setup.joys[-1].axes))
 
 
-def test_an_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSetup, start: Start) -> None:
+def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSetup, start: Start) -> None:
     condition = {
         "topic": "/ap/mode",
         "type": "std_msgs/msg/UInt8",
@@ -357,7 +357,7 @@ def test_an_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: Bridg
     assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in bridge.lines)
 
 
-def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_time(setup: BridgeSetup) -> None:
+def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(setup: BridgeSetup) -> None:
     """The publisher of u stays alive and u returns: the age of u counts, not the presence of a publisher."""
     setup.autopilot()
     setup.change_map("silence", neutral=NEUTRAL)
@@ -395,7 +395,7 @@ def test_a_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_t
     assert sum("-> ENGAGED" in line for line in bridge.lines) == 1
 
 
-def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_be_sent(
+def test_bag_of_autopilot_played_into_dry_run_gives_y_and_what_would_be_sent(
     setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
     autopilot = setup.autopilot()
@@ -426,7 +426,7 @@ def test_a_bag_of_an_autopilot_played_into_a_dry_run_gives_its_y_and_what_would_
     assert not setup.joys
 
 
-def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
+def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json")
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
@@ -454,7 +454,7 @@ def test_rise_di_fly_starts_the_bridge_and_logs_the_autopilot_topics(setup: Brid
     assert not setup.joys
 
 
-def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_and_why(
+def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     setup: BridgeSetup, start: Start, tmp_path: Path
 ) -> None:
     setup.autopilot()
@@ -491,7 +491,7 @@ def test_the_controller_is_active_only_while_engaged_and_the_summary_says_when_a
     )
 
 
-def test_identify_excites_the_autopilot_and_writes_what_flies_it(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
+def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     # Roll alone, 11 s in place of 52 s for four inputs: the other axes of Joy are NaN, which leaves them at trim.
     content = yaml.safe_load(Path(setup.map).read_text(encoding="utf-8"))
     content |= {"instant": "p", "outputs": {"p": content["outputs"]["p"]}, "inputs": {"aileron": content["inputs"]["aileron"]}}
@@ -521,7 +521,7 @@ def test_identify_excites_the_autopilot_and_writes_what_flies_it(setup: BridgeSe
     assert check.exit_code == 0, check.output
 
 
-def test_a_flight_without_the_topics_of_its_autopilot_ends_with_the_sentence_of_the_bridge(
+def test_flight_without_topics_of_autopilot_ends_with_sentence_of_bridge(
     setup: BridgeSetup, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processes, "FIRST_Y", 3.0)  # in place of 20 s
@@ -537,14 +537,14 @@ def test_a_flight_without_the_topics_of_its_autopilot_ends_with_the_sentence_of_
     assert f"/ap/airspeed: /peer publishes {expected}" in flight.output
 
 
-def test_a_map_with_a_wrong_sign_is_refused(setup: BridgeSetup, start: Start) -> None:
+def test_map_with_wrong_sign_refused(setup: BridgeSetup, start: Start) -> None:
     setup.change_map("inputs", "elevator", sign=-1)
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send")
     assert flight.end() == 2
     assert "with the map ardupilot_2024 D of q and elevator is -1, the controller has +1" in flight.output
 
 
-def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
+def test_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSetup) -> None:
     setup.autopilot()
     setup.bridge()
     command = partial(setup.peer.command, 0.1, 0.1, 9.0, -0.1)
@@ -559,7 +559,7 @@ def test_a_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeS
     assert not setup.joys
 
 
-def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Start) -> None:
+def test_topic_of_another_version_is_error_that_names_both_types(start: Start) -> None:
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}")
     with peer(topics=()) as other:
         other.node.create_publisher(TwistStamped, "/ap/airspeed", 10)  # as an AP_DDS would whose type has changed
@@ -569,7 +569,7 @@ def test_a_topic_of_another_version_is_an_error_that_names_both_types(start: Sta
         bridge.wait_for("/ap/joy: /peer subscribes to sensor_msgs/msg/Imu, expected sensor_msgs/msg/Joy")
 
 
-def test_a_missing_message_package_ends_the_bridge_with_the_command_that_builds_it(start: Start, tmp_path: Path) -> None:
+def test_missing_message_package_ends_bridge_with_command_that_builds_it(start: Start, tmp_path: Path) -> None:
     absent = tmp_path / "absent.yaml"
     absent.write_text((LIBRARY / "px4.yaml").read_text(encoding="utf-8").replace("px4_msgs/", "absent_msgs/"), encoding="utf-8")
     bridge = start("autopilot_bridge.main", "--ros-args", "-p", f"map:={absent}")

@@ -65,7 +65,7 @@ class Page:
         return found
 
 
-def test_a_target_that_guidance_does_not_take_ends_at_once_when_it_is_cancelled(peer_node: Peer) -> None:
+def test_target_that_guidance_does_not_take_ends_at_once_when_it_cancelled(peer_node: Peer) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
         sent = worker.submit(client.send_target, {"phi": 0.1})
         guidance = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force
@@ -78,7 +78,7 @@ def test_a_target_that_guidance_does_not_take_ends_at_once_when_it_is_cancelled(
             sent.result()
 
 
-def test_a_flight_is_commanded_from_its_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:
+def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
     flight.wait_for_log(tmp_path / "runs", 50_000)
     run = next(path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink())

@@ -187,7 +187,7 @@ def test_stopped_controller_publishes_no_stale_u_and_re_engages_from_trim(start_
     assert (peer_node.u()[before] == 0.0).all()
 
 
-def test_an_overrun_of_the_controller_does_not_free_its_publisher_lock(start_node: Start, peer_node: Peer) -> None:
+def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, peer_node: Peer) -> None:
     process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=0.2")
     engage(peer_node)
 
@@ -217,7 +217,7 @@ def test_an_overrun_of_the_controller_does_not_free_its_publisher_lock(start_nod
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_malformed_sample_is_refused_counted_and_never_used(
+def test_malformed_sample_refused_counted_and_never_used(
     name: str, message: JointState, reason: str, start_node: Start, peer_node: Peer
 ) -> None:
     start_node("rise_di_controller", *LONG_MAX_AGE)
@@ -276,7 +276,7 @@ def test_saturation_limits_can_be_added_in_flight(start_node: Start, peer_node: 
         ({"k_gg": 1.0}, "undeclared parameter"),
     ],
 )
-def test_invalid_change_is_rejected_with_its_reason_and_has_no_effect(
+def test_invalid_change_rejected_with_reason_and_has_no_effect(
     changes: dict[str, Any], sentence: str, start_node: Start, peer_node: Peer
 ) -> None:
     start_node("rise_di_controller")
@@ -301,7 +301,7 @@ def test_waits_for_configure_and_activate_without_autostart(start_node: Start, p
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.INACTIVE, each=lambda: peer_node.send(0.01))
 
 
-def test_a_deactivated_controller_publishes_trim_but_a_standby_that_was_never_activated_nothing(
+def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activated_nothing(
     start_node: Start, peer_node: Peer
 ) -> None:
     """A bridge engages with a fresh u. Beside another controller the u of a standby would be a conflict."""
@@ -317,7 +317,7 @@ def test_a_deactivated_controller_publishes_trim_but_a_standby_that_was_never_ac
     assert peer_node.received["internals"] == []
 
 
-def test_a_controller_that_starts_inactive_publishes_trim_until_it_is_activated(start_node: Start, peer_node: Peer) -> None:
+def test_controller_that_starts_inactive_publishes_trim_until_it_activated(start_node: Start, peer_node: Peer) -> None:
     start_node("rise_di_controller", "-p", "start_active:=false")
     peer_node.until(lambda: len(peer_node.received["u"]) > 20, each=lambda: peer_node.send(0.01))
     assert peer_node.call(GetState, "controller/get_state", GetState.Request()).current_state.label == "inactive"
@@ -327,7 +327,7 @@ def test_a_controller_that_starts_inactive_publishes_trim_until_it_is_activated(
     engage(peer_node)
 
 
-def test_an_invalid_transition_is_refused_and_the_node_goes_on(start_node: Start, peer_node: Peer) -> None:
+def test_invalid_transition_refused_and_node_goes_on(start_node: Start, peer_node: Peer) -> None:
     process = start_node("rise_di_controller")
     engage(peer_node)
     client = peer_node.node.create_client(ChangeState, "controller/change_state")
@@ -339,7 +339,7 @@ def test_an_invalid_transition_is_refused_and_the_node_goes_on(start_node: Start
     wait_for_messages(peer_node, "u", 20, each=lambda: peer_node.send(0.01))
 
 
-def test_incompatible_type_and_quality_of_service_are_reported_with_the_peer(start_node: Start) -> None:
+def test_incompatible_type_and_quality_of_service_reported_with_peer(start_node: Start) -> None:
     with peer(topics=()) as peer_node:
         process = start_node("aircraft_sim")
         peer_node.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))

@@ -40,7 +40,7 @@ def is_engaged(folder: Path) -> bool:
     return any("ENGAGED" in log.read_text(encoding="utf-8") for log in folder.glob("runs/*/log/controller.log"))
 
 
-def test_interrupt_ends_all_processes_and_keeps_the_log(engaged: Engaged, tmp_path: Path) -> None:
+def test_interrupt_ends_all_processes_and_keeps_log(engaged: Engaged, tmp_path: Path) -> None:
     flight, nodes = engaged
     assert len(nodes) == 4
     flight.interrupt()
@@ -58,7 +58,7 @@ def test_interrupt_ends_all_processes_and_keeps_the_log(engaged: Engaged, tmp_pa
         assert "Traceback" not in log.read_text(encoding="utf-8")
 
 
-def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tmp_path: Path) -> None:
+def test_second_interrupt_does_not_interrupt_shutdown(engaged: Engaged, tmp_path: Path) -> None:
     flight, nodes = engaged
     flight.interrupt()
     flight.interrupt()
@@ -70,7 +70,7 @@ def test_a_second_interrupt_does_not_interrupt_the_shutdown(engaged: Engaged, tm
     assert read_run(next((tmp_path / "runs").glob("*-osprey_gust"))).tape.notes == ()  # the recorder closed its file
 
 
-def test_a_lost_terminal_ends_the_flight_with_its_log_and_report(tmp_path: Path) -> None:
+def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
     terminal, of_flight = pty.openpty()
     words = [*DEFAULT_SIGHUP, "setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
     flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
@@ -111,7 +111,7 @@ def test_two_flights_on_one_domain_do_not_mix(start: Start, engaged: Engaged) ->
     assert first.end() == 130
 
 
-def test_a_flight_in_one_process_with_a_wrong_sign_ends_when_it_diverges(
+def test_flight_in_one_process_with_wrong_sign_ends_when_it_diverges(
     start: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     wrong = tmp_path / "wrong.yaml"
@@ -122,7 +122,7 @@ def test_a_flight_in_one_process_with_a_wrong_sign_ends_when_it_diverges(
     assert "outcome: diverged at t = " in flight.output
 
 
-def test_a_killed_node_ends_the_flight_and_is_named(engaged: Engaged) -> None:
+def test_killed_node_ends_flight_and_named(engaged: Engaged) -> None:
     flight, nodes = engaged
     flight.child("rise_di_controller.main").kill()
     assert flight.end() == 3
@@ -130,7 +130,7 @@ def test_a_killed_node_ends_the_flight_and_is_named(engaged: Engaged) -> None:
     assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
 
 
-def test_nodes_end_when_the_command_itself_is_killed(engaged: Engaged, tmp_path: Path) -> None:
+def test_nodes_end_when_command_itself_killed(engaged: Engaged, tmp_path: Path) -> None:
     flight, nodes = engaged
     flight.popen.kill()
     assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
@@ -138,7 +138,7 @@ def test_nodes_end_when_the_command_itself_is_killed(engaged: Engaged, tmp_path:
     assert read_run(next((tmp_path / "runs").glob("*-osprey_gust"))).tape.notes == ()
 
 
-def test_a_process_under_test_ends_with_the_process_that_runs_the_tests() -> None:
+def test_process_under_test_ends_with_process_that_runs_tests() -> None:
     long = "Process('timeit', '-n', '1', 'import time; time.sleep(600)', cwd=Path())"
     program = f"from pathlib import Path; from tests.ros.conftest import Process; print({long}.popen.pid, flush=True)"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True) as tests:

@@ -66,7 +66,7 @@ def decode_or_reject(decoder: Decoder, raw: bytes) -> None:
 
 @many
 @given(payloads() | st.binary(max_size=120) | st.sampled_from(CORPUS))
-def test_any_payload_is_decoded_or_rejected_without_effect_on_the_next_one(raw: bytes) -> None:
+def test_any_payload_decoded_or_rejected_without_effect_on_next_one(raw: bytes) -> None:
     decoder = Decoder(NAMES)
     decode_or_reject(decoder, raw)
     good = Encoder(NAMES, "/aircraft#1").encode(7, np.array([1.0, 2.0, 3.0, 4.0]))
@@ -79,7 +79,7 @@ def test_any_payload_is_decoded_or_rejected_without_effect_on_the_next_one(raw: 
 
 @many
 @given(st.data())
-def test_any_payload_of_an_autopilots_topic_is_a_value_or_rejected(data: st.DataObject) -> None:
+def test_any_payload_of_autopilots_topic_is_value_or_rejected(data: st.DataObject) -> None:
     channel_map = named_map("ardupilot_2024")  # its message types are installed
     row = data.draw(st.sampled_from([*channel_map.outputs.values()]))
     kind: Any = message_type(row.type)

@@ -38,7 +38,7 @@ PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
 LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
-def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
+def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH)
     recorded = read_run(fly(start, scenario, "runs")).tape
     for name, signal in simulate(load_scenario(scenario)).signals.items():
@@ -48,7 +48,7 @@ def test_a_lockstep_flight_repeats_the_bytes_of_one_process(start: Start, tmp_pa
     assert len(recorded["u_m"].stamp_ns) == 100  # one at each instant but the first: y takes 10 ms
 
 
-def test_a_lockstep_flight_takes_a_target_and_ends_with_the_name_of_a_lost_guidance(start: Start, tmp_path: Path) -> None:
+def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(start: Start, tmp_path: Path) -> None:
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--runs", "runs")
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
     assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60").succeed().output
@@ -58,7 +58,7 @@ def test_a_lockstep_flight_takes_a_target_and_ends_with_the_name_of_a_lost_guida
     assert summary["outcome"] == "guidance was killed by SIGKILL"
 
 
-def test_guidance_alone_starts_from_the_parameters_of_a_run(start: Start, tmp_path: Path) -> None:
+def test_guidance_alone_starts_from_parameters_of_run(start: Start, tmp_path: Path) -> None:
     refused = start("flight_guidance.main", "--ros-args", "--params-file", str(find_scenario("osprey_route").path))
     assert refused.end() == 2
     assert "`parameters.yaml` of a run has them" in refused.output
@@ -122,7 +122,7 @@ def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     return made
 
 
-def test_there_is_no_command_before_the_controller_is_engaged(start: Start, peer_node: Peer, calm: Path) -> None:
+def test_there_is_no_command_before_controller_engaged(start: Start, peer_node: Peer, calm: Path) -> None:
     made = Flight(start, peer_node, calm)
     made.mode = ControllerMode.WAITING
 
@@ -138,7 +138,7 @@ def test_there_is_no_command_before_the_controller_is_engaged(start: Start, peer
     made.until(lambda: peer_node.received["u_m"])
 
 
-def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> None:
+def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:
     flight.until(lambda: flight.last("target.altitude") == 60.0, lambda: flight.target(heading=1.0, altitude=60.0))
     assert flight.last("mode.lateral") == Lateral.HEADING
     assert flight.last("mode.vertical") == Vertical.ALTITUDE
@@ -150,7 +150,7 @@ def test_targets_select_the_modes_and_bad_ones_are_refused(flight: Flight) -> No
     assert flight.last("target.heading") == 1.0
 
 
-def test_the_modes_of_a_second_controller_are_refused(flight: Flight) -> None:
+def test_modes_of_second_controller_refused(flight: Flight) -> None:
     def second() -> None:
         inactive = np.array([float(ControllerMode.INACTIVE)])
         flight.peer.publish("internals", to_message(time.time_ns(), ["mode"], inactive, "/standby#2"))
@@ -160,7 +160,7 @@ def test_the_modes_of_a_second_controller_are_refused(flight: Flight) -> None:
     assert flight.last("target.heading") == 1.0  # that of an INACTIVE controller is forgotten
 
 
-def test_a_route_to_a_stopped_guidance_ends_at_once_when_it_is_cancelled(flight: Flight) -> None:
+def test_route_to_stopped_guidance_ends_at_once_when_it_cancelled(flight: Flight) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker, flight.process.stopped():
         sent = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
         flight.until(lambda: flight.peer.node.count_publishers("route") == 1)
@@ -169,7 +169,7 @@ def test_a_route_to_a_stopped_guidance_ends_at_once_when_it_is_cancelled(flight:
             sent.result()
 
 
-def test_the_command_target_says_what_is_in_force_and_what_is_refused(flight: Flight, start: Start) -> None:
+def test_command_target_says_what_is_in_force_and_what_refused(flight: Flight, start: Start) -> None:
     good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
     flight.until(lambda: good.popen.poll() is not None)
     assert "in force: heading=90, altitude=60" in good.succeed().output
@@ -238,7 +238,7 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
 REFUSAL = "the controller is INACTIVE, expected ENGAGED"
 
 
-def test_a_route_is_flown_when_it_arrives_and_refused_when_it_cannot_be_flown(flight: Flight) -> None:
+def test_route_flown_when_it_arrives_and_refused_when_it_cannot_be_flown(flight: Flight) -> None:
     publisher = flight.peer.node.create_publisher(PathMessage, "route", PUBLISH)
 
     def route(*points: tuple[float, float, float]) -> PathMessage:
@@ -267,7 +267,7 @@ def pose_at(east: float, north: float, up: float) -> PoseStamped:
     return message
 
 
-def test_a_second_publisher_of_pose_is_refused_and_a_stale_pose_levels_the_wings(flight: Flight) -> None:
+def test_second_publisher_of_pose_refused_and_stale_pose_levels_wings(flight: Flight) -> None:
     flight.until(lambda: flight.peer.counted("refused pose: sender", 5), lambda: flight.send("/other#2"))
 
     def without_pose() -> None:

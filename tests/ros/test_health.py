@@ -20,7 +20,7 @@ def check(*names: str) -> tuple[int, str]:
     return result.returncode, result.stdout
 
 
-def test_a_running_node_is_healthy_and_a_suspended_or_missing_one_is_not(start_node: Start) -> None:
+def test_running_node_is_healthy_and_suspended_or_missing_one_is_not(start_node: Start) -> None:
     recorder = start_node("flight_recorder").wait_for("ready")
     assert check()[0] == 0
     status, output = check("recorder")

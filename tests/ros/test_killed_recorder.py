@@ -47,7 +47,7 @@ def missing_seconds(folder: Path, witness: PolledSubscription) -> float:
 
 
 @pytest.mark.usefixtures("publisher")
-def test_8_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
+def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Recorder, tmp_path: Path, peer_node: Peer) -> None:
     generator = np.random.default_rng(1)
     witness = PolledSubscription(peer_node.node, Y, NEWEST_SAMPLES, raw=True)
     missing = []
@@ -77,7 +77,7 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_a_second(recorder: Reco
     assert max(missing) < 0.3, missing
 
 
-def test_the_log_of_a_killed_recorder_is_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_log_of_killed_recorder_reported_and_repairable(start: Start, osprey_gust: Scenario, tmp_path: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(osprey_gust.path), "--duration", "30")
     flight.wait_for_log(tmp_path / "runs", 150_000)
     node = flight.child("flight_recorder.main")

@@ -79,9 +79,7 @@ def scenario_file(path: Path, controller: dict[str, Any] | None, name: str = "os
         ("osprey_turbulence", ["--lockstep"]),
     ],
 )
-def test_a_law_flies_in_lockstep_as_without_ros_and_is_replayed(
-    law: str, options: list[str], start: Start, tmp_path: Path
-) -> None:
+def test_law_flies_in_lockstep_as_without_ros_and_replayed(law: str, options: list[str], start: Start, tmp_path: Path) -> None:
     name = "osprey_servo" if law in SECTIONS else law
     scenario = scenario_file(tmp_path / f"{law}.yaml", SECTIONS.get(law), name)
     runs = []
@@ -112,7 +110,7 @@ def test_a_law_flies_in_lockstep_as_without_ros_and_is_replayed(
         ),
     ],
 )
-def test_a_controller_under_a_law_that_it_cannot_fly_ends_with_one_sentence(
+def test_controller_under_law_that_it_cannot_fly_ends_with_one_sentence(
     law: str, sentence: str, start: Start, tmp_path: Path
 ) -> None:
     scenario = scenario_file(tmp_path / "other.yaml", SECTIONS["pid"] | {"law": law})
@@ -122,7 +120,7 @@ def test_a_controller_under_a_law_that_it_cannot_fly_ends_with_one_sentence(
 
 
 @pytest.mark.usefixtures("_example")
-def test_the_node_names_its_law_and_takes_new_gains_of_it_in_flight(start: Start, peer_node: Peer, tmp_path: Path) -> None:
+def test_node_names_law_and_takes_new_gains_of_it_in_flight(start: Start, peer_node: Peer, tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     node = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario), "-p", "max_age:=5.0")
     engage(peer_node)

@@ -58,7 +58,7 @@ def osprey(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_second_publisher_and_a_command_beyond_its_bound_are_refused(osprey: Path, start: Start, peer_node: Peer) -> None:
+def test_second_publisher_and_command_beyond_bound_refused(osprey: Path, start: Start, peer_node: Peer) -> None:
     process = start("reference_model.main", "--ros-args", "--params-file", str(osprey))
     place = OUTPUTS.index("p")
 
@@ -81,7 +81,7 @@ def test_a_second_publisher_and_a_command_beyond_its_bound_are_refused(osprey: P
     assert min(rolls()) >= 0.0  # no roll to the left
 
 
-def test_in_lockstep_the_reference_waits_for_u_m_and_repeats_the_bytes_of_one_process(osprey: Path, start: Start) -> None:
+def test_in_lockstep_reference_waits_for_u_m_and_repeats_bytes_of_one_process(osprey: Path, start: Start) -> None:
     reference = Reference(load_scenario(osprey).reference_model)
     expected = [reference.sample(0)]
     for number in range(1, 31):  # 500 Hz; u_m at 50 Hz: at every tenth instant

@@ -68,7 +68,7 @@ def both_cores_busy() -> Iterator[None]:
             process.wait()
 
 
-def test_runs_repeat_to_the_byte_on_a_busy_host_in_one_process_and_without_ros(start: Start, tmp_path: Path) -> None:
+def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros(start: Start, tmp_path: Path) -> None:
     scenario = scenario_file(tmp_path, 1.0, aircraft=ROUGH)
     first = payloads(fly(start, scenario, "idle"))
     with both_cores_busy():
@@ -112,7 +112,7 @@ LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is a
 
 
 @pytest.mark.parametrize("victim", ["aircraft", "controller", "recorder"])  # the next test kills the reference model
-def test_other_nodes_end_within_three_seconds_of_a_kill_and_name_it(victim: str, start: Start, tmp_path: Path) -> None:
+def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(victim: str, start: Start, tmp_path: Path) -> None:
     processes = nodes(start, scenario_file(tmp_path, 1e6))
     processes["aircraft"].wait_for_log(tmp_path / "run", LOG_SIZE)
     processes[victim].popen.kill()
@@ -126,7 +126,7 @@ def test_other_nodes_end_within_three_seconds_of_a_kill_and_name_it(victim: str,
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) > 100
 
 
-def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start, tmp_path: Path) -> None:
+def test_killed_node_ends_flight_with_name_in_summary(start: Start, tmp_path: Path) -> None:
     command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5)), "--lockstep", "--runs", "runs")
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
     command.child("reference_model.main").kill()
@@ -135,7 +135,7 @@ def test_a_killed_node_ends_the_flight_with_its_name_in_the_summary(start: Start
     assert summary["outcome"] == "reference_model was killed by SIGKILL"
 
 
-def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: Start, tmp_path: Path) -> None:
+def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:
     wrong = {"D": [-1, 1, 1, 1]}
     scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)  # no saturation limits the wrong input
     command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
@@ -145,7 +145,7 @@ def test_a_diverged_aircraft_ends_the_flight_with_the_reason_and_a_log(start: St
     assert summary["duration"] > 1.0
 
 
-def test_a_node_that_waits_for_a_refused_sample_ends_with_the_reason(start_node: Start, peer_node: Peer) -> None:
+def test_node_that_waits_for_refused_sample_ends_with_reason(start_node: Start, peer_node: Peer) -> None:
     for sender in ("/controller", "/second"):  # for the first y and the next
         peer_node.command(0.0, 0.0, 0.0, 0.0, sender=sender)
     aircraft = start_node("aircraft_sim", "-p", "lockstep:=true", "-p", "control_rate:=100.0")

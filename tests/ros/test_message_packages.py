@@ -66,18 +66,18 @@ def build_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path / "build"
 
 
-def test_a_package_is_built_after_those_that_it_contains_messages_of(sources: Path) -> None:
+def test_package_built_after_those_that_it_contains_messages_of(sources: Path) -> None:
     assert in_order("plane_msgs", find_sources([sources])) == ["air_msgs", "plane_msgs"]
     assert in_order("plane_msgs", find_sources([sources / "plane"])) == ["plane_msgs"]  # air_msgs may be installed
 
 
-def test_an_installed_package_in_place_of_sources_is_one_sentence(sources: Path) -> None:
+def test_installed_package_in_place_of_sources_is_one_sentence(sources: Path) -> None:
     (sources / "air" / "air_msgs" / "CMakeLists.txt").unlink()
     with pytest.raises(MessagesError, match=r"SOURCE: found no CMakeLists\.txt in .*air_msgs, expected sources"):
         in_order("plane_msgs", find_sources([sources]))
 
 
-def test_a_part_of_a_package_holds_what_its_messages_contain(sources: Path) -> None:
+def test_part_of_package_holds_what_messages_contain(sources: Path) -> None:
     plane = sources / "plane" / "plane_msgs"
     assert closure("plane_msgs", plane, ["State"]) == {"State", "Mode"}
     assert closure("plane_msgs", plane, ["Arm"]) == {"Arm", "Mode"}
@@ -85,7 +85,7 @@ def test_a_part_of_a_package_holds_what_its_messages_contain(sources: Path) -> N
         closure("plane_msgs", plane, ["State", "Speed"])
 
 
-def test_a_package_that_is_not_among_the_sources_is_refused(sources: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_package_that_is_not_among_sources_refused(sources: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["px4_msgs", str(sources)]) == 2
     assert "PACKAGE: found px4_msgs, expected one of SOURCE: air_msgs, plane_msgs" in capsys.readouterr().err
     assert main(["px4_msgs", str(sources / "nowhere")]) == 2

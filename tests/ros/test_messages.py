@@ -28,7 +28,7 @@ def decoded(decoder: Decoder, raw: bytes) -> StampedVector:
 
 
 @given(NAMES, st.data(), STAMPS, st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20))
-def test_a_sample_is_encoded_as_an_independent_library_encodes_it(
+def test_sample_encoded_as_independent_library_encodes_it(
     names: list[str], data: st.DataObject, stamp_ns: int, frame_id: str
 ) -> None:
     values = data.draw(st.lists(st.floats(), min_size=len(names), max_size=len(names)))
@@ -45,7 +45,7 @@ def test_the_middleware_reads_what_was_encoded() -> None:
 
 
 @given(st.permutations(["q", "V", "p", "r"]), st.lists(st.floats(-1e9, 1e9), min_size=4, max_size=4), STAMPS)
-def test_wanted_channels_are_decoded_by_name_with_and_without_a_known_layout(
+def test_wanted_channels_decoded_by_name_with_and_without_known_layout(
     names: list[str], values: list[float], stamp_ns: int
 ) -> None:
     decoder, encoder = Decoder(("p", "V")), Encoder(names, "/aircraft#1")
@@ -55,14 +55,14 @@ def test_wanted_channels_are_decoded_by_name_with_and_without_a_known_layout(
         assert sample.value.tolist() == [values[names.index("p")], values[names.index("V")]]
 
 
-def test_a_decoder_follows_a_change_of_channel_names_or_publisher() -> None:
+def test_decoder_follows_change_of_channel_names_or_publisher() -> None:
     decoder = Decoder(("q",))
     for names, frame_id in ((("q", "V"), "a"), (("V", "q"), "a"), (("q",), "b"), (("q", "V"), "a")):
         sample = decoded(decoder, Encoder(names, frame_id).encode(5, np.array([float(name == "q") for name in names])))
         assert (sample.value.tolist(), sample.sender) == ([1.0], frame_id)
 
 
-def test_a_code_of_an_earlier_version_is_no_part_of_the_sender() -> None:
+def test_code_of_earlier_version_is_no_part_of_sender() -> None:
     decoder = Decoder(("q",))
     for code in ("0" * 32, "f" * 32):  # as `rise-di play` publishes a log with codes
         raw = Encoder(("q",), f"/aircraft#1;mac={code}").encode(5, np.array([1.0]))
@@ -70,7 +70,7 @@ def test_a_code_of_an_earlier_version_is_no_part_of_the_sender() -> None:
 
 
 @given(st.binary(max_size=100))
-def test_the_sender_of_any_bytes_is_a_text(raw: bytes) -> None:
+def test_sender_of_any_bytes_is_text(raw: bytes) -> None:
     assert isinstance(sender_of(raw), str)
 
 
@@ -93,7 +93,7 @@ def invalid_samples() -> list[tuple[str, bytes]]:
 
 @pytest.mark.parametrize(("reason", "raw"), invalid_samples())
 @pytest.mark.parametrize("known_layout", [False, True])
-def test_an_invalid_message_is_rejected_with_its_reason(reason: str, raw: bytes, known_layout: bool) -> None:
+def test_invalid_message_rejected_with_reason(reason: str, raw: bytes, known_layout: bool) -> None:
     decoder = Decoder(("q", "V"))
     if known_layout:
         decoder.decode(GOOD)
@@ -103,7 +103,7 @@ def test_an_invalid_message_is_rejected_with_its_reason(reason: str, raw: bytes,
     assert decoded(decoder, GOOD).value.tolist() == [1.0, 2.0]
 
 
-def test_a_message_with_velocities_is_read_by_its_positions() -> None:
+def test_message_with_velocities_read_by_positions() -> None:
     decoder, raw = Decoder(("q",)), vector(NANOSECONDS, ["q"], [3.0], "x", velocity=[9.0])
     for _ in range(2):
         assert decoded(decoder, raw).value.tolist() == [3.0]

@@ -29,7 +29,7 @@ def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, 
     return states
 
 
-def test_a_late_subscriber_gets_the_state_of_each_process(start_node: Start) -> None:
+def test_late_subscriber_gets_state_of_each_process(start_node: Start) -> None:
     packages = {"controller": "rise_di_controller", "aircraft": "aircraft_sim"}
     nodes = {name: start_node(package, "-r", "__ns:=/one") for name, package in packages.items()}
     for node in nodes.values():
@@ -41,7 +41,7 @@ def test_a_late_subscriber_gets_the_state_of_each_process(start_node: Start) -> 
         assert states == expected
 
 
-def test_the_aircraft_completes_a_lockstep_flight_and_the_process_has_its_id(
+def test_aircraft_completes_lockstep_flight_and_process_has_id(
     start_node: Start, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     short = osprey_gust.vary(flight={"duration": 0.2})
@@ -55,7 +55,7 @@ def test_the_aircraft_completes_a_lockstep_flight_and_the_process_has_its_id(
         peer_node.until(lambda: states == expected)
 
 
-def test_a_monitor_tells_a_node_from_one_of_another_flight(start_node: Start, osprey_gust: Scenario) -> None:
+def test_monitor_tells_node_from_one_of_another_flight(start_node: Start, osprey_gust: Scenario) -> None:
     node = start_node("rise_di_controller")
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
         pid = node.popen.pid
@@ -83,7 +83,7 @@ def start_stage(scenario: Scenario, run: Path) -> None:
         pass
 
 
-def test_a_log_line_does_not_start_a_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_log_line_does_not_start_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
     code = "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n"
     only_stage.write_text(code, encoding="utf-8")
     with pytest.raises(ParameterError, match="timed out waiting for controller: not ready after 3 s; see the logs in "):
@@ -91,7 +91,7 @@ def test_a_log_line_does_not_start_a_flight(only_stage: Path, osprey_gust: Scena
     assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
 
 
-def test_a_process_ending_while_others_wait_is_named_at_once(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+def test_process_ending_while_others_wait_named_at_once(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
     only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8")
     begin = time.monotonic()
     with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
@@ -99,9 +99,7 @@ def test_a_process_ending_while_others_wait_is_named_at_once(only_stage: Path, o
     assert time.monotonic() - begin < 2.5  # READY_TIMEOUT is 3 s
 
 
-def test_a_process_that_ends_is_named_with_its_fatal_line_not_its_last_one(
-    only_stage: Path, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_process_that_ends_named_with_fatal_line_not_last_one(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
     lines = "[FATAL] [1.0] [controller]: lost contact with aircraft", "[INFO] [1.1] [controller]: 3 messages in run"
     only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"):
@@ -119,7 +117,7 @@ LOSES_CONTACT = "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with 
     ],
     ids=("killed", "diverged"),
 )
-def test_the_cause_is_named_when_the_recorder_that_lost_contact_has_ended_too(
+def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
     end: str, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
@@ -135,7 +133,7 @@ def test_the_cause_is_named_when_the_recorder_that_lost_contact_has_ended_too(
         flight.stop()
 
 
-def test_the_state_of_a_node_in_another_flight_does_not_start_this_one(
+def test_state_of_node_in_another_flight_does_not_start_this_one(
     start_node: Start, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
 ) -> None:
     other = start_node("rise_di_controller").wait_for("ready")
@@ -158,7 +156,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize("executable", ["recorder", "one_process"])
-def test_the_process_that_closes_the_log_has_time_for_it(
+def test_process_that_closes_log_has_time_for_it(
     executable: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, peer_node: Peer
 ) -> None:
     only_stage.write_text(CLOSES_SLOWLY, encoding="utf-8")

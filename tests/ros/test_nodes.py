@@ -29,7 +29,7 @@ NODES = {
 
 
 @pytest.mark.parametrize("package", NODES)
-def test_a_node_without_parameters_names_the_missing_one_and_ends_with_status_2(package: str, start: Start) -> None:
+def test_node_without_parameters_names_missing_one_and_ends_with_status_2(package: str, start: Start) -> None:
     node = start(f"{package}.main")
     assert node.end() == 2
     assert len(node.lines) == 1
@@ -56,7 +56,7 @@ def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: st
 
 @pytest.mark.parametrize(("package", "waits_for"), [("rise_di_controller", "/y"), ("aircraft_sim", "/u")])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
+def test_node_without_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
     package: str, waits_for: str, number: signal.Signals, start_node: Start
 ) -> None:
     node = start_node(package).wait_for(f"waiting for {waits_for}: no publisher")
@@ -67,7 +67,7 @@ def test_a_node_without_a_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_node_stopped_during_its_start_shuts_down_cleanly(number: signal.Signals, start_node: Start, peer_node: Peer) -> None:
+def test_node_stopped_during_start_shuts_down_cleanly(number: signal.Signals, start_node: Start, peer_node: Peer) -> None:
     node = start_node("rise_di_controller")
     early_participant = f"_start_{node.popen.pid}"
     # The start may be faster than the discovery.
@@ -77,12 +77,12 @@ def test_a_node_stopped_during_its_start_shuts_down_cleanly(number: signal.Signa
     assert "Traceback" not in node.output
 
 
-def test_the_early_participant_is_destroyed_once_the_node_exists(start_node: Start, peer_node: Peer) -> None:
+def test_early_participant_destroyed_once_node_exists(start_node: Start, peer_node: Peer) -> None:
     start_node("rise_di_controller").wait_for("ready")
     peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
 
 
-def test_no_module_is_imported_by_a_ready_node(start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer) -> None:
+def test_no_module_imported_by_ready_node(start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer) -> None:
     # A library function that imports modules at its first call would do so inside a tick.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
     nodes = [start_node(package) for package in NODES]
@@ -96,7 +96,7 @@ def test_no_module_is_imported_by_a_ready_node(start_node: Start, monkeypatch: p
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
 
 
-def test_requests_whose_replies_do_not_arrive_leave_the_controller_its_ticks(start_node: Start, peer_node: Peer) -> None:
+def test_requests_whose_replies_do_not_arrive_leave_controller_ticks(start_node: Start, peer_node: Peer) -> None:
     """The middleware blocks for 0.1 s before a reply whose reader does not match: here one that requires another durability."""
     node = start_node("rise_di_controller").wait_for("ready")
     unmatched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -110,7 +110,7 @@ def test_requests_whose_replies_do_not_arrive_leave_the_controller_its_ticks(sta
     assert np.diff(changes()).min() > 0.9  # s; without a pause 0.11
 
 
-def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start_node: Start) -> None:
+def test_burst_of_signals_ends_node_as_one_signal_does(start_node: Start) -> None:
     # A lock in the signal handler would deadlock here: the second signal interrupts the first handler.
     node = start_node("aircraft_sim").wait_for("waiting for /u")
     for _ in range(50):
@@ -119,7 +119,7 @@ def test_a_burst_of_signals_ends_a_node_as_one_signal_does(start_node: Start) ->
     assert node.end(5.0) == 0
 
 
-def test_a_missing_transport_profile_is_an_error_before_the_start(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_transport_profile_is_error_before_start(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/nowhere/profile.xml")
     node = start("aircraft_sim.main")
     assert node.end() == 2
@@ -127,13 +127,13 @@ def test_a_missing_transport_profile_is_an_error_before_the_start(start: Start, 
 
 
 @pytest.mark.parametrize("package", ["aircraft_sim", "reference_model"])
-def test_a_start_time_in_the_past_is_an_error(package: str, start_node: Start) -> None:
+def test_start_time_in_past_is_error(package: str, start_node: Start) -> None:
     node = start_node(package, "-p", "start_time:=1000000.0")
     assert node.end() == 2
     assert any("start_time: found an instant" in line for line in node.lines)
 
 
-def test_a_recorder_that_cannot_write_names_the_folder(start_node: Start) -> None:
+def test_recorder_that_cannot_write_names_folder(start_node: Start) -> None:
     node = start_node("flight_recorder", "-p", "directory:=/proc/nowhere")
     assert node.end() == 2
     assert "recorder.directory: /proc/nowhere cannot be written" in node.output
@@ -142,7 +142,7 @@ def test_a_recorder_that_cannot_write_names_the_folder(start_node: Start) -> Non
 @pytest.mark.parametrize(
     ("package", "priority"), [("reference_model", 50), ("rise_di_controller", 49), ("flight_recorder", 47)]
 )
-def test_a_node_of_a_longer_period_has_a_lower_real_time_priority(package: str, priority: int, start_node: Start) -> None:
+def test_node_of_longer_period_has_lower_real_time_priority(package: str, priority: int, start_node: Start) -> None:
     node = start_node(package, within=with_policy("--fifo", "50")).wait_for("ready")
     assert {os.sched_getparam(thread.id).sched_priority for thread in psutil.Process(node.popen.pid).threads()} == {priority}
     node.interrupt().succeed()

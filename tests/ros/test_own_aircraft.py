@@ -20,9 +20,7 @@ def pitch_rate(message: JointState) -> float:
     return float(message.position[message.name.index("q")])
 
 
-def test_the_aircraft_of_the_page_tracks_the_reference_model(
-    start: Start, start_node: Start, peer_node: Peer, tmp_path: Path
-) -> None:
+def test_aircraft_of_page_tracks_reference_model(start: Start, start_node: Start, peer_node: Peer, tmp_path: Path) -> None:
     (program,) = re.findall(
         r"^```python\n(.*?)^```$", (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     )

@@ -47,7 +47,7 @@ def of(run: Path, topic: str) -> list[bytes]:
     return [message.data for message in read_playback(run, [topic]).messages]
 
 
-def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path, start: Start, peer_node: Peer) -> None:
+def test_flight_played_byte_by_byte_with_timing_and_clock(run: Path, start: Start, peer_node: Peer) -> None:
     receiving = Receiver(peer_node.node, Y, Y_M, CLOCK)
     process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m", "--stamps", "recorded", "--rate", "2")
     receiving.until(Y, 1001)
@@ -63,7 +63,7 @@ def test_a_flight_is_played_byte_by_byte_with_its_timing_and_its_clock(run: Path
     assert np.median(np.abs(late)) < 0.02
 
 
-def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, start: Start, peer_node: Peer) -> None:
+def test_stamps_moved_to_now_and_all_other_bytes_unchanged(run: Path, start: Start, peer_node: Peer) -> None:
     receiving = Receiver(peer_node.node, Y)
     process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
     receiving.until(Y, 251)
@@ -75,7 +75,7 @@ def test_stamps_are_moved_to_now_and_all_other_bytes_are_unchanged(run: Path, st
     assert received == recorded
 
 
-def test_a_domain_with_a_publisher_of_the_topic_is_an_error(run: Path, start: Start, domain: int, peer_node: Peer) -> None:
+def test_domain_with_publisher_of_topic_is_error(run: Path, start: Start, domain: int, peer_node: Peer) -> None:
     peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
     process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
     assert process.end() == 2
@@ -97,7 +97,7 @@ def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start, peer_no
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
-def test_a_controller_reproduces_a_flight_to_the_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
+def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(tmp_path))
     flight.succeed(120)
     recorded = tmp_path / "latest"
@@ -112,7 +112,7 @@ def test_a_controller_reproduces_a_flight_to_the_byte(start: Start, start_node: 
     assert receiving.received["internals"] == internals
 
 
-def test_a_controller_in_real_time_follows_a_recorded_flight(run: Path, start: Start, start_node: Start) -> None:
+def test_controller_in_real_time_follows_recorded_flight(run: Path, start: Start, start_node: Start) -> None:
     with peer() as peer_node:
         node = start_node("rise_di_controller").wait_for("ready")
         process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")

@@ -88,7 +88,7 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 
-def test_the_policy_allows_exactly_the_topics_and_services_of_nodes(start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
+def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
     processes = [start_node(package) for package in packages]
     for process in processes:
@@ -117,12 +117,12 @@ def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Pat
     assert found == allowed()["guidance"]
 
 
-def test_the_policy_allows_exactly_those_of_the_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_policy_allows_exactly_those_of_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
         assert discovered(peer_node, ("monitor",))["monitor"] == allowed()["monitor"]
 
 
-def test_the_policy_allows_exactly_those_of_the_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
+def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
     maps = [named_map(name) for name in MAP_FILES]
     used = [row for channel_map in maps for row in channel_map.used_topics()]
     published = {topic for key, topic, _ in used if key.startswith("messages.")}
@@ -141,7 +141,7 @@ def test_the_policy_allows_no_wildcard() -> None:
 
 
 @pytest.mark.parametrize("node", allowed())
-def test_the_policy_allows_no_service_request_but_those_of_the_bridge_to_the_controller(node: str) -> None:
+def test_policy_allows_no_service_request_but_those_of_bridge_to_controller(node: str) -> None:
     """The controller is active only while the bridge is engaged."""
     assert allowed()[node].request == (
         frozenset({"/controller/change_state", "/controller/get_state"}) if node == "bridge" else frozenset()

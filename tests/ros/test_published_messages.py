@@ -134,7 +134,7 @@ class Px4:
         return int(self._status.nav_state)
 
 
-def test_a_bridge_flies_px4_in_offboard_and_returns_it_to_hold(start: Start) -> None:
+def test_bridge_flies_px4_in_offboard_and_returns_it_to_hold(start: Start) -> None:
     """Heartbeats from the request on, setpoints in offboard; a release ends both and requests Hold."""
     needs("px4_msgs")
     start("autopilot_bridge.main", "--ros-args", "-p", "map:=px4", "-p", "dry_run:=false").wait_for("ready")

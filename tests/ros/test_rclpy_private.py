@@ -36,7 +36,7 @@ def has_private_names(path: Path) -> bool:
     return any(name.startswith("rclpy.impl") or (name.startswith("rclpy") and reads_handle) for name in modules)
 
 
-def test_a_serialised_message_is_taken_without_an_executor(peer_node: Peer) -> None:
+def test_serialised_message_taken_without_executor(peer_node: Peer) -> None:
     context = peer_node.node.context
     subscription = peer_node.node.create_subscription(Int64, "number", lambda _: None, QoSProfile(depth=10), raw=True)
     publish = peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)).publish
@@ -49,19 +49,19 @@ def test_a_serialised_message_is_taken_without_an_executor(peer_node: Peer) -> N
     assert information["source_timestamp"] <= information["received_timestamp"]
 
 
-def test_bytes_that_are_no_message_raise_the_error_that_the_nodes_catch() -> None:
+def test_bytes_that_are_no_message_raise_error_that_nodes_catch() -> None:
     with pytest.raises(rclpy_private.DeserializationError):
         deserialize_message(b"\x00", Int64)
 
 
-def test_a_participant_is_in_the_graph_until_it_is_destroyed(peer_node: Peer) -> None:
+def test_participant_is_in_graph_until_it_destroyed(peer_node: Peer) -> None:
     participant = rclpy_private.create_participant("_early", peer_node.node.context)
     peer_node.until(lambda: "_early" in peer_node.node.get_node_names())
     rclpy_private.destroy_participant(participant)
     peer_node.until(lambda: "_early" not in peer_node.node.get_node_names())
 
 
-def test_a_ready_callback_is_executed_and_raises_what_it_raises(peer_node: Peer) -> None:
+def test_ready_callback_executed_and_raises_what_it_raises(peer_node: Peer) -> None:
     context: Context = peer_node.node.context
     node = Node("served", context=context)
     executor = SingleThreadedExecutor(context=context)

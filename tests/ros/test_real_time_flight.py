@@ -49,7 +49,7 @@ def rms(error: FloatArray) -> FloatArray:
     return figures
 
 
-def test_flight_over_topics_is_recorded_and_as_accurate_as_in_one_process(
+def test_flight_over_topics_recorded_and_as_accurate_as_in_one_process(
     start: Start, short_scenario: Path, tmp_path: Path
 ) -> None:
     scenario = load_scenario(short_scenario)

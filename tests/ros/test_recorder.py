@@ -69,7 +69,7 @@ def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node:
     assert [one.name for event in events for one in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
 
 
-def test_further_topics_are_recorded_with_any_offered_qos(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+def test_further_topics_recorded_with_any_offered_qos(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     latched = peer_node.node.create_publisher(String, "/latched", LATCHED)
     latched.publish(String(data="before"))
     process = recorder("run", "topics:=[/latched, relative/pressure, /late, /y]")
@@ -87,7 +87,7 @@ def test_further_topics_are_recorded_with_any_offered_qos(recorder: Recorder, pe
     assert errors(process) == []
 
 
-def test_a_later_publisher_with_a_weaker_qos_is_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+def test_later_publisher_with_weaker_qos_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
     strong.publish(String(data="strong"))
     process = recorder("run", "topics:=[/mixed]")
@@ -109,7 +109,7 @@ def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Pee
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
 
 
-def test_a_flight_of_which_a_part_is_recorded_is_no_silent_failure(recorder: Recorder, peer_node: Peer) -> None:
+def test_flight_of_which_part_recorded_is_no_silent_failure(recorder: Recorder, peer_node: Peer) -> None:
     process = recorder("run").wait_for("ready")
 
     def send() -> None:
@@ -119,7 +119,7 @@ def test_a_flight_of_which_a_part_is_recorded_is_no_silent_failure(recorder: Rec
     assert "waiting for /y:" not in process.output
 
 
-def test_a_flight_that_falls_silent_is_named_each_time(recorder: Recorder, peer_node: Peer) -> None:
+def test_flight_that_falls_silent_named_each_time(recorder: Recorder, peer_node: Peer) -> None:
     process = recorder("run").wait_for("ready")
 
     def silences() -> int:
@@ -138,7 +138,7 @@ def test_a_flight_that_falls_silent_is_named_each_time(recorder: Recorder, peer_
     pause(2)
 
 
-def test_a_topic_whose_type_is_not_installed_is_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+def test_topic_whose_type_is_not_installed_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()
     (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
@@ -191,7 +191,7 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
     assert f"/truth: the recorder lost {lost} messages" in run.tape.notes
 
 
-def test_a_second_publisher_of_a_topic_is_no_loss(recorder: Recorder, peer_node: Peer) -> None:
+def test_second_publisher_of_topic_is_no_loss(recorder: Recorder, peer_node: Peer) -> None:
     process = recorder("run")
     process.wait_for("ready")
     publishers = [peer_node.node.create_publisher(JointState, "y", PUBLISH) for _ in range(2)]
@@ -219,7 +219,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     ("least", "reason"),
     [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
 )
-def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
+def test_full_disk_ends_recording_with_one_error_and_not_flight(
     least: str, reason: str, recorder: Recorder, peer_node: Peer, disk: Path
 ) -> None:
     process = recorder(disk / "run", f"min_free:={least}", "lockstep:=true")
@@ -239,7 +239,7 @@ def test_a_full_disk_ends_the_recording_with_one_error_and_not_the_flight(
     assert read_run(disk / "run").tape.notes == ()
 
 
-def test_too_little_space_at_the_start_is_rejected(recorder: Recorder, disk: Path) -> None:
+def test_too_little_space_at_start_rejected(recorder: Recorder, disk: Path) -> None:
     process = recorder(disk / "run")
     assert process.end() == 2
     sentence = r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB"
@@ -247,5 +247,5 @@ def test_too_little_space_at_the_start_is_rejected(recorder: Recorder, disk: Pat
 
 
 @pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
-def test_a_publisher_keeps_a_history_of_two_seconds_for_a_recorder(rate: float, depth: int) -> None:
+def test_publisher_keeps_history_of_two_seconds_for_recorder(rate: float, depth: int) -> None:
     assert publisher_qos(period_ns(rate, "rate")).depth == depth

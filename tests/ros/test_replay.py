@@ -52,7 +52,7 @@ def with_limits(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("options", [("--lockstep",), ("--one-process",)])
-def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
+def test_lockstep_with_feedforward_saturation_and_lost_samples_replayed(
     options: tuple[str, ...], start: Start, tmp_path: Path
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH))), *options)
@@ -66,7 +66,7 @@ def test_lockstep_with_feedforward_saturation_and_lost_samples_is_replayed(
     assert log.group("u_ff").values.any()
 
 
-def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_busy_host(
+def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_host(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
@@ -99,7 +99,7 @@ def test_a_flight_in_real_time_is_replayed_with_parameter_changes_outages_and_a_
     assert replayed(start, run, "--set", "controller.k_g=1.0000000000000002", status=1)["open_loop"]
 
 
-def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) -> None:
+def test_log_of_killed_recorder_replayed(start: Start, tmp_path: Path) -> None:
     flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 30.0, "osprey_gust")), "--lockstep")
     flight.wait_for_log(tmp_path, 200_000)
     flight.child("flight_recorder.main").kill()
@@ -109,7 +109,7 @@ def test_the_log_of_a_killed_recorder_is_replayed(start: Start, tmp_path: Path) 
     assert any("is truncated" in note for note in output["notes"])
 
 
-def test_a_late_recorder_leaves_its_first_tick_unchecked_and_notes_the_missing_samples(
+def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     start: Start, tmp_path: Path, peer_node: Peer
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")

@@ -54,14 +54,14 @@ def received(attacker: Process) -> int:
     return int(json.loads(attacker.lines[-1])["received"])
 
 
-def test_a_process_of_this_host_receives_y_and_commands_u(start: Start, start_node: Start) -> None:
+def test_process_of_this_host_receives_y_and_commands_u(start: Start, start_node: Start) -> None:
     node = aircraft(start_node)
     assert received(start("tests.ros.attacker", "30", within=ON_LOOPBACK)) > 0
     node.wait_for("receiving u from /controller#1")
     assert "sample refused" not in node.output
 
 
-def test_a_replayed_u_is_refused_by_its_stamp(start_node: Start, peer_node: Peer) -> None:
+def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None:
     """Also by a restarted aircraft, which has no memory of the last stamp."""
     first = aircraft(start_node, "-p", "max_age:=0.1")
     publisher = peer_node.node.create_publisher(U.type, U.name, 10)
@@ -143,7 +143,7 @@ class EarlierProcess(psutil.Process):
 
 
 @pytest.mark.parametrize("process", [psutil.Process, EarlierProcess])
-def test_a_socket_on_all_interfaces_is_found_in_spite_of_the_loopback_profile(
+def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
     process: type[psutil.Process], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(psutil, "Process", process)
@@ -244,7 +244,7 @@ def test_by_default_another_host_neither_receives_y_nor_commands_u(
     assert "sample refused" not in node.output  # no sample has arrived
 
 
-def test_with_a_network_profile_another_host_receives_y_and_commands_u(
+def test_with_network_profile_another_host_receives_y_and_commands_u(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
     node = aircraft(start_node, within=(*hosts.first, *on_network))

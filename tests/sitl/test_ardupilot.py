@@ -39,7 +39,7 @@ def engaged(plane: ArduPlane, duration: float) -> AbstractContextManager[Process
     return plane.engaged(SCENARIO.path, map_of(plane), duration)
 
 
-def test_a_dry_run_measures_what_the_autopilot_logs(plane: ArduPlane) -> None:
+def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     """In turns and climbs rates and pose are those of its own log: slopes of 1 within 1 %, and V its airspeed within 5 %.
 
     V is the airspeed of its estimator, VFR_HUD that of the sensor, an equivalent one. In the autopilot they differ by 3 %.
@@ -90,7 +90,7 @@ def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
     plane.start("replay", str(plane.run)).succeed()
 
 
-def test_turbulence_moves_the_aircraft_as_much_as_under_the_autopilots_own_law(plane: ArduPlane) -> None:
+def test_turbulence_moves_aircraft_as_much_as_under_autopilots_own_law(plane: ArduPlane) -> None:
     """The rms of q while engaged is at most twice that in GUIDED just before, by the autopilot's log; the envelope may end it.
 
     SIM_WIND_TURB 2 moves q by 0.4 rad/s in GUIDED, far more than a command: an error would tell of the wind. The rms of 8 s
@@ -204,7 +204,7 @@ EVENTS = {
 }
 
 
-def test_sticks_that_the_bridge_overrides_do_not_show_and_do_not_act_before_the_release(plane: ArduPlane) -> None:
+def test_sticks_that_bridge_overrides_do_not_show_and_do_not_act_before_release(plane: ArduPlane) -> None:
     """The autopilot shows Joy in channels 1 to 4, so that an override by a stick of these would act on the law's own u."""
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
@@ -257,7 +257,7 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
     pytest.fail("the sticks do not act")
 
 
-def test_an_overloaded_machine_leaves_the_aircraft_to_the_law_or_to_the_pilot(plane: ArduPlane) -> None:
+def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane) -> None:
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a release acts at once."""
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))

@@ -30,7 +30,7 @@ def engaged(px4: Px4, duration: float) -> AbstractContextManager[Process]:
     return px4.engaged(SCENARIO.path, OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml")), duration)
 
 
-def test_an_engaged_flight_tracks_its_commands_in_offboard(px4: Px4) -> None:
+def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
     """The part of y that goes along with y_m has half to one and a half of its size, thrust is off its limits, ticks replay.
 
     The noise of its gyro is larger than the commands: rms 50 mrad/s in q and 104 in p, in Hold too. The part is uncertain
@@ -148,7 +148,7 @@ def test_px4_flies_by_its_own_law_again(px4: Px4, name: str, record_testsuite_pr
     assert event.reason in f"{one['reason']}; {summary['outcome']}"
 
 
-def test_an_overloaded_machine_leaves_the_airplane_to_the_law_or_to_px4(px4: Px4) -> None:
+def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4 flies in Hold."""
     with engaged(px4, 60.0) as flight:
         for one in burn(3.0):

@@ -64,7 +64,7 @@ def test_fault_is_detected_contained_and_recovered_from(
         record(row | flight.measured)
 
 
-def test_random_faults_are_detected_contained_and_recovered_from(
+def test_random_faults_detected_contained_and_recovered_from(
     flights: Flights, draws: Sequence[Draw], record: Callable[[Row], None]
 ) -> None:
     """Of two at a time: each is detected by the node that should, no process ends, and the flight is steady again."""
