@@ -30,9 +30,9 @@ from benchmarks import sampling
 from rich.console import Console
 from rich.progress import track
 
+from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import law_order
 from flight_analysis.metrics import ErrorMetrics, error_metrics
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario

@@ -8,6 +8,7 @@ import math
 from collections import deque
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -64,7 +65,7 @@ def names(conditions: tuple[Condition, ...], channels: tuple[str, ...]) -> list[
     return [one.name if one.channel is None else f"{one.name} of {channels[one.channel]}" for one in conditions]
 
 
-def failing_in_loop(assessment: GainAssessment) -> list[str]:
+def failing_in_loop(assessment: GainAssessment[Any]) -> list[str]:
     return names(gain_conditions.failing(assessment.loop), assessment.controller.outputs)
 
 
@@ -441,7 +442,7 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
 
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     literal = find_scenario("osprey_servo").vary(controller={"sign": "literal"})
-    answer: GainAssessment = selection.check_gains(literal, osprey)
+    answer: GainAssessment[Any] = selection.check_gains(literal, osprey)
     assert answer.delay_margin is None
     with pytest.raises(ParameterError, match=r"^sign: found literal, expected soft or implicit"):
         linear_law(literal.controller.tuned_law(), 4, 0.01)

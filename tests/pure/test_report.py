@@ -35,6 +35,7 @@ from rise_di_controller.internals import Saturation
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
+OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")  # headings on every page with a linear loop
 DEG = np.pi / 180.0
 
 
@@ -108,23 +109,24 @@ def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, co
         "Spectrum of u",
         "Ticks of the controller",
         "Timing of the ticks",
+        *OF_LOOP,
     ]
 
 
 def test_log_of_only_y_and_reference_has_report(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight())
-    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
+    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m", *OF_LOOP]
     assert "Events" not in page
 
 
 def test_pose_without_attitude_has_no_replay(tmp_path: Path, servo: Scenario) -> None:
     page = page_of(tmp_path, servo, flight(pose=held(101, climb=1.0)))
-    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m"]
+    assert headings(page) == ["Output y over the reference y_m", "Tracking error e = y - y_m", *OF_LOOP]
 
 
 def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> None:
     one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
-    assert len(headings(page_of(tmp_path, servo, one))) == 5  # y, e, u, states, integrals: no wind, no late tick
+    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(OF_LOOP)  # y, e, u, states, integrals: no wind, no late tick
 
 
 def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
@@ -160,7 +162,7 @@ def test_every_colour_of_page_has_dark_counterpart(tmp_path: Path, servo: Scenar
     shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
     specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete))
     used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
-    assert used - shared <= set(plotting.DARK | figures.DARK)
+    assert used - shared <= set(plotting.DARK | figures.DARK | comparison.DARK)
     assert len(used) > 5
 
 

@@ -14,8 +14,9 @@ import pytest
 from tests.view_link import InTheAir, NodesInMemory
 from tornado.httpclient import AsyncHTTPClient, HTTPResponse
 
+from flight_analysis.closed_loop.margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import check_gains, manoeuvre, margins, study_airframe
+from flight_analysis.design.gain_selection import check_gains, manoeuvre, study_airframe
 from flight_bringup.scenarios import find_scenario
 from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
 from flight_view.server import Server
@@ -34,7 +35,7 @@ class Desk:
         self.time = 0.0
         self.flight, self.nodes = InTheAir(run), NodesInMemory(scenario, *(names or ALL), dry_run=dry_run)
         self.flight.update()
-        self.control = Control(self.flight, self.nodes, KEY, real=real, assess=margins, now=lambda: self.time)
+        self.control = Control(self.flight, self.nodes, KEY, real=real, assess=delay_margins, now=lambda: self.time)
         self.lease = ""
 
     async def ask(self, do: str, key: str = KEY, lease: str | None = None, **request: Any) -> dict[str, Any]:

@@ -17,9 +17,9 @@ from tests.browser import CHROMIUM, Browser
 from tests.joint_states import JOINT_STATE, vector
 from tests.view_link import NodesInMemory, in_the_air
 
+from flight_analysis.closed_loop.margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import margins
 from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
@@ -561,7 +561,7 @@ def test_pose_of_bridge_drawn_where_it_has_attitude(
 
 def a_control(flight: Flight, nodes: NodesInMemory, controls: list[Control]) -> Control:
     """A control of nodes in memory; kept, so that a test can close it."""
-    controls.append(Control(in_the_air(flight), nodes, "ABCD-EFGH", assess=margins))
+    controls.append(Control(in_the_air(flight), nodes, "ABCD-EFGH", assess=delay_margins))
     return controls[-1]
 
 

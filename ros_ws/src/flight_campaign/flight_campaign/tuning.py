@@ -16,8 +16,9 @@ from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
+from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import law_order, with_feedforward
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
 from flight_analysis.design.observer_selection import integrator_model
 from flight_campaign import fleet, statistics

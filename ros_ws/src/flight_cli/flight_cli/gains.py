@@ -8,13 +8,16 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Study
+from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_cli.output import new_table, options, parse_numbers, print_json, write_text
 from flight_core.parameters import require
 from rise_di.gain_design import check_gains, select_gains
+from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
 PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin")
@@ -27,6 +30,7 @@ MEANINGS = {
     "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
 }
 """Terms of the table and their meaning."""
+Assessment = GainAssessment[Any]
 HEADER = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 
 
@@ -65,10 +69,13 @@ def gains(
 ) -> None:
     """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every condition on both.
 
+    With --check, show the conditions and margins of the scenario's controller instead: of any law, with the law's own gains.
+
     Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
     console = Console(quiet=as_json)
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
+    answers: dict[str, Assessment]
     with console.status("simulating the ideal control on uncertain airframes"), options(*loop, *PARTS):
         if check:
             for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
@@ -119,41 +126,66 @@ def _parse_lags(text: str) -> list[float]:
     return values
 
 
-def _show(console: Console, found: Study, answers: dict[str, GainAssessment]) -> None:
+def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> None:
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
     samples = len(found.A) - 1
-    title = f"Gains for {found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples); K, Lambda in 1/s,"
-    headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
-    table = new_table(f"{title} beta in units of y / s^2", ["channel", "D", *headings], left=("channel",))
-    for i, (output, name) in enumerate(zip(outputs, first.controller.inputs, strict=True)):
-        row = [f"{output} by {name}", f"{first.controller.D[i]:+d}"]
-        for answer in answers.values():
-            params = answer.controller.law_params()
-            row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
-        table.add_row(*row)
-    console.print(table)
+    aircraft = f"{found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples)"
+    console.print(_gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft))
     for name, answer in answers.items():
+        if answer.margins is not None and answer.margins.nominal.stable:
+            headings = [f"{column.group}\n{column.head}" for column in MARGIN_COLUMNS]
+            table = new_table(f"\nMargins, {name}: nominal (worst sample)", ("input", *headings), left=("input",))
+            for row in margin_rows(answer.margins):
+                table.add_row(*row)
+            console.print(table)
+            console.print(modes_text(answer.margins), highlight=False, soft_wrap=True)
         console.print(f"{name}: {_format_delay_margin(found, answer)}", highlight=False, soft_wrap=True)
+    console.print(MARGIN_LEGEND, style="dim", highlight=False, soft_wrap=True)
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
+        if not getattr(first, part):
+            continue
         headings = [text for name in answers for text in (f"{name}\nvalue and bound", "\nmargin")]
         table = new_table(f"\n{heading}", ["condition", *headings], left=("condition",), wrapped=("condition",))
         for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
             table.add_row(_condition_name(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
         console.print(table)
-    gamma_2 = first.bounds.gamma_2[0]
-    console.print(
-        f"margin: a condition holds above 1 and fails (!) below; ~ is an estimate: gamma_2 = {gamma_2:g} 1/s is an assumption",
-        soft_wrap=True,
-    )
-    for word, meaning in MEANINGS.items():
+    estimate = "" if first.bounds is None else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
+    console.print(f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True)
+    for word, meaning in MEANINGS.items() if first.bounds is not None else ():
         console.print(f"{word}: {meaning}", highlight=False, soft_wrap=True)
     for name, answer in answers.items():
         failed = answer.failing
         console.print(f"{name}: {'every condition holds' if not failed else f'{len(failed)} conditions fail'}", highlight=False)
         for condition in failed if len(answers) == 1 else ():
             console.print(f"  {condition.sentence(outputs)}", highlight=False)
+
+
+def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
+    """K, Lambda and beta of RISE-DI, a row a channel."""
+    headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
+    title = f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2"
+    table = new_table(title, ["channel", "D", *headings], left=("channel",))
+    first = next(iter(answers.values())).controller
+    for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
+        row = [f"{output} by {name}", f"{first.D[i]:+d}"]
+        for answer in answers.values():
+            params = answer.controller.law_params()
+            row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
+        table.add_row(*row)
+    return table
+
+
+def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
+    """The parameters of a law other than RISE-DI."""
+    table = new_table(
+        f"Law {controller.law} for {aircraft}", ("parameter", "value"), left=("parameter", "value"), wrapped=("value",)
+    )
+    for name in type(controller).model_fields:
+        if name not in ControllerConfig.model_fields:
+            table.add_row(name, gain_selection.yaml_flow(getattr(controller, name), 4))
+    return table
 
 
 def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str:
@@ -163,7 +195,7 @@ def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
-def _format_delay_margin(found: Study, answer: GainAssessment) -> str:
+def _format_delay_margin(found: Study, answer: Assessment) -> str:
     if answer.delay_margin is None:
         return "no linear loop (literal sign)"
     if answer.delay_margin == 0.0:
@@ -174,7 +206,7 @@ def _format_delay_margin(found: Study, answer: GainAssessment) -> str:
     return f"{margin}; {speed_of_margin(found, answer)}"
 
 
-def speed_of_margin(found: Study, answer: GainAssessment) -> str:
+def speed_of_margin(found: Study, answer: Assessment) -> str:
     """Up to which speed a delay margin above 0 lasts with fixed gains."""
     ratio = gain_selection.stable_speed_ratio(found, answer.controller)
     if math.isinf(ratio):
@@ -182,7 +214,7 @@ def speed_of_margin(found: Study, answer: GainAssessment) -> str:
     return f"it lasts up to {ratio * found.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
 
 
-def _stable_speed_ratio(found: Study, answer: GainAssessment) -> float | None:
+def _stable_speed_ratio(found: Study, answer: Assessment) -> float | None:
     """The ratio; None where the literal sign has no linear loop, or without a limit."""
     if answer.delay_margin is None:
         return None
@@ -200,7 +232,7 @@ def _cells(condition: Condition) -> tuple[str, str]:
     return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
-def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dict[str, Any]:
+def _as_json(found: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
     inputs = list(found.airframe.inputs)
     return {
         "airframe": found.airframe.name,
@@ -215,8 +247,10 @@ def _as_json(found: Study, answers: dict[str, GainAssessment], seed: int) -> dic
             "delay_margin": answer.delay_margin,
             "channel_margins": answer.channel_margins,
             "stable_speed_ratio": _stable_speed_ratio(found, answer),
-            "bounds": {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")}
-            | {"rho": answer.bounds.rho},
+            "margins": None if answer.margins is None else margins_as_json(answer.margins),
+            "bounds": None
+            if answer.bounds is None
+            else {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {"rho": answer.bounds.rho},
             "conditions": [
                 {
                     "name": condition.name,

@@ -83,7 +83,7 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
 
 
 def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:
-    from flight_analysis.design.gain_selection import margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
+    from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_bringup.clients import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
@@ -91,7 +91,7 @@ def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: s
         key, controls = new_key(), []
 
         def control(flight: Flight) -> Control:
-            controls.append(Control(flight, client, key, real=real, assess=margins))
+            controls.append(Control(flight, client, key, real=real, assess=delay_margins))
             return controls[0]
 
         _announce(f"control key: {key}")

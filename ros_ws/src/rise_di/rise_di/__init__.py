@@ -59,11 +59,12 @@ __all__ = [
 
 if TYPE_CHECKING:  # for type checkers and completion; a test compares these imports with HOMES
     from aircraft_sim.airframe import Airframe, airframes, load_airframe
+    from flight_analysis.closed_loop.margins import margins
     from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
     from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
     from flight_analysis.closed_loop.simulate import simulate
     from flight_analysis.design.airframe_properties import airframe_facts
-    from flight_analysis.design.gain_selection import Selection, margins
+    from flight_analysis.design.gain_selection import Selection
     from flight_analysis.design.gain_selection import as_yaml as gains_yaml
     from flight_analysis.metrics import best_error, error_metrics
     from flight_analysis.report.data_frame import data_frame
@@ -86,11 +87,12 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
 else:  # type checkers would take a module with __getattr__ to have any name
     HOMES = {
         "aircraft_sim.airframe": ("Airframe", "airframes", "load_airframe"),
+        "flight_analysis.closed_loop.margins": ("margins",),
         "flight_analysis.closed_loop.replay": ("ReplayResult", "recorded_scenario", "replay"),
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
         "flight_analysis.design.airframe_properties": ("airframe_facts",),
-        "flight_analysis.design.gain_selection": ("Selection", "as_yaml as gains_yaml", "margins"),
+        "flight_analysis.design.gain_selection": ("Selection", "as_yaml as gains_yaml"),
         "flight_analysis.metrics": ("best_error", "error_metrics"),
         "flight_analysis.report.data_frame": ("data_frame",),
         "flight_analysis.report.summary": ("summarise",),

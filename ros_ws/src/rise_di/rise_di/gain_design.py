@@ -17,6 +17,7 @@ from flight_campaign import tuned_gains
 from flight_core.arguments import FilePath, as_count, as_number, as_numbers
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
+from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
@@ -69,6 +70,7 @@ def select_gains(
     Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
     """
     chosen, frame = _scenario(scenario), _airframe(airframe)
+    chosen.rise_di()
     setting = _loop(chosen, frame, rate, y_rate, lag, delay)._replace(
         inputs=tuple(inputs.split(",")) if isinstance(inputs, str) and inputs else tuple(inputs),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
@@ -92,8 +94,11 @@ def check_gains(
     gamma_2: float = 0.0,
     samples: int = 100,
     seed: int = 1,
-) -> GainAssessment:
-    """Every condition on the gains of a scenario for an airframe; arguments as for `select_gains`. Raises ParameterError."""
+) -> GainAssessment[ControllerConfig]:
+    """Every condition on the gains of a scenario under any law, and the margins of the loop; arguments as for `select_gains`.
+
+    Raises ParameterError.
+    """
     chosen, frame = _scenario(scenario), _airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)

@@ -4,7 +4,7 @@
 
 With P(z) from u to y, the sampled aircraft with actuators and delay, and K(z) from y to u, the law:
 
-    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1        loop transfer function at input i, all other inputs closed
+    S(z) = (I - K P)^-1,    L_i(z) = 1 / S_ii(z) - 1        loop transfer function with input i alone open
 
 on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedback Systems", chapter 10, for phase, gain and
 sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk Margins", IEEE Control Systems 40(5), 2020.
@@ -64,7 +64,7 @@ class Margins(NamedTuple):
             return np.minimum(self.gain_increase, 1.0 / self.gain_decrease)
 
     def worst(self) -> "Margins":
-        """The worst of N aircraft in each figure by itself, from shapes (N, m) and (N,)."""
+        """The worst of N aircraft figure by figure, from shapes (N, m) and (N,)."""
         least = {name: np.asarray(value.min(axis=0)) for name, value in self._asdict().items()}
         most = {
             name: np.asarray(getattr(self, name).max(axis=0)) for name in ("gain_decrease", "sensitivity", "sensitivity_all")
@@ -74,13 +74,13 @@ class Margins(NamedTuple):
 
 
 def disk_gain(disk: FloatArray) -> FloatArray:
-    """Gain margin that a balanced disk margin guarantees, a factor up and down: (2 + disk) / (2 - disk)."""
+    """Gain margin of a balanced disk margin, a factor up and down: (2 + disk) / (2 - disk)."""
     with np.errstate(divide="ignore"):
         return np.asarray((2.0 + disk) / np.maximum(2.0 - disk, 0.0))
 
 
 def disk_phase(disk: FloatArray) -> FloatArray:
-    """Phase margin that a balanced disk margin guarantees, rad: 2 atan(disk / 2)."""
+    """Phase margin of a balanced disk margin, rad: 2 atan(disk / 2)."""
     return np.asarray(2.0 * np.arctan(disk / 2.0))
 
 

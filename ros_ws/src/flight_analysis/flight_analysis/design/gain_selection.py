@@ -9,18 +9,26 @@ scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 from numpy.typing import NDArray
 
 from aircraft_sim import dynamics
-from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.params import Gust
 from aircraft_sim.uncertainty import nominal_and_sampled
+from flight_analysis.closed_loop.margins import (
+    LoopMargins,
+    is_literal,
+    law_order,
+    linear_loop,
+    loop_assessment,
+    loop_of,
+)
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_conditions
 from flight_analysis.design.airframe_properties import invariant_zeros
@@ -35,7 +43,7 @@ from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
-from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, is_stable, linear_law
+from rise_di_controller.linear_loop import Loop, is_stable
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -82,7 +90,7 @@ class ChannelPairing(NamedTuple):
 class LoopSetting(NamedTuple):
     """The loop that the gains are selected for, and the settings of the selection."""
 
-    base: RiseDiConfig  # source of all parameters that are not selected: softening, max_age, limits
+    base: ControllerConfig  # source of all parameters that are not selected: softening, max_age, limits
     rate: float  # Hz
     lag: Mapping[str, float]  # s, by input; 0 for an input without lag
     delay: float  # s
@@ -114,16 +122,25 @@ class Study(NamedTuple):
         return np.asarray(self.C @ self.B[0])
 
 
-class GainAssessment(NamedTuple):
-    """A gain set, every condition on it, and its delay margins."""
+class GainAssessment(NamedTuple, Generic[Controller]):
+    """A controller, every condition on its gains, and the margins of its loop."""
 
-    controller: RiseDiConfig
-    theorem: tuple[Condition, ...]
+    controller: Controller
+    theorem: tuple[Condition, ...]  # empty for a law other than RISE-DI
     loop: tuple[Condition, ...]
-    bounds: Bounds
-    delay_margin: float | None  # s, nominal airframe, delay in all channels; None for the literal sign
-    channel_margins: tuple[float, ...]  # s, delay in one channel alone; empty with delay_margin None
+    bounds: Bounds | None  # None for a law other than RISE-DI
+    margins: LoopMargins | None  # None for the literal sign
     study: Study  # of the airframe
+
+    @property
+    def delay_margin(self) -> float | None:
+        """Delay margin of the nominal aircraft with the delay in all channels, s; None for the literal sign."""
+        return None if self.margins is None else self.margins.delay
+
+    @property
+    def channel_margins(self) -> tuple[float, ...]:
+        """Delay margins of the nominal aircraft with the delay in one channel alone, s; none for the literal sign."""
+        return () if self.margins is None else self.margins.channel_delay
 
     @property
     def failing(self) -> tuple[Condition, ...]:
@@ -136,8 +153,8 @@ class Selection(NamedTuple):
 
     study: Study
     setting: LoopSetting
-    theorem: GainAssessment
-    engineering: GainAssessment
+    theorem: GainAssessment[RiseDiConfig]
+    engineering: GainAssessment[RiseDiConfig]
     origin: str = ""  # of the gains beside an observer, a sentence
 
 
@@ -386,7 +403,7 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     return type(controller).validate_mapping(controller.model_dump() | {"feedforward": model.model_dump()}, "controller")
 
 
-def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment:
+def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainAssessment[ControllerConfig]:
     """Every condition on the gain set of a scenario's controller, for an airframe studied along the scenario's manoeuvre.
 
     Raises ParameterError for other outputs than those of the airframe, and if D or the pairing contradict the airframe.
@@ -394,15 +411,14 @@ def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainA
     known, frame = scenario.controller.outputs, study.airframe
     fits = f"the outputs {', '.join(known)}"
     require(sorted(known) == sorted(frame.outputs), f"airframe {frame.name}", ", ".join(frame.outputs), fits)
-    return assess_gains(study, scenario.rise_di(), loop_setting(scenario, gamma_2))
+    return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
 
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
-    controller, rates = scenario.rise_di(), scenario.aircraft.actuators.rate
-    airframe, _ = scenario.aircraft.load()
+    controller, rates = scenario.controller, scenario.aircraft.actuators.rate
     own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
-    limits = dict(zip(airframe.inputs, rates, strict=bool(rates)))
+    limits = dict(zip(scenario.aircraft.channels().inputs, rates, strict=bool(rates)))
     return LoopSetting(
         controller,
         controller.rate,
@@ -413,25 +429,48 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     )
 
 
-def assess_gains(study: Study, controller: RiseDiConfig, setting: LoopSetting) -> GainAssessment:
+def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> GainAssessment[Controller]:
     """Every condition on a gain set. Rate, lag and delay are the controller's; gamma_2 and rate limits are the setting's.
 
-    Theorem: "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and
-    3 are the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over
-    these samples; steps 2 and 3 are sufficient for Q > 0. Loop: `check_loop` without an observer, the fraction of the samples
-    for which the linear loop is stable, and its delay margin on the nominal airframe, which should be at least one period, a
-    missed tick, or what an observer requires beyond the delay. With the implicit sign the linear loop is the one inside the
-    width of the sign, dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period.
+    Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for which the linear loop is
+    stable, and its delay margin on the nominal airframe, which should be at least one period, a missed tick, or what an
+    observer requires beyond the delay. With the implicit sign the linear loop is the one inside the width of the sign,
+    dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period. A law other than RISE-DI
+    has the conditions of the linear loop alone.
     """
     rows, columns = law_order(study.airframe, controller)
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
+    theorem: tuple[Condition, ...] = ()
+    conditions: tuple[Condition, ...] = ()
+    bounds = None
+    if isinstance(controller, RiseDiConfig):
+        theorem, conditions, bounds = _rise_di_conditions(study, controller, setting, D)
+    if is_literal(controller):
+        return GainAssessment(controller, theorem, conditions, bounds, None, study)
+    margins = loop_assessment(linear_loop(controller, study.airframe, study.A, study.B))
+    stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
+    conditions += (Condition("linear stability", None, stable, 1.0),)
+    if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
+        least = 1.0 / controller.rate if controller.observer is None else controller.observer.margin - controller.delay
+        conditions += (Condition("delay margin", None, margins.delay, least),)
+    return GainAssessment(controller, theorem, conditions, bounds, margins, study)
+
+
+def _rise_di_conditions(
+    study: Study, controller: RiseDiConfig, setting: LoopSetting, D: FloatArray
+) -> tuple[tuple[Condition, ...], tuple[Condition, ...], Bounds]:
+    """The conditions of Theorem 1, those of `check_loop`, and the bounds of the theorem.
+
+    "D" and "zero dynamics" are the fractions of the samples for which they hold. The bounds of (29), (30), steps 2 and 3 are
+    the largest over the samples for which both hold. "V2_dot" is the smallest eigenvalue of Q in V2_dot = -z'Qz over these
+    samples; steps 2 and 3 are sufficient for Q > 0.
+    """
+    rows, columns = law_order(study.airframe, controller)
     params = controller.law_params()
-    loop = loop_of(controller)
     bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
     C, Bs = study.C[rows], study.B[:, :, columns]
-
     known = [
         KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x) for A, B in zip(study.A[counts], Bs[counts], strict=True)
     ]
@@ -442,64 +481,28 @@ def assess_gains(study: Study, controller: RiseDiConfig, setting: LoopSetting) -
         *gain_conditions.check(gains, bounds),
         Condition("V2_dot", None, decay_rate, 0.0, strict=True),
     )
+    if controller.observer is not None:  # the engineering rules are those of a law that has no other feedback beside it
+        return theorem, (), bounds
     responses = np.abs(np.einsum("Nii->Ni", C @ Bs))[counts] * params.input_scale
-    rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
+    rate_limit = _by_name(setting.rate_limit, controller.inputs, math.inf)
     limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
-    conditions: tuple[Condition, ...] = ()
-    if controller.observer is None:  # the engineering rules are those of a law that has no other feedback beside it
-        conditions = gain_conditions.check_loop(params, loop, responses[0], responses.max(axis=0), *limits)
-    if params.sign is Sign.LITERAL:
-        return GainAssessment(controller, theorem, conditions, bounds, None, (), study)
-    plants = [LinearPlant(A + study.gravity, B, C) for A, B in zip(study.A, Bs, strict=True)]
-    no_delay = np.zeros(len(rows))
-    linear = linear_law(controller.tuned_law(), len(rows), loop.period)
-    stable = float(np.mean([is_stable(plant, linear, loop, no_delay) for plant in plants]))
-    margin = delay_margin(plants[0], linear, loop)
-    each = tuple(delay_margin(plants[0], linear, loop, channel) for channel in range(len(rows)))
-    conditions += (Condition("linear stability", None, stable, 1.0),)
-    if params.sign is Sign.SOFT:
-        least = loop.period if controller.observer is None else controller.observer.margin - controller.delay
-        conditions += (Condition("delay margin", None, margin, least),)
-    return GainAssessment(controller, theorem, conditions, bounds, margin, each, study)
+    conditions = gain_conditions.check_loop(params, loop_of(controller), responses[0], responses.max(axis=0), *limits)
+    return theorem, conditions, bounds
 
 
-def margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
-    """Delay margin, s, of the nominal linear loop in all channels, by output in one alone, and the least that it should be.
-
-    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable with its own lag.
-    """
-    literal = isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
-    if scenario.aircraft.is_jsbsim or literal:
-        return {}
-    airframe = load_airframe(scenario.aircraft.airframe)
-    rows, columns = law_order(airframe, controller)
-    A, B, C = airframe.matrix_a() + airframe.matrix_gravity(), airframe.matrix_b()[:, columns], airframe.matrix_c()[rows]
-    plant, loop = LinearPlant(A, B, C), loop_of(controller)
-    linear = linear_law(controller.tuned_law(), len(rows), loop.period)
-    each = {name: delay_margin(plant, linear, loop, channel) for channel, name in enumerate(controller.outputs)}
-    return {"delay_margin": delay_margin(plant, linear, loop), "channels": each, "least": loop.period}
-
-
-def stable_speed_ratio(study: Study, controller: RiseDiConfig) -> float:
+def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     """Airspeed over that of the trim up to which the delay margin lasts with fixed gains; 0 without one at trim.
 
     The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
     SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
-    rows, columns = law_order(study.airframe, controller)
-    loop, linear = loop_of(controller), linear_law(controller.tuned_law(), len(rows), 1.0 / controller.rate)
-    surfaces, no_delay = np.array([name != "V" for name in controller.outputs]), np.zeros(len(rows))
-    plant, steps = LinearPlant(study.A[0] + study.gravity, study.B[0][:, columns], study.C[rows]), round(1.0 / SPEED_STEP)
+    of, steps = linear_loop(controller, study.airframe, study.A[:1], study.B[:1]), round(1.0 / SPEED_STEP)
+    surfaces, no_delay = np.array([name != "V" for name in controller.outputs]), np.zeros(len(of.inputs))
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
         response = np.where(surfaces, (step / steps) ** 2, 1.0)
-        if not is_stable(plant._replace(B=plant.B * response), linear, loop, no_delay):
+        if not is_stable(of.nominal._replace(B=of.nominal.B * response), of.law, of.loop, no_delay):
             return (step - 1) / steps if step > steps else 0.0
     return math.inf
-
-
-def loop_of(controller: ControllerConfig) -> Loop:
-    """The loop of a controller."""
-    return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
 
 
 def _bounds(
@@ -527,12 +530,6 @@ def _has_signs(Omega: FloatArray, D: FloatArray) -> bool:
         return bool((signs(Omega) == D).all())
     except DecompositionError:
         return False
-
-
-def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
-    """Indices of the law's outputs and inputs among those of an airframe."""
-    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
-    return [airframe.outputs.index(name) for name in controller.outputs], columns
 
 
 def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) -> FloatArray:

@@ -23,8 +23,9 @@ from control_laws.observer_design import (
     aircraft_observer,
     extended_state_observer,
 )
+from flight_analysis.closed_loop.margins import law_order, loop_of
 from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
-from flight_analysis.design.gain_selection import law_order, loop_of, with_feedforward
+from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray

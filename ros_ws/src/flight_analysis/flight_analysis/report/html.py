@@ -13,7 +13,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from flight_analysis.report import comparison, figures, guided_figures, plotting, tables
+from flight_analysis.closed_loop.margins import LinearLoop, loop_assessment, scenario_loop
+from flight_analysis.report import comparison, figures, guided_figures, margins, plotting, tables
 from flight_analysis.report.plotting import Figure, SampleStore, pack
 from flight_analysis.report.replay import Replay, replay
 from flight_analysis.report.summary import (
@@ -26,6 +27,7 @@ from flight_analysis.report.summary import (
 )
 from flight_core.files import write_file
 from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 HERE = Path(__file__).parent
@@ -78,12 +80,13 @@ def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 def _flight_page(flight: RecordedFlight) -> Page:
     units, gusts = display_units(flight.scenario), flight.scenario.gust_windows()
-    context = figures.plot_context(flight.tape, units, gusts)
+    context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(flight)
+    of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts))
     return Page(
         f"Flight {flight.name}",
         [Line(f"{_description(flight)}.", flight.summary["outcome"])],
-        [TableGroup(tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts)))],
-        _sections(flight, context),
+        [TableGroup([*of_flight, *([] if loop is None else [margins.margin_table(loop_assessment(loop))])])],
+        [*_sections(flight, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,
         flight.summary["notes"],
         replay(flight, context),
@@ -159,6 +162,27 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
             figures.tick_figure(context),
         ),
         Section("Timing of the ticks", "", figures.timing_figure({"": run}, {"": colour}), over_time=False),
+    ]
+
+
+def _linear_loop(flight: RecordedFlight) -> LinearLoop | None:
+    """The linear loop of the flight's scenario; None without one: the literal sign, an aircraft without a model."""
+    try:
+        return scenario_loop(flight.scenario, flight.scenario.controller)
+    except ParameterError:
+        return None
+
+
+def _loop_sections(loop: LinearLoop) -> list[Section]:
+    hint = f"L at each input, the other inputs closed: the sampled loop with actuators, delay and hold; {loop.model}"
+    return [
+        Section("Bode plot of the loop", hint, margins.bode_figure(loop), over_time=False),
+        Section(
+            "Nyquist plot of the loop",
+            "Inside the circle around -1 the sensitivity is above 2.",
+            margins.nyquist_figure(loop),
+            over_time=False,
+        ),
     ]
 
 
