@@ -224,15 +224,15 @@ def test_second_publisher_of_topic_of_autopilot_ends_engagement_and_blocks_anoth
 
 def test_engagement_says_which_pilot_override_has_no_effect() -> None:
     bridge = engaged_bridge()
-    silent = "a pilot override has no effect: no message on /joy for 1 s"
-    assert bridge.reason == silent
-    for t, reason in ((0.1, ""), (1.2, silent)):
-        if not reason:
+    silent = "a pilot override has no effect: no message on /joy for 1 s; "
+    assert bridge.reason.startswith(silent)
+    for t, received in ((0.1, True), (1.2, False)):
+        if received:
             bridge.take_override("gamepad", 0.0, at(t))
         receive_outputs(bridge, t)
         receive_u(bridge, t)
         assert bridge.step(at(t)) is Phase.ENGAGED
-        assert bridge.reason == reason
+        assert bridge.reason.startswith(silent) is not received
 
 
 def test_y_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh() -> None:
@@ -273,7 +273,7 @@ def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
         bridge.take_output("q", 0.0, at(0.0), at(0.01))
 
 
-PX4_STATUS = {"armed": 2.0, "offboard": 4.0}  # armed, in Hold
+PX4_STATUS = {"armed": 2.0, "offboard": 4.0, "transmitter": 1.0}  # armed, in Hold, with a transmitter
 
 
 def px4_bridge(t: float = 0.0, **status: float) -> Bridge:
@@ -343,7 +343,8 @@ def test_engagement_without_awaited_mode_ends_after_time_with_reason() -> None:
 
 def test_engagement_refused_with_sentence_of_condition() -> None:
     bridge = new_bridge(unlimited("px4"))
-    assert bridge.engage(at(0.0)) == "armed: arming_state not received yet (/fmu/out/vehicle_status_v1)"
+    refused = "armed: arming_state not received yet (/fmu/out/vehicle_status_v1); transmitter: valid not received yet"
+    assert bridge.engage(at(0.0)).startswith(refused)
     bridge = px4_bridge(armed=1.0)
     assert bridge.engage(at(0.0)) == "the aircraft is not armed (arming_state is 1)"
     assert bridge.phase is Phase.DISENGAGED
@@ -371,8 +372,84 @@ def test_condition_that_is_not_reported_any_more_ends_engagement() -> None:
     for t in np.arange(0.1, 1.7, 0.1).tolist():
         receive_outputs(bridge, t, tuple(bridge.outputs))
         receive_u(bridge, t)
+        bridge.take_condition("transmitter", 1.0, at(t))
         assert (bridge.step(at(t)) is Phase.ENGAGED) == (t < 1.55), t
     assert bridge.reason.startswith("armed: arming_state is 1.60 s old")
+
+
+def fly(bridge: Bridge, begin: float, end: float, **status: float) -> Phase:
+    """Fresh inputs ten times a second, and the phase at the end. A status of NaN is not received."""
+    for t in np.arange(begin, end, 0.1).tolist():
+        receive_outputs(bridge, t, tuple(bridge.outputs), 20.0)
+        receive_u(bridge, t)
+        for name, raw in (PX4_STATUS | {"offboard": 14.0} | status).items():
+            if name in bridge.channel_map.conditions and not np.isnan(raw):
+                bridge.take_condition(name, raw, at(t))
+        bridge.step(at(t))
+    return bridge.phase
+
+
+@pytest.mark.parametrize(
+    ("valid", "reason"),
+    [
+        (0.0, "the transmitter is lost (valid is 0)"),
+        (np.nan, "transmitter: valid is 0.90 s old (/fmu/out/manual_control_setpoint)"),
+    ],
+)
+def test_lost_transmitter_releases_within_a_second(valid: float, reason: str) -> None:
+    bridge = px4_bridge(offboard=14.0)
+    assert bridge.engage(at(0.0)) == ""
+    assert fly(bridge, 0.05, 3.0) is Phase.ENGAGED
+    assert "the loss of the transmitter" not in bridge.reason
+    assert fly(bridge, 3.05, 3.96, transmitter=valid) in {Phase.RELEASE, Phase.DISENGAGED}
+    assert bridge.reason == reason
+
+
+def test_blind_engagement_ignores_the_transmitter() -> None:
+    bridge = px4_bridge(offboard=14.0, transmitter=0.0)
+    assert bridge.engage(at(0.0)) == "the transmitter is lost (valid is 0)"
+    assert bridge.engage(at(0.0), blind=True) == ""
+    assert fly(bridge, 0.05, 3.0, transmitter=0.0) is Phase.ENGAGED
+    assert bridge.reason.endswith(
+        "the loss of the transmitter is not watched (--blind), and the override by pilot has no effect then; "
+        "released by a lost condition (armed, offboard), rise-di engage --off"
+    )
+    bridge.disengage("disengaged by request", at(3.0))
+    assert bridge.engage(at(3.0)) == "the transmitter is lost (valid is 0)"  # blind for one engagement
+
+
+def test_unwatched_transmitter_needs_a_bound() -> None:
+    bridge = ready_bridge(channel_map=CHANNEL_MAP.model_copy(update={"max_engaged": None}))
+    refusal = "the loss of the transmitter cannot be seen over this link: set max_engaged in the map, or engage with --blind"
+    assert bridge.engage(at(0.0)) == refusal
+    assert bridge.engage(at(0.0), blind=True) == ""
+    assert bridge.phase is Phase.ENGAGED
+
+
+def test_max_engaged_releases_after_a_warning() -> None:
+    bridge = engaged_bridge(CHANNEL_MAP.model_copy(update={"max_engaged": 30.0}))
+    blind = (
+        "the loss of the transmitter cannot be seen over this link; "
+        "released by the override by gamepad, rise-di engage --off, max_engaged after 30 s"
+    )
+    assert bridge.reason.endswith(blind)
+    assert fly(bridge, 0.05, 19.96) is Phase.ENGAGED
+    assert "max_engaged releases" not in bridge.reason
+    assert fly(bridge, 20.05, 29.96) is Phase.ENGAGED
+    assert bridge.reason.startswith("max_engaged releases in 10 s, unless engaged again; ")
+    assert bridge.engage(at(30.0)) == ""
+    assert fly(bridge, 30.05, 49.96) is Phase.ENGAGED
+    assert bridge.reason.endswith(blind)
+    assert fly(bridge, 50.05, 60.06) is Phase.RELEASE
+    assert bridge.reason == "engaged for 30 s, max_engaged of the map"
+
+
+def test_blind_engagement_has_no_bound() -> None:
+    bridge = ready_bridge(channel_map=CHANNEL_MAP.model_copy(update={"max_engaged": 5.0}))
+    assert bridge.engage(at(0.0)) == ""
+    assert bridge.engage(at(0.0), blind=True) == ""
+    assert fly(bridge, 0.05, 20.0) is Phase.ENGAGED
+    assert "max_engaged" not in bridge.reason
 
 
 def test_captured_output_is_zero_until_engagement_and_then_change() -> None:

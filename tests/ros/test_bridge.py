@@ -54,6 +54,7 @@ RELEASE_AFTER = 1.0  # s, in place of the 3 s of RC_OVERRIDE_TIME
 NEUTRAL = 0.4  # s, in tests with neutral values
 FULL = math.radians(30.0)  # full deflection of a surface in the map
 EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
+PATIENT = 5.0  # s, of y and u, where a release by their age would hide another one
 MAX_AGE, RELEASE = 0.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s, for hosts under load
 LATE = 0.2  # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20 ms
 
@@ -145,6 +146,11 @@ class BridgeSetup:
         """Wait for six further messages to the autopilot."""
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5)
+
+    def first_nan(self, t: float, command: Callable[[], None]) -> float:
+        """Wait for NaN after an instant of the system clock, while u is published; s from the instant."""
+        self.peer.until(lambda: self.after(t)[1], each=command)
+        return self.after(t)[1][0]
 
     def after(self, t: float) -> tuple[list[float], list[float]]:
         """Times at which finite values and NaN were sent, s after an instant of the system clock."""
@@ -355,6 +361,74 @@ def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSe
     setup.peer.until(lambda: client.popen.poll() is not None, each=command)
     assert client.end() == 130
     assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in bridge.lines)
+
+
+def test_lost_transmitter_releases_within_a_second(setup: BridgeSetup) -> None:
+    """The transmitter says that the pilot is there, then that the pilot is lost, then nothing."""
+    condition = {
+        "topic": "/ap/transmitter",
+        "type": "std_msgs/msg/UInt8",
+        "field": "data",
+        "one_of": [1],
+        "sentence": "the transmitter is lost",
+        "max_age": 0.8,
+        "transmitter": True,
+        "source": "a test",
+    }
+    setup.change_age_limits(PATIENT)  # of y and u: the transmitter alone releases
+    setup.change_map(conditions={"transmitter": condition}, max_engaged=None)
+    setup.change_map("topics", **{"/ap/transmitter": {"reliability": "reliable", "durability": "volatile", "depth": 1}})
+    setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+    transmitter = setup.peer.node.create_publisher(UInt8, "/ap/transmitter", 1)
+    here: int | None = 1
+
+    def command() -> None:
+        setup.peer.command(0.0, 0.0, 0.0, 0.0)
+        if here is not None:
+            transmitter.publish(UInt8(data=here))
+
+    for lost, reason in ((0, "the transmitter is lost (data is 0)"), (None, "transmitter: data is ")):
+        here = 1
+        setup.engage_while(command)
+        here, last = lost, time.time()
+        setup.until_released(bridge, command, reason)
+        assert setup.first_nan(last, command) <= 1.0 + LATE
+
+
+def test_blind_engagement_says_what_still_releases(setup: BridgeSetup, start: Start) -> None:
+    """A map without a bound needs `--blind`. With `max_engaged` the end is announced, and then the channels are released."""
+    setup.change_age_limits(PATIENT)
+    setup.change_map(max_engaged=None)
+    setup.autopilot()
+    bridge = setup.bridge("-p", "dry_run:=false")
+
+    def command() -> None:
+        setup.peer.command(0.0, 0.0, 0.0, 0.0)
+
+    def engage(*options: str) -> Process:
+        client = start("flight_cli.cli", "engage", *options)
+        setup.peer.until(lambda: client.popen.poll() is not None, each=command)
+        return client
+
+    refused = engage()
+    assert refused.end() == 1
+    assert "not engaged: the loss of the transmitter cannot be seen over this link: set max_engaged" in refused.output
+    blind = engage("--blind").succeed()
+    assert "warning: a pilot override has no effect" in blind.output
+    assert "the loss of the transmitter cannot be seen over this link; released by the override by gamepad" in blind.output
+    assert engage("--off").end() == 0
+    bridge.interrupt()
+    setup.peer.until(lambda: bridge.popen.poll() is not None)
+
+    setup.change_map(max_engaged=11.0)
+    bridge = setup.bridge("-p", "dry_run:=false")
+    setup.joys.clear()
+    assert "max_engaged after 11 s" in engage().succeed().output
+    engaged = stamp(setup.joys[0])
+    setup.peer.until(lambda: "ENGAGED: max_engaged releases in 10 s" in bridge.output, each=command)
+    setup.until_released(bridge, command, "engaged for 11 s, max_engaged of the map")
+    assert setup.first_nan(engaged, command) == pytest.approx(11.0, abs=LATE)
 
 
 def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(setup: BridgeSetup) -> None:

@@ -110,6 +110,7 @@ class Px4:
                 ("vehicle_odometry", odometry),
                 ("airspeed_validated", airspeed),
                 ("vehicle_status_v1", self._status),
+                ("manual_control_setpoint", types.ManualControlSetpoint(valid=True)),
             )
         ]
         self.received: dict[str, list[Any]] = {}

@@ -38,6 +38,7 @@ PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopbac
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
 OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO")  # of a rehearsal
 POLL = 0.1  # s, between two questions to the autopilot
+BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
 CRUISE = (25.0, 65.0)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
@@ -72,6 +73,7 @@ class Autopilot:
 
     script: Path
     namespace: str  # of the network, as the kit names it
+    engage_options: tuple[str, ...] = ()
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -169,20 +171,28 @@ class Autopilot:
         path.write_text(text, encoding="utf-8")
         return str(path)
 
+    def engage(self, *options: str) -> Process:
+        """Start `rise-di engage`, as the autopilot needs it where no options are given."""
+        return self.start("engage", *(options or self.engage_options))
+
     def fly(self, scenario: Path, channel_map: str, duration: float, *options: str) -> Process:
         """Start a flight of the stack."""
         arguments = (str(scenario), "--bridge", channel_map, "--duration", f"{duration:g}", "--runs", str(self.folder / "runs"))
         return self.start("fly", *arguments, *options)
 
     @contextmanager
-    def engaged(self, scenario: Path, channel_map: str, duration: float) -> Iterator[Process]:
-        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in its own mode."""
+    def engaged(self, scenario: Path, channel_map: str, duration: float, *, transmitter: bool = False) -> Iterator[Process]:
+        """A flight of the stack, engaged from level flight. Afterwards the autopilot flies level in its own mode.
+
+        `transmitter`: whether the bridge watches the transmitter.
+        """
         self.level()
         flight = self.fly(scenario, channel_map, duration, "--send")
         try:
             flight.wait_for("DISENGAGED")
             self.hand_over()
-            self.start("engage").succeed()
+            blind = ("--blind",) if duration > BOUNDED else self.engage_options
+            self.start("engage", *(() if transmitter else blind)).succeed()
             yield flight
         finally:
             if flight.popen.poll() is None:
@@ -367,6 +377,7 @@ class Px4(Autopilot):
 
     script = KIT / "px4" / "sitl"
     namespace = "rise_di_px4"
+    engage_options = ("--blind",)
     tools = KIT / "px4" / "fly"
     home = 489.4  # m, where its simulator begins
 

@@ -161,7 +161,7 @@ def move_a_stick(plane: ArduPlane, _: Process) -> Callable[[], object]:
 
 
 def release(plane: ArduPlane, _: Process) -> None:
-    plane.start("engage", "--off").succeed()
+    plane.engage("--off").succeed()
 
 
 def change_mode(plane: ArduPlane, _: Process) -> None:
@@ -257,13 +257,34 @@ def sticks_act(plane: ArduPlane, since: float) -> float:
     pytest.fail("the sticks do not act")
 
 
+def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) -> None:
+    """No field tells the loss, and Joy keeps the autopilot's own RC failsafe off: the failsafe acts after the release."""
+    bound = 20.0
+    channel_map = plane.patient_map("ardupilot", ("max_engaged: 120.0", f"max_engaged: {bound}"))
+    with plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
+        assert "the loss of the transmitter cannot be seen over this link" in flight.output
+        plane.say("param", "SIM_RC_FAIL", "1")
+        try:
+            flight.wait_for("max_engaged releases in 10 s")
+            assert plane.state()["mode"] == "MANUAL"
+            flight.wait_for("RELEASE")
+            plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
+        finally:
+            plane.say("param", "SIM_RC_FAIL", "0")
+        flight.interrupt()
+        flight.end()
+    (engagement,) = plane.summary()["engagements"]
+    assert engagement["reason"] == f"engaged for {bound:g} s, max_engaged of the map"
+    assert engagement["stop"] - engagement["start"] == pytest.approx(bound, abs=LATE)
+
+
 def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane) -> None:
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a release acts at once."""
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
         for one in burn(3.0):
             one.wait()
-        plane.start("engage", "--off").succeed()
+        plane.engage("--off").succeed()
         released = time.time()
         assert sticks_act(plane, released) - released <= RC_PERIOD + LATE
         flight.interrupt()
@@ -284,7 +305,7 @@ def test_the_stack_engages_again_after_a_restart(plane: ArduPlane, what: str) ->
             plane.restart()
             plane.take_off()
         plane.hand_over()
-        plane.until(lambda _: plane.start("engage").end() == 0)
+        plane.until(lambda _: plane.engage().end() == 0)
         flight.interrupt()
         flight.end()
     first, _ = plane.summary()["engagements"]

@@ -69,7 +69,7 @@ class Event(NamedTuple):
 
 
 def release(px4: Px4, _: Process) -> None:
-    px4.start("engage", "--off").succeed()
+    px4.engage("--off").succeed()
 
 
 def override(px4: Px4, _: Process) -> Callable[[], object]:
@@ -148,12 +148,34 @@ def test_px4_flies_by_its_own_law_again(px4: Px4, name: str, record_testsuite_pr
     assert event.reason in f"{one['reason']}; {summary['outcome']}"
 
 
+def test_lost_transmitter_releases_within_a_second(px4: Px4, record_testsuite_property: Callable[[str, object], None]) -> None:
+    """PX4 would fly on in offboard: COM_RCL_EXCEPT of the kit has the bit of offboard."""
+    px4.say("param", "set", "COM_RC_IN_MODE", "1")
+    stick = px4.tool("stick", "600", "600")
+    try:
+        channel_map = OWN_MAP or px4.patient_map(str(EXAMPLE / "map.yaml"))
+        with px4.engaged(SCENARIO.path, channel_map, 90.0, transmitter=True) as flight:
+            stick.popen.kill()
+            lost = time.time()
+            px4.until(lambda state: state["nav_state"] != OFFBOARD, timeout=10.0)
+            flight.wait_for("RELEASE").interrupt()
+            flight.end()
+    finally:
+        stick.popen.kill()
+        px4.say("param", "set", "COM_RC_IN_MODE", "4")
+    (engagement,) = read_run(px4.run).engagements or []
+    released = (engagement.stop_ns or 0) / 1e9 - lost
+    record_testsuite_property("PX4, transmitter lost", f"{released:.3f}")
+    assert released <= 1.0
+    assert "transmitter" in (engagement.reason or "")
+
+
 def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4 flies in Hold."""
     with engaged(px4, 60.0) as flight:
         for one in burn(3.0):
             one.wait()
-        px4.start("engage", "--off").succeed()
+        px4.engage("--off").succeed()
         px4.until(lambda state: state["nav_state"] == HOLD, timeout=OWN_LAW + LATE)
         flight.interrupt()
         flight.end()
@@ -175,7 +197,7 @@ def test_the_stack_engages_again_after_a_restart(px4: Px4, what: str) -> None:
             flight.wait_for("s old")
             px4.take_off()
             px4.level()
-        px4.until(lambda _: px4.start("engage").end() == 0)
+        px4.until(lambda _: px4.engage().end() == 0)
         flight.interrupt()
         flight.end()
     first, _ = px4.summary()["engagements"]

@@ -16,7 +16,7 @@ import numpy as np
 from autopilot_bridge.channel_map import to_channel, to_raw
 from autopilot_bridge.params import ROUNDING, ChannelMap, ConditionRow, InputRow, MeasuredRow, OutputRow
 from flight_core.publisher_lock import PublisherLock
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.vectors import (
     ChannelError,
     FloatArray,
@@ -25,6 +25,9 @@ from flight_core.vectors import (
     require_not_future,
     require_not_old,
 )
+
+UNBOUNDED = "the loss of the transmitter cannot be seen over this link: set max_engaged in the map, or engage with --blind"
+END_WARNING_NS = 10 * NANOSECONDS  # before the end of an engagement by `max_engaged`
 
 
 class Phase(IntEnum):
@@ -72,6 +75,9 @@ class Bridge:
         self._overrides: dict[str, Reading] = {}
         self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
+        self._blind = False  # whether the engagement goes on without the transmitter
+        self._end_ns: int | None = None  # of the engagement by `max_engaged`
+        self._watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
         rows = channel_map.inputs.values()
         self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
         self._max_age_ns = nanoseconds(channel_map.silence.max_age)
@@ -150,7 +156,8 @@ class Bridge:
 
     def _unmet(self, now_ns: int, *, awaited: bool) -> str:
         """The conditions that do not hold, as a sentence; those that an engagement awaits, or the others."""
-        rows = ((name, row) for name, row in self.channel_map.conditions.items() if row.awaited is awaited)
+        conditions = self.channel_map.conditions.items()
+        rows = ((name, row) for name, row in conditions if row.awaited is awaited and not (row.transmitter and self._blind))
         return "; ".join(filter(None, (self._violation(name, row, now_ns) for name, row in rows)))
 
     def _lost(self, now_ns: int) -> str:
@@ -184,6 +191,29 @@ class Bridge:
         silent = [f"no message on {row.topic} for {row.max_age:g} s" for name, row in rows if self._is_silent(name, now_ns)]
         return f"a pilot override has no effect: {'; '.join(silent)}" if silent else ""
 
+    def _blindness(self) -> str:
+        """What an engagement that does not see the loss of the transmitter lacks, and what still releases, as a sentence."""
+        if self._watches_transmitter and not self._blind:
+            return ""
+        rows = self.channel_map.overrides.items()
+        dead, working = (", ".join(name for name, row in rows if row.transmitter is by) for by in (True, False))
+        conditions = ", ".join(name for name, row in self.channel_map.conditions.items() if not row.transmitter)
+        releases = (
+            f"the override by {working}" if working else "",
+            f"a lost condition ({conditions})" if conditions else "",
+            "rise-di engage --off",
+            f"max_engaged after {self.channel_map.max_engaged:g} s" if self._end_ns else "",
+        )
+        where = "is not watched (--blind)" if self._watches_transmitter else "cannot be seen over this link"
+        without = f", and the override by {dead} has no effect then" if dead else ""
+        return f"the loss of the transmitter {where}{without}; released by {', '.join(filter(None, releases))}"
+
+    def _lacks(self, now_ns: int) -> str:
+        """What an engagement lacks, as a sentence."""
+        ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
+        warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again" if ends else ""
+        return "; ".join(filter(None, (warning, self._silent_overrides(now_ns), self._blindness())))
+
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
         return self.u_lock.timed_out(now_ns, self._max_age_ns)
@@ -203,6 +233,7 @@ class Bridge:
             lambda _: self.conflict,
             self._active_overrides,
             lambda now_ns: self._unmet(now_ns, awaited=False),
+            lambda _: "" if self._blind or self._watches_transmitter or self.channel_map.max_engaged else UNBOUNDED,
             self._missing,
             lambda _: self._outside(),
             lambda _: self._away_from_trim(),
@@ -235,15 +266,28 @@ class Bridge:
             return ""
         return f"{name}: its trim is {trim:.3g} now, and the limits [{row.lower:g}, {row.upper:g}] around it leave its range"
 
-    def engage(self, now_ns: int) -> str:
-        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence, empty where there is none."""
+    def engage(self, now_ns: int, *, blind: bool = False) -> str:
+        """Engage, or begin to: the phase tells. Returns the reason of a refusal as a sentence, empty where there is none.
+
+        `blind`: without regard to the loss of the transmitter, and without end. A request while engaged starts the time of
+        `max_engaged` again.
+        """
+        if self.phase is Phase.ENGAGED:
+            self._blind |= blind
+            self._begin_time(now_ns)
         if self.phase in {Phase.ENGAGED, Phase.ENGAGING}:
             return ""
-        refusal = self.refusal(now_ns)
-        if not refusal:
+        before, self._blind = self._blind, blind
+        if refusal := self.refusal(now_ns):
+            self._blind = before
+        else:
             self._enter(Phase.ENGAGING, now_ns)
             self._continue_engagement(now_ns)
         return refusal
+
+    def _begin_time(self, now_ns: int) -> None:
+        bound = None if self._blind else self.channel_map.max_engaged
+        self._end_ns = None if bound is None else now_ns + nanoseconds(bound)
 
     def _continue_engagement(self, now_ns: int) -> None:
         """Engage once the awaited conditions hold; give up after their time, or where something else would refuse."""
@@ -270,8 +314,9 @@ class Bridge:
     def step(self, now_ns: int) -> Phase:
         """Phase at an instant.
 
-        A stale y or u, a value outside the envelope, a lost condition or a conflicting publisher ends an engagement. The phases
-        ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a conflicting publisher.
+        A stale y or u, a value outside the envelope, a lost condition, a conflicting publisher or `max_engaged` ends an
+        engagement. The phases ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a
+        conflicting publisher.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -284,8 +329,10 @@ class Bridge:
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
                 self._enter(Phase.NEUTRAL, now_ns)
+            elif self._end_ns is not None and now_ns >= self._end_ns:
+                self.disengage(f"engaged for {self.channel_map.max_engaged:g} s, max_engaged of the map", now_ns)
             else:
-                self.reason = self._silent_overrides(now_ns)
+                self.reason = self._lacks(now_ns)
         times = self.channel_map.silence
         if self.phase is Phase.NEUTRAL and now_ns - self._phase_ns >= nanoseconds(times.neutral):
             self._enter(Phase.RELEASE, now_ns)
@@ -373,9 +420,12 @@ class Bridge:
         return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in own)
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
-        if phase is Phase.ENGAGED:
-            self.reason = self._silent_overrides(now_ns)
         self.phase, self._phase_ns = phase, now_ns
+        if phase is Phase.ENGAGED:
+            self._begin_time(now_ns)
+            self.reason = self._lacks(now_ns)
+        elif phase in {Phase.RELEASE, Phase.DISENGAGED}:
+            self._blind = False
 
 
 def _staleness(topic: str, reading: Reading | None, max_age: float, now_ns: int) -> str:

@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import JointState
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
@@ -89,6 +89,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         names = [f"{row.message}.{row.field}" for row in self._map.inputs.values()]
         self._would_send_encoder = self.encoder(names)
         self.create_service(SetBool, "~/engage", self._engage)
+        self.create_service(Trigger, "~/engage_blind", self._engage_blind)
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
         self._first_y, self._start_ns = False, 0
         self._report_ns = 0  # of the last report on the engagement
@@ -210,12 +211,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
                     self.get_logger().error(f"messages.{name} not sent: {error}", throttle_duration_sec=2.0)
 
     def _engage(self, request: Any, response: Any) -> Any:
-        now_ns = self.now_ns()
         if request.data:
-            self._find_conflicts()
-            response.message = self._bridge.engage(now_ns)
-        else:
-            self._bridge.disengage("disengaged by request", now_ns)
+            return self._request_engagement(response, blind=False)
+        self._bridge.disengage("disengaged by request", self.now_ns())
+        response.success = True
+        self._log_phase()
+        return response
+
+    def _engage_blind(self, request: Any, response: Any) -> Any:
+        return self._request_engagement(response, blind=True)
+
+    def _request_engagement(self, response: Any, *, blind: bool) -> Any:
+        self._find_conflicts()
+        response.message = self._bridge.engage(self.now_ns(), blind=blind)
         response.success = not response.message
         if response.message:
             self.get_logger().warning(f"not engaged: {response.message}")

@@ -148,6 +148,10 @@ class ConditionRow(WatchedRow):
     awaited: bool = Field(
         default=False, description="whether an engagement waits for the condition, up to `engage_timeout`, instead of a refusal"
     )
+    transmitter: bool = Field(
+        default=False,
+        description="whether the field tells the loss of the pilot's transmitter: an engagement with `--blind` ignores the row",
+    )
 
 
 class OverrideRow(WatchedRow):
@@ -160,6 +164,7 @@ class OverrideRow(WatchedRow):
     )
     bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
     max_age: Positive = Field(default=1.0, description="the age above which the override is not active any more, s")
+    transmitter: bool = Field(default=True, description="whether the override has no effect without the pilot's transmitter")
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
         """Whether the override is active. `at_engagement` is its value at engagement; None where it is not engaged."""
@@ -201,6 +206,10 @@ class ChannelMap(Config):
     )
     engage_timeout: Positive = Field(
         default=5.0, description="how long an engagement waits for its awaited conditions, s; then it is refused"
+    )
+    max_engaged: Positive | None = Field(
+        default=None,
+        description="how long an engagement lasts, s; needed without `--blind` where no condition tells the transmitter's loss",
     )
     silence: SilenceConfig = Field(description="failsafe for a u that times out")
     outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")

@@ -56,7 +56,7 @@ __all__ = ["ControlClient", "EngagementClient", "FlightMonitor", "Player", "Targ
 
 MODES = {float(mode): mode.name for mode in Mode}
 
-ENGAGE = "bridge/engage"  # the service of a bridge
+ENGAGE, ENGAGE_BLIND = "bridge/engage", "bridge/engage_blind"  # the services of a bridge
 SERVICE_TIMEOUT, WITHDRAW_TIMEOUT = 10.0, 1.0  # s
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
@@ -178,18 +178,20 @@ class EngagementClient(_Client):
         self._engagement_subscription = PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
 
-    def engage(self, progress: Callable[[str], None]) -> str:
+    def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> str:
         """Wait for u at trim and engage the bridge, which activates the controller. Returns the reason of a refusal, or "".
 
-        `progress` is called with what the bridge waits for, and with what it lacks once it is engaged. An engagement that is
-        not waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode later.
+        An engaged bridge takes the request at once: the time of `max_engaged` starts again. `blind`: without regard to the loss
+        of the transmitter. `progress` is called with what the bridge waits for, and with what it lacks once it is engaged. An
+        engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode later.
         """
         self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
-        self._spin_until(lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", FIRST_U)
-        self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
+        if self._phases[-1][0] != "ENGAGED":
+            self._spin_until(lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", FIRST_U)
+            self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
         self._received_phases().clear()
         try:
-            if refusal := self._set_engaged(engaged=True):
+            if refusal := self._engage_blind() if blind else self._set_engaged(engaged=True):
                 return refusal
             silent = "bridge/engagement: no change, expected ENGAGED or a reason"
             self._spin_until(lambda: self._settled(progress), silent, FIRST_U)
@@ -202,6 +204,9 @@ class EngagementClient(_Client):
         if reason:
             progress(f"warning: {reason}")
         return ""
+
+    def _engage_blind(self) -> str:
+        return str(self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message)
 
     def disengage(self) -> str:
         """Disengage the bridge. Returns its reason to refuse, or ""."""

@@ -12,18 +12,22 @@ REFUSED = 1
 
 def engage(
     off: Annotated[bool, typer.Option("--off", help="Disengage: give the channels back to the autopilot.")] = False,
+    blind: Annotated[
+        bool, typer.Option("--blind", help="Engage without regard to the pilot's transmitter, and without end by max_engaged.")
+    ] = False,
     namespace: Annotated[str, typer.Option(help="Namespace of the bridge and the controller.")] = "",
 ) -> None:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
     It waits until u is at trim, and until the autopilot has changed its mode where the map asks for that. The bridge activates
-    the controller, and deactivates it at the end of the engagement. Exit status: 0 done, 1 refused with the bridge's reason,
-    2 service not available.
+    the controller, and deactivates it at the end of the engagement. The loss of the pilot's transmitter ends the engagement
+    where the map has a condition for it; elsewhere max_engaged of the map ends the engagement, unless you engage again before.
+    Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """
     from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
-        refusal = client.disengage() if off else client.engage(lambda line: print(line, file=sys.stderr))
+        refusal = client.disengage() if off else client.engage(lambda line: print(line, file=sys.stderr), blind=blind)
     if refusal:
         print(f"error: not {'disengaged' if off else 'engaged'}: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
