@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Arguments of public functions: each is converted, or refused in one sentence."""
+"""Arguments of public functions: conversion, or refusal in one sentence."""
 
 import math
 import os
@@ -16,20 +16,20 @@ T = TypeVar("T")
 
 
 def as_path(value: FilePath, key: str, expected: str) -> Path:
-    """The path that a text or a path-like object names. Raises ParameterError for other values and for an empty text."""
+    """The path of a text or a path-like object. Raises ParameterError for a value of a different type and for an empty text."""
     text = os.fspath(value) if isinstance(value, str | os.PathLike) else b""
     require(isinstance(text, str) and text != "", key, short_repr(value), expected)
     return Path(value)
 
 
 def as_number(value: object, key: str, least: float, most: float = math.inf, unit: str = "") -> float:
-    """A finite number from `least` to `most`. Raises ParameterError for other values, with the unit."""
+    """A finite number from `least` to `most`. Raises ParameterError, with the unit, for a different value."""
     bounds = f"{least:g} or more{', ' * bool(unit)}" if most == math.inf else f"{least:g} to {most:g} "
     return float(_bounded(float, value, key, least, most, f"{bounds}{unit}".rstrip()))
 
 
 def as_count(value: object, key: str, least: int, most: float = math.inf) -> int:
-    """An integer from `least` to `most`. Raises ParameterError for other values."""
+    """An integer from `least` to `most`. Raises ParameterError for a different value."""
     bounds = f"of {least} or more" if most == math.inf else f"from {least} to {most:g}"
     return int(_bounded(int, value, key, least, most, f"an integer {bounds}"))
 
@@ -42,7 +42,7 @@ def _bounded(number: type[float], value: object, key: str, least: float, most: f
 
 
 def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
-    """Finite numbers from a list, a tuple or an array, or from a single number. Raises ParameterError for other values."""
+    """Finite numbers from a list, a tuple or an array, or from a single number. Raises ParameterError for a different value."""
     problems = Problems()
     read = kind_of(float | tuple[float, ...]).read(value, key, problems)
     require(not problems.sentences(), key, short_repr(value), expected)
@@ -50,7 +50,7 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
 
 
 def as_instance(value: object, kind: type[T], key: str, expected: str) -> T:
-    """The value, of a class. Raises ParameterError for a value of another class."""
+    """The value, of a class. Raises ParameterError for a value of a different class."""
     if not isinstance(value, kind):
         raise ParameterError(f"{key}: found {short_repr(value)}, expected {expected}")
     return value

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Channels that several nodes share by their names: docs/interfaces.md."""
+"""Channels shared by several nodes, by name: docs/interfaces.md."""
 
 RATES_AND_SPEED = ("q", "V", "p", "r")
 """Channels of y, y_m and u_m in a guided flight: rad/s in body axes, and m/s from trim."""
 
 ATTITUDE = ("phi", "theta")
-"""Channels of u_m beside the commands: bank, and pitch above that of level flight, rad. They serve its ending alone."""
+"""Channels of u_m beside the commands: bank, and pitch above the pitch of level flight, rad; for the end of u_m alone."""
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east", "climb", "beta")
 """Channels of `pose`: attitude, rad (body FRD in NED, psi from true north in (-pi, pi]); position, m; velocity over ground,
-m/s; sideslip, rad, which counts as 0 where it is not measured."""
+m/s; sideslip, rad, which counts as 0 where sideslip is not measured."""

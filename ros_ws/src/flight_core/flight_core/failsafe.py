@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Failsafe for an input that times out: hold the last value, then ramp it to trim."""
+"""Failsafe for a stale input: hold the last value, then ramp to trim."""
 
 
 def failsafe_scale(silence_ns: int, hold_ns: int, ramp_ns: int) -> float:

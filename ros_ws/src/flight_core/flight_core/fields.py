@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values of a parameter set: what an annotation permits, and the sentence about a value that does not fit.
+"""Values of a parameter set: permission by an annotation, and the sentence about a value not permitted.
 
 Types are strict. An int is accepted as a float, a sequence as a tuple, an array or a scalar of NumPy as lists and numbers, and
 a path as a str; nothing else is converted. The annotations are float, int, bool, str, object, Literal, tuple, dict, unions of
@@ -37,30 +37,30 @@ short_repr = _ShortRepr().repr
 
 
 class Problems:
-    """Sentences about values that do not fit."""
+    """Sentences about values not permitted."""
 
     def __init__(self) -> None:
         self.unknown: list[str] = []  # keys
         self.others: list[str] = []
 
     def sentences(self) -> list[str]:
-        """All of them. A mistyped key is before the key that is missing because of it."""
+        """Unknown keys first: a mistyped key is before the key missing because of the mistake."""
         return self.unknown + self.others
 
     def refuse(self, key: str, value: object, expected: str) -> None:
-        """Add that a key has a value other than the expected one."""
+        """Add a sentence: the value found for a key, and the expected value."""
         self.others.append(f"{key}: found {short_repr(value)}, expected {expected}")
 
 
 class Kind(NamedTuple):
-    """What an annotation permits."""
+    """Values permitted by an annotation."""
 
-    expected: str  # for the sentence about a value of another type
+    expected: str  # for the sentence about a value of a different type
     takes: Callable[[Any], bool]  # whether a value has the type
-    content: Callable[[Any, str, Problems], Any]  # (value of the type, its key, problems) -> the value that the set holds
+    content: Callable[[Any, str, Problems], Any]  # (value of the type, key, problems) -> the value in the set
 
     def read(self, value: object, key: str, problems: Problems) -> Any:
-        """The value that the set holds; a value that does not fit is added to `problems`."""
+        """The value for the set. A value not permitted adds a sentence to `problems`."""
         if hasattr(value, "dtype") and hasattr(value, "tolist"):  # an array or a scalar of NumPy
             value = value.tolist()
         if self.takes(value):
@@ -84,7 +84,7 @@ LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
 
 
 def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) -> Kind:
-    """An int, or a float, which may be infinite or NaN only with `allow_inf_nan`."""
+    """An int, or a float: infinite or NaN only with `allow_inf_nan`."""
     if unknown := limits.keys() - LIMITS.keys():
         raise TypeError(f"a number has no rule {', '.join(sorted(unknown))}")
     checks = [(*LIMITS[rule], limits[rule]) for rule in LIMITS if rule in limits]
@@ -121,9 +121,9 @@ def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
 
 
 def _choice(choices: Sequence[object], expected: str = "") -> Kind:
-    """One of some values, of the same type: 1 is neither True nor 1.0."""
-    named = expected or _either([repr(one) for one in choices])
-    return Kind(named, lambda value: any(type(value) is type(one) and value == one for one in choices), _same)
+    """A value among choices, of the same type: 1 is neither True nor 1.0."""
+    named = expected or _either([repr(choice) for choice in choices])
+    return Kind(named, lambda value: any(type(value) is type(choice) and value == choice for choice in choices), _same)
 
 
 def _check_count(count: int, key: str, problems: Problems, least: float, most: float) -> None:
@@ -133,18 +133,18 @@ def _check_count(count: int, key: str, problems: Problems, least: float, most: f
 
 
 def _values(parts: Sequence[Any], *, min_length: float = 0, max_length: float = math.inf) -> Kind:
-    """A tuple: of any length with values of one kind, or of a value of each of some kinds."""
+    """A tuple: of any length with values of one kind, or with a value per kind."""
     repeated = parts[-1] is Ellipsis
-    kinds = [kind_of(one) for one in parts if one is not Ellipsis]
+    kinds = [kind_of(part) for part in parts if part is not Ellipsis]
     least, most = (min_length, max_length) if repeated else (len(kinds), len(kinds))
 
     def content(value: Sequence[Any], key: str, problems: Problems) -> tuple[Any, ...]:
         _check_count(len(value), key, problems, least, most)
         each = zip(kinds * len(value) if repeated else kinds, value, strict=False)
-        return tuple(kind.read(one, f"{key}[{i}]", problems) for i, (kind, one) in enumerate(each))
+        return tuple(kind.read(item, f"{key}[{i}]", problems) for i, (kind, item) in enumerate(each))
 
     def takes(value: object) -> bool:
-        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))  # of YAML and of ROS it is no tuple
+        return isinstance(value, Sequence) and not isinstance(value, (str, bytes))  # YAML and ROS give no tuple
 
     return Kind("a list of values", takes, content)
 
@@ -156,11 +156,11 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
-        for given, one in value.items():
+        for given, item in value.items():
             is_number = parts[0] is int and isinstance(given, str) and re.fullmatch(r"-?\d{1,18}", given)  # a key of JSON
             name = int(given) if is_number else given
             if keys.takes(name):
-                table[name] = values.read(one, f"{key}.{name}", problems)
+                table[name] = values.read(item, f"{key}.{name}", problems)
             else:
                 problems.others.append(f"{key}: found the key {short_repr(name)}, expected a name")
         return table
@@ -181,16 +181,16 @@ def _group(schema: Any) -> Kind:
 
 
 def _union(kinds: Sequence[Kind]) -> Kind:
-    """A value of the first kind that it fits."""
+    """A value of the first fitting kind."""
 
     def content(value: Any, key: str, problems: Problems) -> Any:
         trial = Problems()
         for kind in kinds:
             if kind.takes(value):
                 trial = Problems()
-                found = kind.content(value, key, trial)
+                converted = kind.content(value, key, trial)
                 if not trial.sentences():
-                    return found
+                    return converted
         problems.unknown += trial.unknown
         problems.others += trial.others
         return None
@@ -217,23 +217,23 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
-    """What an annotation permits under rules such as gt. Raises TypeError for an annotation or a rule that is not known."""
+    """Values permitted by an annotation under rules, e.g. gt. Raises TypeError for an unknown annotation or rule."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
-        return kind_of(parts[0], {rule: limit for one in parts[1:] for rule, limit in one.rules.items()} | dict(rules))
+        return kind_of(parts[0], {rule: limit for field in parts[1:] for rule, limit in field.rules.items()} | dict(rules))
     if origin in (Union, UnionType):
-        return _union([kind_of(one, {} if one is NoneType else rules) for one in parts])
+        return _union([kind_of(part, {} if part is NoneType else rules) for part in parts])
     if origin in GENERIC:
         return GENERIC[origin](parts, **rules)
     return SIMPLE[annotation](**rules) if annotation in SIMPLE else _group(annotation, **rules)
 
 
 REQUIRED: Any = object()
-"""Default of a field without one."""
+"""Default of a field without a default."""
 
 
 class FieldInfo:
-    """Declaration of a field; in Annotated its rules alone."""
+    """Declaration of a field; in Annotated the rules alone."""
 
     annotation: Any = None
 
@@ -247,7 +247,7 @@ class FieldInfo:
 
 
 def Field(default: Any = REQUIRED, *, description: str = "", **rules: Any) -> Any:  # noqa: N802 - the name in pydantic
-    """Declare the default of a field, its meaning and its rules.
+    """Declare the default, the meaning and the rules of a field.
 
     Rules are gt, ge, lt, le and allow_inf_nan of a number, min_length and pattern of a string, min_length and max_length of a
     tuple and of a dict.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Input and output files: existence checks, YAML, atomic replacement, sentences for files that cannot be read or written."""
+"""Input and output files: existence checks, YAML, atomic replacement, sentences for unreadable or unwritable files."""
 
 import errno
 import math
@@ -20,8 +20,8 @@ from yaml.composer import Composer
 from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, require
 
-# Exceptions of PyYAML. It raises its own for invalid syntax, the others for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
-# or for nesting that is too deep.
+# Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
+# or for too deep nesting.
 NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 INT_TAG, FLOAT_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
@@ -30,17 +30,17 @@ MAX_FILE_BYTES = 1 << 19
 """Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB and 5 us a byte."""
 
 MAX_YAML_NODES = 100_000
-"""Values of a file after expansion of its aliases. A few lines of nested aliases can expand to billions of values."""
+"""Values of a file after expansion of the aliases. A few lines of nested aliases can expand to billions of values."""
 
 
 INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)|0o[0-7]+|0x[0-9a-fA-F]+")
 FLOAT = re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 """Numbers of the core schema of YAML 1.2.2, section 10.3.2, without leading zeros: 060 is 48 by YAML 1.1 and 60 by YAML 1.2.
-The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000. All three are strings here, so no number is guessed."""
+The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000. These are strings here, so no number is guessed."""
 
 
 class _Loader(Composer, yaml.CSafeLoader):
-    """Reads numbers as YAML 1.2, rejects duplicate keys and aliases that expand to more than MAX_YAML_NODES values.
+    """Reads numbers as YAML 1.2, rejects duplicate keys and an expansion of aliases to more than MAX_YAML_NODES values.
 
     PyYAML keeps the last of duplicate keys. libyaml parses, nine times as fast as Python. Python composes: where nesting is
     deep, libyaml's binding exhausts the stack.
@@ -68,7 +68,7 @@ class _Loader(Composer, yaml.CSafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes each string that `_Loader` would read as a number."""
+    """Quotes a string that `_Loader` would read as a number."""
 
 
 def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -86,12 +86,12 @@ _Loader.add_constructor(INT_TAG, _integer)
 
 
 def dump_yaml(value: object, *, flow: bool | None = None) -> str:
-    """A value as YAML text that `parse_yaml` reads back: lists of scalars in one line, everything in blocks with flow False."""
+    """A value as YAML text for `parse_yaml`: lists of scalars in one line, everything in blocks with flow False."""
     return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=flow, width=128)
 
 
 def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Number of nodes after expansion of all aliases; infinite for a node that contains itself. `sizes` caches by identity."""
+    """Number of nodes after expansion of aliases; infinite for a recursive node. `sizes` caches by identity."""
     if isinstance(node, yaml.ScalarNode):
         return 1
     if id(node) not in sizes:
@@ -102,7 +102,7 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
 
 
 def is_file(path: Path) -> bool:
-    """Whether the path is a file; False also for an invalid path, such as one that is too long."""
+    """Whether the path is a file; False also for an invalid path, e.g. too long a path."""
     return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises OSError and ValueError
 
 
@@ -117,7 +117,7 @@ def names_in(library: Path) -> list[str]:
 
 
 def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
-    """The file of a name in a library, or the path of a file that ends in .yaml. Raises ParameterError with the names.
+    """The file of a name in a library, or the path of a .yaml file. Raises ParameterError with the names.
 
     `key` and `kind` are of the sentence: "scenario", "a scenario file".
     """
@@ -135,7 +135,7 @@ def open_nonblocking(path: str | Path) -> BinaryIO:
 
 @contextmanager
 def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
-    """Turn an OSError inside the block into a ParameterError: `key`, the `path` that cannot be written, and `expected`.
+    """Turn an OSError inside the block into a ParameterError: `key`, the unwritable `path`, and `expected`.
 
     `key` may be empty.
     """
@@ -147,9 +147,9 @@ def writing(key: str, path: str | Path, expected: str) -> Iterator[None]:
 
 
 def read_file(path: Path, key: str, expected: str) -> bytes:
-    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for one that cannot be read or is longer.
+    """Content of an input file of at most MAX_FILE_BYTES. Raises ParameterError for an unreadable or longer file.
 
-    `key` names the file in the sentence, `expected` what it should be.
+    `key` names the file in the sentence, `expected` the right content.
     """
     try:
         with open_nonblocking(path) as stream:
@@ -188,8 +188,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Write a file atomically: the stream becomes the file at `path` once the block ends, and is removed after an error.
 
     After a crash, a kill or a full disk the file has either the new or the old content. The stream is a fresh file in the same
-    folder, so nothing is written through a link at `path`: the file replaces the link. Raises OSError, also for a `path` that
-    exists and is no regular file, such as a folder or a device.
+    folder, so nothing is written through a link at `path`: the file replaces the link. Raises OSError, also for an existing
+    `path` that is no regular file, e.g. a folder or a device.
     """
     with suppress(FileNotFoundError):  # also of a link to nothing
         mode = path.stat().st_mode
@@ -214,7 +214,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def _umask() -> int:
-    """The permissions that new files of this process lack; the only way to read them is to set them."""
+    """The permissions withheld from new files of this process. umask(2) returns the mask only while setting a new mask."""
     mask = os.umask(0o077)
     os.umask(mask)
     return mask

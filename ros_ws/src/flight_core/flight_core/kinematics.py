@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Euler's kinematics of bank and pitch, and their inverse in a coordinated turn. Angles in rad, rates in rad/s, body axes FRD.
 
-Arguments are Python floats, or arrays with a value for each aircraft of a fleet.
+Arguments are Python floats, or arrays with a value per aircraft of a fleet.
 Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), chapters 2, 3 and 9.
 """
 
@@ -35,7 +35,7 @@ def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> S
 
 
 def body_rates(phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r: Scalar) -> tuple[Scalar, Scalar]:
-    """P and q that turn the attitude at these rates beside r, the inverse of `euler_rates`:
+    """P and q for these rates of the attitude beside r, the inverse of `euler_rates`:
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
     """  # noqa: D400, D415 - what follows is an equation

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mode of the controller, which its node publishes in `internals` and which guidance, log and page read."""
+"""Mode of the controller: published by the controller in `internals`, read by guidance, log and page."""
 
 from enum import IntEnum
 

@@ -6,7 +6,7 @@ from flight_core.text import bounded
 
 COMPLETED = "completed"
 INTERRUPTED = "interrupted"
-LOST_CONTACT = "lost contact with"  # before the name of another node: the end of a node that is not the cause
+LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Validated parameter sets: one declaration for each set, one sentence for each error.
+"""Validated parameter sets: a declaration per set, a sentence per error.
 
-A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping that a scenario file or a ROS
-node holds. The first value that does not fit becomes a `ParameterError` of one sentence: the key, what was found, what is
-expected.
+A set is a frozen class of annotated fields. `validate_mapping` builds it from the nested mapping of a scenario file or of
+a ROS node. The first value not permitted becomes a `ParameterError` of one sentence: the key, what was found, what is expected.
 
-Declarations and methods have the names of pydantic 2, which is not used: Ubuntu 24.04 has its release 1.10, with another
-interface and no strict types, and with pydantic 2 the parameters of a node took twice as long to import.
+Declarations and methods have the names of pydantic 2. The stack does not use pydantic: Ubuntu 24.04 has release 1.10, with a
+different interface and no strict types, and with pydantic 2 the parameters of a node took twice as long to import.
 """
 
 import difflib
@@ -41,7 +40,7 @@ class Config:
     """Base of every parameter set: frozen, finite, strictly typed (an int is accepted as a float), without unknown keys."""
 
     model_fields: ClassVar[dict[str, FieldInfo]] = {}
-    """The fields by name, those of bases first."""
+    """The fields by name, fields of bases first."""
 
     def __init_subclass__(cls) -> None:
         own = {}
@@ -73,24 +72,24 @@ class Config:
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
-        """Build the set from a nested mapping; `where` is its name in errors, e.g. "controller".
+        """Build the set from a nested mapping; `where` names the set in errors, e.g. "controller".
 
-        Raises ParameterError with one sentence for the first key that does not fit.
+        Raises ParameterError with a sentence for the first key not permitted.
         """
         problems = Problems()
         try:
-            found = cls.read(values, where, problems)
-        except ArithmeticError as error:  # of a check that computes with several keys
+            built = cls.read(values, where, problems)
+        except ArithmeticError as error:  # of a check with several keys
             too_far = f"numbers too large or too small ({error.args[-1]})"
             raise ParameterError(f"{where}: found {too_far}, expected those of a flight") from None
-        if found is None:
+        if built is None:
             first, *others = problems.sentences()
             raise ParameterError(first + (f" (and {len(others)} more)" if others else ""))
-        return found
+        return built
 
     @classmethod
     def read(cls, values: Mapping[Any, Any], key: str, problems: Problems) -> Self | None:
-        """Build the set from a nested mapping; if a value does not fit, None, and it is added to `problems`."""
+        """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not permitted."""
         before, content = len(problems.sentences()), {}
         for name, field in cls.model_fields.items():
             if name in values:
@@ -105,25 +104,27 @@ class Config:
             elif name in REMOVED and name not in cls.model_fields:
                 problems.unknown.append(f"{key}.{name}: {REMOVED[name]}")
             elif name not in cls.model_fields:
-                near = [f"{one} perhaps, or another" for one in difflib.get_close_matches(name, sorted(cls.model_fields), n=1)]
+                near = [
+                    f"{match} perhaps, or another" for match in difflib.get_close_matches(name, sorted(cls.model_fields), n=1)
+                ]
                 known = f"{(near or ['one'])[0]} of {', '.join(sorted(cls.model_fields))}"
                 problems.unknown.append(f"{key}.{name}: unknown key, expected {known}")
         if len(problems.sentences()) > before:
             return None
-        found = cls.__new__(cls)
-        vars(found).update(content, _given=frozenset(values))
+        built = cls.__new__(cls)
+        vars(built).update(content, _given=frozenset(values))
         try:
-            found._check()
-        except ValueError as error:  # `require` raised it, with the rest of the key and the sentence
+            built._check()
+        except ValueError as error:  # from `require`, with the rest of the key and the sentence
             problems.others.append(f"{key}.{error}")
             return None
-        return found
+        return built
 
     def _check(self) -> None:
-        """Check the values against each other. Raises ParameterError."""
+        """Check relations between the values. Raises ParameterError."""
 
     def model_copy(self, *, update: Mapping[str, Any]) -> Self:
-        """A copy with other values, which are not checked."""
+        """A copy with new values, without a check."""
         copy = type(self).__new__(type(self))
         values = {name: getattr(self, name) for name in self.model_fields}
         vars(copy).update(values | dict(update), _given=vars(self)["_given"] | update.keys())
@@ -146,7 +147,7 @@ class Config:
                     mode=mode, exclude_none=exclude_none, exclude_defaults=exclude_defaults, exclude_unset=exclude_unset
                 )
             if isinstance(value, dict):
-                return {name: plain(one) for name, one in value.items()}
+                return {name: plain(item) for name, item in value.items()}
             if isinstance(value, (tuple, list)):
                 return (list if mode == "json" else type(value))(map(plain, value))
             return value
@@ -166,7 +167,7 @@ class Config:
 
     @classmethod
     def model_validate_json(cls, text: str) -> Self:
-        """Build the set from JSON. Raises ValueError, which is a ParameterError if the text is JSON."""
+        """Build the set from JSON. Raises ParameterError, and ValueError for a text that is not JSON."""
         try:
             values = json.loads(text)
         except RecursionError:
@@ -182,7 +183,7 @@ class NodeConfig(Config):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Parameters that may change in flight: dotted names, or names of groups of which all members may."""
+        """Parameters that may change in flight: dotted names, or names of groups as a whole."""
         return frozenset()
 
 
@@ -202,7 +203,7 @@ def require(condition: bool, key: str, found: object, expected: str) -> None:
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:
-    """Raise ParameterError unless there is one value for each named channel."""
+    """Raise ParameterError unless the number of values is the number of channels."""
     require(len(values) == len(names), key, f"{len(values)} values", f"{len(names)}, one for each of {', '.join(names)}")
 
 
@@ -216,7 +217,7 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nest(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name with both value and group."""
+    """Dotted names -> nested mapping, the inverse of `flatten`. Raises ParameterError for a name of a value and of a group."""
     tree: dict[str, Any] = {}
     for name, value in flat.items():
         *groups, leaf = name.split(".")

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Publisher lock of a topic that must have one publisher: samples of a conflicting publisher are ignored.
+"""Publisher lock of a topic with a single publisher: samples of a conflicting publisher are ignored.
 
-A message names its publisher in `frame_id`.
+A message names the publisher in `frame_id`.
 """
 
 from flight_core.vectors import ChannelError
@@ -17,10 +17,10 @@ def publisher_of(frame_id: str) -> str:
 
 
 class PublisherLock:
-    """Locks to the first publisher of a topic, until its samples time out; then to the next one.
+    """Locks to the first publisher of a topic, until the samples time out; then to the next publisher.
 
-    A restarted node, which has the same name, may take over earlier than another node. Overruns of the node that receives do
-    not count: after one, a sample of another publisher may be the first that it takes.
+    A restarted node, of the same name, may take over earlier than a different node. Overruns of the receiving node do not
+    count: the first sample after an overrun may come from a different publisher.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class PublisherLock:
         return now_ns - self._received_ns
 
     def timed_out(self, now_ns: int, max_age_ns: int) -> bool:
-        """Whether there is no publisher, or its last sample is older than the age limit."""
+        """Whether there is no publisher, or the last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
     def overran(self, duration_ns: int) -> None:
@@ -41,9 +41,9 @@ class PublisherLock:
         self._overrun_ns += duration_ns
 
     def check(self, sender: str, now_ns: int, max_age_ns: int, takeover_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a sample of another publisher while the locked one has not timed out.
+        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked publisher times out.
 
-        The timeout is `max_age_ns` for the same node in another process, `takeover_ns` for another node.
+        The timeout is `max_age_ns` for the same node in a new process, `takeover_ns` for a different node.
         """
         if sender == self.publisher:
             return
@@ -52,7 +52,7 @@ class PublisherLock:
             raise ChannelError(SENDER, f"conflicting publisher {sender} ignored: already receiving from {self.publisher}")
 
     def refresh(self, sender: str, now_ns: int) -> bool:
-        """Lock to the publisher of a valid sample. Returns whether it is another one than before."""
+        """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""
         changed, self.publisher, self._received_ns = sender != self.publisher, sender, now_ns
         self._overrun_ns = 0
         return changed

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rates and periods. A period is a whole number of nanoseconds, so that k periods add up exactly."""
+"""Rates and periods. A period is a whole number of nanoseconds: k periods add up exactly."""
 
 from flight_core.parameters import ParameterError, require
 
@@ -26,7 +26,7 @@ def period_ns(rate: float, key: str) -> int:
 
 
 def divide(whole_ns: int, part_ns: int, key: str, whole: str) -> int:
-    """Number of parts in the whole. Raises ParameterError naming `key` unless it is an integer."""
+    """Number of parts in the whole. Raises ParameterError naming `key` unless the number is an integer."""
     if part_ns <= 0 or whole_ns % part_ns:  # asked first: the sentence takes longer than the division
         expected = f"a whole fraction of {whole} ({seconds(whole_ns):g} s)"
         raise ParameterError(f"{key}: found {seconds(part_ns):g} s, expected {expected}")

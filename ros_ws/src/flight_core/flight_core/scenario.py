@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario files: one ROS parameter file with a section for each node, read without ROS.
+"""Scenario files: a ROS parameter file with a section per node, read without ROS.
 
 /**/controller:
   ros__parameters:
@@ -21,8 +21,8 @@ A_SCENARIO = "a scenario file"
 def parse_sections(content: bytes, path: Path, expected: tuple[str, ...], optional: tuple[str, ...] = ()) -> Sections:
     """Sections of the content of a scenario file by node name, e.g. {"controller": {"rate": 100.0, ...}}.
 
-    Raises ParameterError, which names the path, for content that is no scenario file or too long, has a duplicate key, or lacks
-    or adds a section; those in `optional` may be absent, or an empty mapping: every parameter by default.
+    Raises ParameterError with the path for content that is no scenario file or too long, has a duplicate key, or lacks or adds
+    a section. A section in `optional` may be absent, or an empty mapping: every parameter by default.
     """
     tree = parse_yaml(limited(content, str(path), A_SCENARIO), str(path), A_SCENARIO)
     require(isinstance(tree, dict), str(path), f"{type(tree).__name__}", f"a mapping with {', '.join(expected)}")

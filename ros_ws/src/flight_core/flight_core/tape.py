@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The tape: the in-memory log of a flight, in one process, over topics or read from a bag."""
+"""The tape: the in-memory log of a flight, from a single process, over topics or read from a bag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from flight_core.vectors import FloatArray
 
 @dataclass(frozen=True)
 class Signal:
-    """One topic: N samples of k named channels, SI units and radians.
+    """A topic: N samples of k named channels, SI units and radians.
 
-    stamp_ns: shape (N,), int64, the instant of each sample, ascending. values: shape (N, k), of a log with each channel
+    stamp_ns: shape (N,), int64, the instants of the samples, ascending. values: shape (N, k), of a log with a channel
     contiguous in memory.
     """
 
@@ -27,7 +27,7 @@ class Signal:
     values: FloatArray
 
     def __getitem__(self, name: str) -> FloatArray:
-        """Samples of one channel, shape (N,). Raises ParameterError that lists the channels."""
+        """Samples of a channel, shape (N,). Raises ParameterError with the list of channels."""
         if name not in self.names:
             raise ParameterError(f"the log: found no channel {name} among {', '.join(self.names)}, expected one")
         return self.values[:, self.names.index(name)]
@@ -42,7 +42,7 @@ class Signal:
         return Signal(self.stamp_ns[keep], self.names, self.values[keep])
 
     def after(self, earlier: "Signal | None") -> "Signal":
-        """The samples of an earlier part, if there is one, then these; both have the same channels."""
+        """The samples of an earlier part, if any, then these; the channels are the same."""
         if earlier is None:
             return self
         stamp_ns = np.concatenate([earlier.stamp_ns, self.stamp_ns])
@@ -64,7 +64,7 @@ class Signal:
 
 @dataclass(frozen=True)
 class Tape:
-    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` one of flight_core.outcome."""
+    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome."""
 
     signals: Mapping[str, Signal]
     start_ns: int = 0
@@ -72,7 +72,7 @@ class Tape:
     outcome: str = COMPLETED
 
     def __getitem__(self, topic: str) -> Signal:
-        """The signal of a topic. Raises ParameterError that lists the topics."""
+        """The signal of a topic. Raises ParameterError with the list of topics."""
         if topic not in self.signals:
             raise ParameterError(f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, expected one")
         return self.signals[topic]
@@ -81,5 +81,5 @@ class Tape:
         return topic in self.signals
 
     def time(self, topic: str) -> FloatArray:
-        """Flight time of each sample of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
+        """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
         return (self[topic].stamp_ns - self.start_ns) / NANOSECONDS

@@ -6,7 +6,7 @@ MAX_LENGTH = 1000  # characters of a sentence, however long the bad input is
 
 
 def printable(text: str) -> str:
-    """A text with unprintable characters, such as line ends and terminal control codes, written as escapes."""
+    """A text with unprintable characters, e.g. line ends and terminal control codes, written as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 

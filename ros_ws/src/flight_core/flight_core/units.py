@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Units of airframe files. Values are converted to SI once, at load; all other code uses SI and radians."""
+"""Units of airframe files. Values are converted to SI once, at load; the code uses SI and radians."""
 
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
 
-GRAVITY = 9.81  # standard gravity as the airframes round it, m/s^2
+GRAVITY = 9.81  # standard gravity as rounded in the airframes, m/s^2
 
 SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
     {
@@ -22,4 +22,4 @@ SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
         "%": 0.01,
     }
 )
-"""SI value (rad, rad/s, m/s, 1) of one of each unit: value_SI = value * SI_PER_UNIT[unit]."""
+"""SI value (rad, rad/s, m/s, 1) of a unit: value_SI = value * SI_PER_UNIT[unit]."""

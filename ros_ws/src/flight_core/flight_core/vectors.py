@@ -15,12 +15,12 @@ from flight_core.text import bounded
 
 FloatArray = NDArray[np.float64]
 Array = Any  # an array of NumPy or of JAX
-Scalar = Any  # a Python float, or an array with a value for each aircraft of a fleet
+Scalar = Any  # a Python float, or an array with a value per aircraft of a fleet
 FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
 
 class _NumPy1:
-    """NumPy 1 with the one function of the array API standard that this stack uses and NumPy 1 lacks."""
+    """NumPy 1 with `concat`, used by this stack and missing in NumPy 1."""
 
     concat = staticmethod(np.concatenate)
 
@@ -39,12 +39,12 @@ class _Floats:
     minimum, maximum = min, max
 
     @staticmethod
-    def where(condition: bool, one: float, other: float) -> float:
-        return one if condition else other
+    def where(condition: bool, x1: float, x2: float) -> float:
+        return x1 if condition else x2
 
 
 def array_namespace(array: Scalar) -> Any:
-    """The array namespace of an array, as the array API standard defines it; `_Floats` for a Python float.
+    """The array namespace of an array by the array API standard; `_Floats` for a Python float.
 
     NumPy 1 arrays lack `__array_namespace__`.
     """
@@ -54,7 +54,7 @@ def array_namespace(array: Scalar) -> Any:
 
 
 class StampedVector(NamedTuple):
-    """The values of a sample, shape (m,), the instant to which they belong, and the publisher that sent them."""
+    """The values of a sample, shape (m,), the instant of the values, and the publisher."""
 
     stamp_ns: int
     value: FloatArray
@@ -70,7 +70,7 @@ class ChannelError(ValueError):
 
 
 def require_newer(stamp_ns: int, last_ns: int, what: str = "sample") -> None:
-    """Raise ChannelError, reason "order", unless a stamp is newer than the last one; `what` names the sample."""
+    """Raise ChannelError, reason "order", unless a stamp is newer than the last stamp; `what` names the sample."""
     if stamp_ns <= last_ns:
         raise ChannelError("order", f"{what}: stamp {seconds(last_ns - stamp_ns):g} s before the last one")
 
