@@ -671,7 +671,11 @@ def test_a_parameter_of_another_law_is_refused() -> None:
         ),
         ("pid", {"filter_time": [0.0] * 4}, "controller.filter_time[0]: found 0.0, expected greater than 0"),
         ("pid", {"lead": [1.0] * 3}, "controller.lead: found 3 values, expected 4, one for each of q, p, r, V"),
-        ("lqg, observer", {"observer": None}, "controller.observer: found none, expected a section: it is the feedback of lqg"),
+        (
+            "lqg, observer",
+            {"observer": None},
+            "controller.observer: found none, expected a section: the observer is the feedback of lqg",
+        ),
     ],
 )
 def test_invalid_parameter_of_law_refused(name: str, changes: dict[str, Any], sentence: str) -> None:

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Control laws other than RISE-DI, each a module of equations."""
+"""Control laws to compare with RISE-DI, a module of equations per law."""

@@ -16,7 +16,7 @@ from rise_di_controller.control_law import ControlLaw
 from rise_di_controller.law import Sign
 from rise_di_controller.observer import ObserverParams, with_observer
 
-Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) where one serves all channels; all of them positive
+Gains = dict[str, FloatArray]  # gains by name, shape (m, N), or (1, N) for all channels; positive
 
 INITIAL_CROSSOVER_LAG_PRODUCT = 0.4
 """rad, bandwidth times the lag of the loop at the start of a search: 23 degrees of phase at the crossover."""
@@ -37,10 +37,10 @@ INITIAL_CHANNEL_GAINS = {
 """Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
 
 INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
-"""Initial gains that are common to all channels."""
+"""Initial gains common to all channels."""
 
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
-"""Noise of the wind, m/s per root s, and its time constant, s, the same for each axis. Dryden's L / V0 at 100 m and 25 m/s is
+"""Noise of the wind, m/s per root s, and the time constant, s, the same for every axis. Dryden's L / V0 at 100 m and 25 m/s is
 4 s vertically and 10 s along the flight; a design gust of 15 m peaks after 0.6 s."""
 
 
@@ -49,15 +49,15 @@ NONE, AIRCRAFT, INTEGRATORS = "none", "aircraft", "integrators"
 
 
 class Law(NamedTuple):
-    """One law."""
+    """A law."""
 
     title: str
     measurements: str  # of the aircraft, besides y_m
     model_data: str  # of the nominal aircraft, besides D
     control_law: Callable[[NominalModel], ControlLaw]
     params: Callable[[Gains, NominalModel], Any]
-    tuned: tuple[str, ...]  # names of its gains
-    feedforward: str = NONE  # model of its feedforward
+    tuned: tuple[str, ...]  # names of the gains
+    feedforward: str = NONE  # model of the feedforward
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
@@ -82,7 +82,7 @@ def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
 
 
 def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
-    """A law that does not depend on the model."""
+    """A law independent of the model."""
     return lambda _: law
 
 
@@ -98,7 +98,7 @@ FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, Nom
     "mrac": ("MRAC", mrac.control_law, mrac.mrac_params, ("K", "adaptation", "bias", "leak")),
     "lqi": ("LQI", lqi.control_law, lqi.lqi_params, ("integral", "effort", "fade")),
 }
-"""Title, law, parameters and tuned gains of the laws of the full state; each also flies with vanes, relative to the air."""
+"""Title, law, parameters and tuned gains of the laws of the full state; these laws also fly with vanes, relative to the air."""
 
 LAWS: dict[str, Law] = {
     "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di.params_of, _rise_gains),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Excitation of one input after another, open loop: doublets and a multisine, for an identification. It controls nothing."""
+"""Excitation of the inputs in turn, open loop and without control: doublets and a multisine, for an identification."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -18,33 +18,33 @@ DOUBLETS = 8.0  # widths: a doublet of 2, a gap of 1, the opposite doublet of 4,
 
 
 class ExcitationParams(NamedTuple):
-    """Timetable over m inputs, (m,), and the harmonics of their multisines, (h, m)."""
+    """Timetable over m inputs, (m,), and the harmonics of the multisines, (h, m)."""
 
     amplitude: Array  # units of u
     width: Array  # s
     begin: Array  # s after engagement: of the doublets of an input
-    period: Array  # s, of the multisine; it lasts one period
+    period: Array  # s, of the multisine, also the duration
     harmonic: Array  # multiples of 1 / period
     phase: Array  # rad
-    part: Array  # of the amplitude; 0 where an input has fewer harmonics than others
+    part: Array  # of the amplitude; 0 beyond the harmonics of an input
 
 
 class ExcitationState(NamedTuple):
     """State between two ticks, (m,)."""
 
-    e: Array  # y - y_m, which this law shows and does not correct
+    e: Array  # y - y_m, shown and not corrected by this law
     elapsed: Array  # s since engagement, the same for every input
 
 
 def signal(elapsed: Array, params: ExcitationParams) -> Array:
-    """Excitation of every input in units of its amplitude, shape (m,), in [-1, 1].
+    """Excitation of every input in units of the amplitude, shape (m,), in [-1, 1].
 
     With tau = elapsed - begin in widths w of an input:
 
         +1 in [0, 1), -1 in [1, 2), -1 in [3, 5), +1 in [5, 7)                              two opposite doublets
         sum_k part_k sin(2 pi harmonic_k (tau - 8) w / period + phase_k) in [8, 8 + period / w)       a multisine
 
-    Each doublet and the multisine have the mean 0: a rate that follows u leaves no attitude behind.
+    A doublet and the multisine have the mean 0: a rate in proportion to u leaves no attitude behind.
     """
     xp = array_namespace(params.amplitude)
     since = elapsed - params.begin
@@ -59,7 +59,7 @@ def signal(elapsed: Array, params: ExcitationParams) -> Array:
 
 
 def multisine(period: float, lowest: float, highest: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Harmonics of 1 / period from `lowest` to `highest`, Hz, their phases and their parts of a peak of one; (h,) each.
+    """Harmonics of 1 / period from `lowest` to `highest`, Hz, phases, and parts of a peak of 1; shapes (h,).
 
     phase_k = -pi k (k - 1) / h keeps the peak low. Source: M. R. Schroeder, IEEE Trans. Information Theory 16(1), 1970.
     """
@@ -93,7 +93,7 @@ EXCITATION = ControlLaw(ExcitationState, _engage, without_limits(_limited), _lim
 
 
 class ExcitationConfig(ControllerConfig):
-    """A controller that excites its inputs, one after another in the order of `inputs`, and controls nothing."""
+    """A controller to excite the inputs in turn, in the order of `inputs`, without control."""
 
     amplitude: NonNegatives = Field(description="largest deviation of each input from trim, units of u; 0 for none")
     width: Positives = Field(description="half the first doublet of each input, s")
@@ -108,7 +108,7 @@ class ExcitationConfig(ControllerConfig):
         return frozenset()
 
     def check_law(self) -> None:
-        """One value for each input, inside the limits of u."""
+        """A value per input, inside the limits of u."""
         for key in ("amplitude", "width", "period", "lowest", "highest"):
             require_length(key, getattr(self, key), self.inputs)
         nyquist = self.rate / 2.0
@@ -126,7 +126,7 @@ class ExcitationConfig(ControllerConfig):
 
     @cached_property
     def _each(self) -> list[float]:
-        """Time of each input, its pause included, s."""
+        """Times of the inputs, pause included, s."""
         return [DOUBLETS * width + period + self.pause for width, period in zip(self.width, self.period, strict=True)]
 
     def control_law(self) -> ControlLaw:
@@ -135,7 +135,7 @@ class ExcitationConfig(ControllerConfig):
 
     def law_params(self) -> Any:
         """The arrays of the excitation."""
-        waves = [multisine(*one) for one in zip(self.period, self.lowest, self.highest, strict=True)]
+        waves = [multisine(*band) for band in zip(self.period, self.lowest, self.highest, strict=True)]
         table = np.zeros((3, max(len(harmonic) for harmonic, _, _ in waves), len(waves)))
         for i, wave in enumerate(waves):
             table[:, : len(wave[0]), i] = wave

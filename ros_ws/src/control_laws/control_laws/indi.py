@@ -28,12 +28,12 @@ class IndiState(NamedTuple):
 
 
 def control_law(model: NominalModel) -> ControlLaw:
-    """Each tick inverts the increment of y_dot only; the measured y_dot contains the model error.
+    """A tick inverts the increment of y_dot only; the measured y_dot contains the model error.
 
         y_dot_f    += a ((y - y_p) / dt - y_dot_f),  position_f += a (position - position_f),  a = 1 - exp(-bandwidth dt)
         u           = position_f + share Omega^-1 (y_m_dot - K e - y_dot_f)
 
-    Both filters are the same, so that y_dot_f and position_f belong to one instant. There is no integral, so no windup.
+    The two filters are the same, so y_dot_f and position_f belong to the same instant. There is no integral, so no windup.
     Source: S. Sieberling, Q. P. Chu, J. A. Mulder, JGCD 33(6), 2010; E. J. J. Smeur, Q. P. Chu, G. C. H. E. de Croon,
     JGCD 39(3), 2016, for the filters.
     """
@@ -60,6 +60,6 @@ indi_params = params_of_gains(IndiParams)
 
 
 class IndiConfig(ControllerConfig):
-    """INDI, which only campaigns fly."""
+    """INDI, flown by campaigns only."""
 
     needs = "the positions of the actuators"

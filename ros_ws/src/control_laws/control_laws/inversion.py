@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Dynamic inversion from the full state x (or x_air): it cancels the nominal model and places the poles of the error."""
+"""Dynamic inversion from the full state x (or x_air): cancels the nominal model and places the poles of the error."""
 
 from typing import NamedTuple
 

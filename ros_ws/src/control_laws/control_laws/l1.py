@@ -32,7 +32,7 @@ class L1State(NamedTuple):
     """State of L1 between two ticks, (m,)."""
 
     e: Array
-    y_before: Array  # y of this tick, from which the next one predicts
+    y_before: Array  # y of this tick, for the prediction of the next tick
     y_dot_u: Array  # Omega u, u after saturation
     sigma_hat: Array  # estimate of y_dot - Omega u
     sigma_f: Array  # filtered
@@ -46,11 +46,11 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         sigma_f  += (1 - exp(-bandwidth dt)) (sigma_hat - sigma_r - sigma_f)
         u         = u_r - Omega^-1 (K e + sigma_f),  sigma_r = y_m_dot - Omega u_r
 
-    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels what is left of y_hat - y in
-    one tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with `feedforward` u_r = u_trim, which holds it. sigma_r is the
-    part of sigma that u_r cancels already. At engagement sigma_f = -K e, so that u = u_r (bumpless transfer); retuning at
-    y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after saturation. Source: N. Hovakimyan, C. Cao,
-    "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
+    y_hat is the step of y_hat_dot = -a (y_hat - y) + Omega u + sigma_hat: this sigma_hat cancels the rest of y_hat - y in
+    a tick. Reference input: u_r = u_trim + Omega^-1 y_m_dot; with `feedforward` u_r = u_trim, where u_trim holds the reference
+    input. sigma_r is the part of sigma already cancelled by u_r. At engagement sigma_f = -K e, so that u = u_r (bumpless
+    transfer); retuning at y_m_dot = 0 changes sigma_f likewise. Anti-windup: the predictor takes u after saturation. Source: N.
+    Hovakimyan, C. Cao, "L1 Adaptive Control Theory", SIAM 2010, section 3.3.
     """
 
     def engage(measured: Measurements, params: L1Params) -> L1State:
@@ -97,7 +97,7 @@ class L1Config(ControllerConfig):
     Omega: Numbers = Field(description="nominal Omega = C B, a row an output, the columns in the order of inputs")
 
     def check_law(self) -> None:
-        """One value for each channel, and an Omega with the controller's D."""
+        """A value per channel, and an Omega with the controller's D."""
         for key in ("K", "bandwidth"):
             require_length(key, getattr(self, key), self.outputs)
         m = len(self.outputs)
@@ -106,10 +106,10 @@ class L1Config(ControllerConfig):
             D = [int(sign) for sign in signs(np.reshape(self.Omega, (m, m)))]
         except DecompositionError as error:
             raise ParameterError(f"Omega: found a matrix without a D ({error}), expected D = {list(self.D)}") from None
-        require(list(self.D) == D, "Omega", f"a matrix with D = {D}", f"D = {list(self.D)}, that of the controller")
+        require(list(self.D) == D, "Omega", f"a matrix with D = {D}", f"D = {list(self.D)}, the controller's D")
 
     def control_law(self) -> ControlLaw:
-        """L1, with the feedforward where there is one."""
+        """L1, with the feedforward if any."""
         return CONTROL_LAWS[self.feedforward is not None]
 
     def law_params(self) -> Any:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Linear-quadratic Gaussian control (LQG): the trim that the observer corrects, and no other feedback."""
+"""Linear-quadratic Gaussian control (LQG): the trim corrected by the observer, and no further feedback."""
 
 from typing import Any, NamedTuple
 
@@ -23,7 +23,7 @@ class LqgState(NamedTuple):
 def _limited(
     state: LqgState, measured: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """U = u_trim, with u_o of the observer in it."""
+    """U = u_trim, u_o of the observer included."""
     u, _ = saturate(measured.u_trim, measured, dt, limits)
     return state, measured.u_trim, u
 
@@ -47,10 +47,10 @@ class LqgConfig(ControllerConfig):
 
     def check_law(self) -> None:
         """The observer is the law."""
-        require(self.observer is not None, "observer", "none", "a section: it is the feedback of lqg")
+        require(self.observer is not None, "observer", "none", "a section: the observer is the feedback of lqg")
 
     def control_law(self) -> ControlLaw:
-        """The law that the observer extends."""
+        """The law extended by the observer."""
         return CONTROL_LAW
 
     def law_params(self) -> Any:

@@ -23,7 +23,7 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
 LEAK = 0.01
-"""1/s, decay of the angles and of y_m in the design model: modes that inputs and cost do not reach have to be stable."""
+"""1/s, decay of the angles and of y_m in the design model: modes out of reach of inputs and cost have to be stable."""
 
 
 class LqiParams(NamedTuple):
@@ -35,8 +35,8 @@ class LqiParams(NamedTuple):
 def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
     """State feedback and integral: u = -gain [x, y_m, y_m_dot, integral of e], with `vanes` x relative to the air.
 
-    The integral is a trapezoid with conditional integration (anti-windup): that of channel i stops while u_i is saturated and
-    the increment has the sign of the excess.
+    The integral is a trapezoid with conditional integration (anti-windup): integration of channel i stops while u_i is
+    saturated and the increment has the sign of the excess.
     """
 
     def limited(
@@ -58,7 +58,7 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
 
 
 class LqiConfig(ControllerConfig):
-    """LQI, which only campaigns fly."""
+    """LQI, flown by campaigns only."""
 
     needs = "the full state"
 
@@ -66,12 +66,12 @@ class LqiConfig(ControllerConfig):
 def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The nominal aircraft with the reference and the integral of e, sampled with u held over a period: F, G and E.
 
-    z+ = F z + G u; the cost is on e and its integral, E z. Shapes (n + 3 m, n + 3 m), (n + 3 m, m) and (2 m, n + 3 m).
+    z+ = F z + G u; the cost is on E z, e and the integral of e. Shapes (n + 3 m, n + 3 m), (n + 3 m, m) and (2 m, n + 3 m).
 
         x_dot   = (A + gravity) x + B u      rows of angles: -LEAK angle, a measured disturbance
         y_m_dot = w - LEAK y_m,  w_dot = -fade w,  integral of e: C x - y_m
 
-    Angles integrate the controlled rates: with their true rows the integral of e would not be controllable.
+    Angles integrate the controlled rates: with the true rows the integral of e would not be controllable.
     """
     n, m = model.B.shape
     free = 1.0 - model.kinematic[:, None]
@@ -89,11 +89,11 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
 
 
 def lqi_params(gains: dict[str, FloatArray], model: NominalModel) -> LqiParams:
-    """The gain that minimises the sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
+    """The gain for the least sum of e'Q e + q'Q_i q + u'R u over z+ = F z + G u, for N sets of weights: (m, n + 3 m, N).
 
         Q = 1 / size^2,  Q_i = integral^2 / size^2,  R = (effort / input_scale)^2 / size^2,  q the integral of e
 
-    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) that costs as much as an input of unit
+    Arguments: `integral` (m, N), 1/s, `effort` (m, N), s: abs(e) at the cost of an input of unit
     response, `fade` (1, N), 1/s. Source: E. Kreindler, D. Rothschild, AIAA J. 14(7), 1976, for model following;
     B. D. O. Anderson, J. B. Moore, "Optimal Control", ch. 9.
     """

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and in one form a perfect y_dot."""
+"""The acceleration-based RISE inversion of MacKunis et al. from y, y_m, the nominal Omega, and optionally a perfect y_dot."""
 
 from typing import NamedTuple
 
@@ -31,7 +31,7 @@ class MacKunisState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
-    """The law with e_dot in its sign term.
+    """The law with e_dot in the sign term.
 
         r          = e_dot + Lambda e
         Pi        += dt beta clip(r / eps, -1, 1)              the sign, softened: measured r is noisy
@@ -40,7 +40,7 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
 
     Then u_dot = -Omega^-1 (K r + beta sgn(r)). `ideal`: e_dot = y_dot - y_m_dot with the perfect derivative of C x; else
     a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
-    Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, its matrices replaced by those here.
+    Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, with the matrices of this module.
     """
     Omega, inverse = model.Omega, model.inverse
 
@@ -56,8 +56,8 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         e = measured.y - measured.y_m
         e_dot = state.e_dot + filter_gain(params.bandwidth, dt) * ((e - state.e) / dt - state.e_dot)
         r = (measured.y_dot - measured.y_m_dot if ideal else e_dot) + params.Lambda * e
-        one = xp.ones_like(e)
-        Pi_step = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -one), one)
+        unit = xp.ones_like(e)
+        Pi_step = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -unit), unit)
         increment = dt * (e + state.e) / 2.0
         integral_e, Pi = state.integral_e + increment, state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
@@ -74,7 +74,7 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
 def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKunisParams:
     """Parameters from gains K, Lambda, beta (m, N), softening (1, N) and, without ideal y_dot, filter (1, N), rad/s.
 
-    eps = beta / K softening: inside it the sign adds K / softening to K.
+    eps = beta / K softening: inside eps the sign adds K / softening to K.
     """
     K, beta = gains["K"], gains["beta"]
     eps = beta / K * gains["softening"]

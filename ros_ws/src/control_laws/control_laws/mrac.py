@@ -16,7 +16,7 @@ class MracParams(NamedTuple):
     K: Array  # 1/s
     adaptation: Array  # of the weights of the states, 1/s^2
     bias: Array  # of the weight of 1, 1/s^2
-    leak: Array  # (1,) of all weights, 1/s
+    leak: Array  # (1,) of the weights, 1/s
 
 
 class MracState(NamedTuple):
@@ -26,13 +26,13 @@ class MracState(NamedTuple):
 
 
 def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
-    """Model-reference adaptive inversion (MRAC). It measures x, with `vanes` relative to the air, and uses the nominal model.
+    """Model-reference adaptive inversion (MRAC) from measured x, with `vanes` relative to the air, and the nominal model.
 
         phi = [x / size, 1],  W (m, n + 1) per aircraft, W(0) = 0
         u   = Omega^-1 (y_m_dot - C (A x + f(x)) - K e - W phi)
-        W  += dt (gamma e phi' - leak W),  gamma = adaptation in the columns of x, bias in that of 1
+        W  += dt (gamma e phi' - leak W),  gamma = adaptation in the columns of x, bias in the column of 1
 
-    the inversion of the nominal model, with weights that adapt to the model error. V = e'e / 2 + sum W~^2 / (2 gamma) falls
+    the inversion of the nominal model, with weights adapted to the model error. V = e'e / 2 + sum W~^2 / (2 gamma) falls
     with e'K e if the model error is linear in phi and leak is 0. The leak (sigma modification) bounds W under noise.
     Anti-windup: a saturated channel does not adapt. Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control",
     ch. 9 to 11; P. A. Ioannou, P. V. Kokotovic, Automatica 20(5), 1984, for the leak.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a model-based law, and what all laws share: saturation of u, anti-windup of integrals.
+"""The nominal model of a model-based law, and the common parts of laws: saturation of u, anti-windup of integrals.
 
 Channels are in the law's order, states in the airframe's.
 """
@@ -17,22 +17,22 @@ from rise_di_controller.saturation import Limits
 
 
 class NominalModel(NamedTuple):
-    """The nominal aircraft, SI, and the loop around it. The docstring of a law names the fields that the law uses."""
+    """The nominal aircraft, SI, and the loop around the aircraft. The docstring of a law names the fields in use."""
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
     C: FloatArray  # (m, n), picks the outputs
     gravity: FloatArray  # (n, n), f(x) = gravity @ sin(x)
-    wind: FloatArray  # (n, G), contribution of 1 m/s of wind along each axis to x_dot
+    wind: FloatArray  # (n, G), contribution of 1 m/s of wind along an axis to x_dot
     noise: FloatArray  # (m,) of the measured outputs, rms per sample; a tenth of the unit of a score without noise
-    kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, such as theta, else 0
+    kinematic: FloatArray  # (n,) 1 for an angle that integrates rates, e.g. theta, else 0
     size: FloatArray  # (n,) unit of a state in adaptation and weights: 1 m/s or 0.1 rad (/s)
     input_scale: FloatArray  # (m,) u per scaled input
     D: FloatArray  # (m,) +1 or -1
     lag: FloatArray  # (m,) time constants of the actuators, s
-    total_lag: FloatArray  # (m,) that of the loop: actuator + 1.5 periods + delay, s
+    total_lag: FloatArray  # (m,) lag of the loop: actuator + 1.5 periods + delay, s
     period: float  # of the law, s
-    lower: FloatArray  # (m,) limits of u, deviations from trim; infinite without one
+    lower: FloatArray  # (m,) limits of u, deviations from trim; infinite without a limit
     upper: FloatArray  # (m,)
 
     @property
@@ -53,7 +53,7 @@ class NominalModel(NamedTuple):
 
 
 def params_of_gains(kind: Callable[..., Any]) -> Callable[[dict[str, FloatArray], NominalModel], Any]:
-    """Parameters of a law whose fields are its gains, shapes (m, N) or (1, N)."""
+    """Parameters of a law with the gains as fields, shapes (m, N) or (1, N)."""
     return lambda gains, model: kind(**gains)
 
 
@@ -62,7 +62,7 @@ def campaign_law(
     engage: Callable[[Measurements, Any], Any],
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> ControlLaw:
-    """A control law that only campaigns fly, since the topics lack what it needs. It cannot be retuned in flight."""
+    """A control law flown by campaigns only, for lack of topics with the measurements. No retuning in flight."""
 
     def retune(state: Any, old: Any, new: Any) -> Any:
         raise NotImplementedError("a law that only campaigns fly has no retuning")
@@ -84,7 +84,7 @@ def start_integral(measured: Measurements, _: Any) -> ErrorIntegral:
 
 
 def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
-    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where it is not measured."""
+    """The full state, shape (n, N), with `vanes` relative to the air. Raises ValueError where x is not measured."""
     x = measured.x_air if vanes else measured.x
     if x is None:
         raise ValueError("measurements: found no state, expected the full state")
@@ -92,7 +92,7 @@ def state_of(measured: Measurements, *, vanes: bool = False) -> Array:
 
 
 def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tuple[Array, Array]:
-    """Saturation: the commanded u inside its limits, and the excess of the requested u, both shape (m,)."""
+    """Saturation: the commanded u inside its limits, and the excess of the requested u, shapes (m,)."""
     commanded = saturation.saturate(u, measured.u_before, dt, limits)
     return commanded, u - commanded
 
@@ -100,12 +100,12 @@ def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tup
 def conditional_integration(before: Array, after: Array, effect: Array, beyond: Array) -> Array:
     """Anti-windup by conditional integration: `before` where effect * beyond > 0, else `after`.
 
-    Arguments: `effect`, change of u (or of the scaled input) by the increment; `beyond`, the excess over the limit; both in the
+    Arguments: `effect`, change of u (or of the scaled input) by the increment; `beyond`, the excess over the limit, in the
     same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5.
     """
     return array_namespace(before).where(effect * beyond > 0.0, before, after)
 
 
 def filter_gain(rate: Array, dt: Array) -> Array:
-    """1 - exp(-rate dt): gain of a low-pass filter of first order on its input in one tick, exact for a held input."""
+    """1 - exp(-rate dt): gain of a first-order low-pass filter on the input in a tick, exact for a held input."""
     return -array_namespace(rate).expm1(-rate * dt)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observers over any law, for many sets of weights at once: their parameters from the gains of a search."""
+"""Observers over any law, for many sets of weights at once: parameters from the gains of a search."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ from rise_di_controller.observer import ObserverParams
 from rise_di_controller.saturation import Limits
 
 PART, WITHIN, FADE = 0.6, 0.1, 1.0
-"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time in which it fades in, s: the defaults of
+"""Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time of the fade-in, s: the defaults of
 `ObserverConfig`."""
 
 
@@ -32,7 +32,7 @@ def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: fl
 
     lower, upper = part * model.lower[:, None], part * model.upper[:, None]
     limits = Limits(lower, upper, (upper - lower) / 2.0 / WITHIN)
-    Phi, Gamma, H, L, F = (last(one) for one in (design.Phi, design.Gamma, design.H, design.L, design.F))
+    Phi, Gamma, H, L, F = (last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F))
     return ObserverParams(of_law, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
 
 
@@ -43,13 +43,13 @@ def aircraft_design(gains: dict[str, FloatArray], model: NominalModel) -> Observ
 
 
 def extended_state_design(gains: dict[str, FloatArray], model: NominalModel) -> ObserverDesign:
-    """Designs from Omega and lags alone: effort, drift, rate_drift and decay, (m, N) each."""
+    """Designs from Omega and lags alone: effort, drift, rate_drift and decay, shapes (m, N)."""
     return extended_state_observer(
         model, unnamed(model), ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
     )
 
 
 def unnamed(model: NominalModel) -> Names:
-    """Numbers as names, for designs that are not written to a file."""
+    """Numbers as names, for designs not written to a file."""
     (n, m), G = model.B.shape[-2:], model.wind.shape[-1]
     return Names(*(tuple(str(k) for k in range(count)) for count in (n, m, m, G)))

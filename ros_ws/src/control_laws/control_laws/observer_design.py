@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Design of the observer: its model in discrete time and its two linear-quadratic gains, for many models and weights at once.
+"""Design of the observer: model in discrete time and two linear-quadratic gains, for many models and weights at once.
 
 Two models: `aircraft_observer` knows A, B, f, wind and lags of an airframe, `extended_state_observer` Omega and lags alone.
-A, B, wind and the weights may have leading axes, which are broadcast against each other: N aircraft, or N sets of weights, are
-N designs. Phi, Gamma, H, L, F are those of the observer of `rise_di_controller.observer`.
+A, B, wind and the weights may have leading axes, broadcast together: N aircraft, or N sets of weights, are N designs. Phi,
+Gamma, H, L, F are the matrices of the observer of `rise_di_controller.observer`.
 """
 
 from typing import NamedTuple
@@ -17,13 +17,13 @@ from control_laws.riccati import correction_of, diagonal, gain_of, transpose
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import zero_order_hold
 
-LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: each of its modes is then observable or stable
+LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: every mode is then observable or stable
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
 ACTUATOR_NOISE = 1e-6  # rad or 1 per root s, noise of the actuators' positions: negligible
 
 
 class Names(NamedTuple):
-    """Names of the channels of a model, in the order of its arrays."""
+    """Names of the channels of a model, in the order of the arrays."""
 
     states: tuple[str, ...]  # n
     inputs: tuple[str, ...]  # m, in the order of the columns of B
@@ -34,11 +34,11 @@ class Names(NamedTuple):
 class Weights(NamedTuple):
     """Weights of the design with the aircraft's model. The units of the states are `NominalModel.size`, "sizes" below."""
 
-    effort: FloatArray  # (.., m) error that costs as much as an input of unit response, s
+    effort: FloatArray  # (.., m) error at the cost of an input of unit response, s
     drift: FloatArray  # (.., m) noise of the disturbances, sizes/s per root s
     gust: FloatArray  # (.., G) noise of the wind, m/s per root s
     wind_time: FloatArray  # (.., G) time constants of the wind, s
-    loose: FloatArray  # (.., n), or (.., 1) for all states: noise of the states, for the model error, sizes per root s
+    loose: FloatArray  # (.., n), or (.., 1) for every state: noise of the states, for the model error, sizes per root s
 
 
 class ExtendedStateWeights(NamedTuple):
@@ -53,14 +53,14 @@ class ExtendedStateWeights(NamedTuple):
 class ObserverModel(NamedTuple):
     """A model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_ff), e = H z."""
 
-    states: tuple[str, ...]  # names of z, such as x.alpha, position.elevator, wind.vertical, disturbance.q
+    states: tuple[str, ...]  # names of z, e.g. x.alpha, position.elevator, wind.vertical, disturbance.q
     Phi: FloatArray  # (.., s, s)
     Gamma: FloatArray  # (.., s, m)
     H: FloatArray  # (m, s)
 
 
 class ObserverDesign(NamedTuple):
-    """A model with its gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u - u_ff)."""
+    """A model with gains: z_hat = z + L (e - H z), u - u_ff = -F z_hat, z+ = Phi z_hat + Gamma (u - u_ff)."""
 
     states: tuple[str, ...]
     Phi: FloatArray  # (.., s, s)
@@ -71,13 +71,13 @@ class ObserverDesign(NamedTuple):
 
 
 def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> ObserverModel:
-    """The aircraft around its reference, its actuators, wind and a disturbance of each output: z = [x, position, w, d].
+    """The aircraft around the reference, actuators, wind and a disturbance per output: z = [x, position, w, d].
 
         x_dot        = (A + gravity) x + B position + wind w + C' d
         position_dot = (u - u_ff - position) / lag,  w_dot = -w / wind_time,  d_dot = -LEAK d
 
-    Angles decay with LEAK too. u_ff produces the motion along the reference: the model is that of small deviations from it.
-    s = n + m + G + m. A, B and wind of the model and `wind_time`, (.., G), may have leading axes.
+    Angles decay with LEAK too. u_ff produces the motion along the reference: the model holds for small deviations from this
+    motion. s = n + m + G + m. A, B and wind of the model and `wind_time`, (.., G), may have leading axes.
     """
     A, (n, m), G = model.A + model.gravity - LEAK * np.diag(model.kinematic), model.B.shape[-2:], model.wind.shape[-1]
     x, p, w, d = np.split(np.arange(n + m + G + m), [n, n + m, n + m + G])
@@ -91,13 +91,13 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
 
 
 def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -> ObserverModel:
-    """Outputs that integrate Omega times the actuators and a disturbance of second order: z = [x, position, d, d_dot].
+    """Outputs as integrals of Omega times the actuators and a disturbance of second order: z = [x, position, d, d_dot].
 
         x_dot        = Omega position + d,  position_dot = (u - u_ff - position) / lag
         d_dot        = disturbance_rate - LEAK d,  disturbance_rate_dot = -decay disturbance_rate
 
-    x are the outputs. s = 4 m. Of the model it uses Omega, the lags and the period. `decay` (.., m), 1/s. Source: J. Han, "From
-    PID to Active Disturbance Rejection Control", IEEE Trans. Industrial Electronics 56(3), 2009.
+    x are the outputs. s = 4 m. Of the model the function uses Omega, the lags and the period. `decay` (.., m), 1/s. Source: J.
+    Han, "From PID to Active Disturbance Rejection Control", IEEE Trans. Industrial Electronics 56(3), 2009.
     """
     m = len(model.C)
     x, p, d, rate = np.split(np.arange(4 * m), 4)
@@ -153,7 +153,7 @@ def feedback_gain(sampled: ObserverModel, model: NominalModel, effort: FloatArra
 
 
 def _correction(sampled: ObserverModel, model: NominalModel, intensities: list[FloatArray]) -> FloatArray:
-    """L for white noise of these intensities, (.., k) each, on the states in their order, SI per root s."""
+    """L for white noise of these intensities, shapes (.., k), on the states in order, SI per root s."""
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
-    process = np.concatenate([np.broadcast_to(one, (*batch, one.shape[-1])) for one in intensities], axis=-1)
+    process = np.concatenate([np.broadcast_to(intensity, (*batch, intensity.shape[-1])) for intensity in intensities], axis=-1)
     return correction_of(sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PI control of each output: RISE-DI without its sign term."""
+"""PI control of the outputs: RISE-DI without the sign term."""
 
 from typing import NamedTuple
 
@@ -57,7 +57,7 @@ def _limited(
 
 
 def _retune(state: PiState, old: PiParams, new: PiParams) -> PiState:
-    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so that Lambda may be 0."""
+    """The same u with new parameters (bumpless transfer): e_0 takes the difference, so Lambda may be 0."""
     asked = -new.D * _u(state, old) / (new.input_scale * new.K)
     return state._replace(e_0=state.e + new.Lambda * state.integral_e - asked)
 
@@ -77,7 +77,7 @@ class PiConfig(ControllerConfig):
     Lambda: NonNegatives = Field(description="integral gains over proportional ones, 1/s")
 
     def check_law(self) -> None:
-        """One value for each channel."""
+        """A value per channel."""
         for key in ("K", "Lambda"):
             require_length(key, getattr(self, key), self.outputs)
 

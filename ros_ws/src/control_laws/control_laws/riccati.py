@@ -2,25 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic design for many models and sets of weights at once: the discrete Riccati equation.
 
-Leading axes of the arguments of a function are broadcast against each other.
+Leading axes of the arguments of a function are broadcast together.
 """
 
 import numpy as np
 
 from flight_core.vectors import FloatArray
 
-MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that decays within 1e9 of them
+MAX_DOUBLINGS = 40  # 2^40 steps of a finite horizon: enough for a mode that decays within 1e9 steps
 
 
 def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """The stabilising P = F'P F - F'P G (R + G'P G)^-1 G'P F + Q by doubling, shape (.., s, s).
 
-    Each doubling squares the horizon's transition: with W = I + G_k P_k,
+    A doubling squares the horizon's transition: with W = I + G_k P_k,
 
         P+ = P + F'P W^-1 F,  G+ = G + F W^-1 G F',  F+ = F W^-1 F,  from G R^-1 G', Q and F
 
-    scipy.linalg.solve_discrete_are solves one at a time and is eight times slower. Shapes: F, Q (.., s, s), G (.., s, m),
-    R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77(8), 2004.
+    scipy.linalg.solve_discrete_are solves a single equation at a time and is eight times slower. Shapes: F, Q (.., s, s), G
+    (.., s, m), R (.., m, m). Source: E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77(8), 2004.
     """
     batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
     F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
@@ -54,7 +54,7 @@ def diagonals(values: FloatArray) -> FloatArray:
 
 
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
-    """The gain (R + G'P G)^-1 G'P F of u = -gain z that minimises the sum of z'Q z + u'R u, shape (.., m, s)."""
+    """The gain (R + G'P G)^-1 G'P F of u = -gain z for the least sum of z'Q z + u'R u, shape (.., m, s)."""
     P = riccati(F, G, Q, R)
     return np.asarray(np.linalg.solve(R + transpose(G) @ P @ G, transpose(G) @ P @ F))
 

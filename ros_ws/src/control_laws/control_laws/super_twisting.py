@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The super-twisting law on each output, from y, y_m and the nominal Omega."""
+"""The super-twisting law on the outputs, from y, y_m and the nominal Omega."""
 
 from typing import NamedTuple
 
