@@ -103,7 +103,7 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recorder, peer_node:
 
 def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Peer) -> None:
     process = recorder("run", "topics:=[/never]")
-    process.wait_for("no publisher of /never; recording starts with the first one")
+    process.wait_for("no publisher of /never; recording starts with the first publisher")
     peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
     process.interrupt().succeed()
     assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder's node: records the topics of a flight, as serialised messages, to one MCAP bag."""
+"""The recorder's node: records the topics of a flight, as serialised messages, to a single MCAP bag."""
 
 import sys
 import time
@@ -37,8 +37,8 @@ FLUSH_PERIOD_NS = nanoseconds(0.1)  # the longest loss when the recorder is kill
 DISK_PERIOD_NS = NANOSECONDS
 MEGABYTE = 1e6
 
-LOOP = (Y, Y_M, U)  # each flight has all of them
-SILENCE_NS = 3 * NANOSECONDS  # a controller that is killed is back within one
+LOOP = (Y, Y_M, U)  # every flight has these topics
+SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
 # Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
 ROSOUT = Topic("/rosout", Log, foreign=True)
@@ -47,7 +47,7 @@ PARAMETER_EVENTS = Topic("/parameter_events", ParameterEvent, foreign=True)
 
 @dataclass
 class _RecordedTopic:
-    """A topic with its subscription and its channel in the bag."""
+    """A topic with the subscription and the channel in the bag."""
 
     subscription: PolledSubscription
     channel: BagChannel
@@ -65,7 +65,7 @@ class _RecordedTopic:
 
 
 class RecorderNode(FlightNode[RecorderConfig]):
-    """Appends all messages that have arrived to the bag at each tick."""
+    """Appends the received messages to the bag at every tick."""
 
     def __init__(self) -> None:
         super().__init__("recorder", RecorderConfig)
@@ -85,7 +85,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._ended = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
-        self._heard, self._heard_ns = 0, time.monotonic_ns()  # messages of LOOP, and when the last of them arrived
+        self._heard, self._heard_ns = 0, time.monotonic_ns()  # messages of LOOP, and when the last message arrived
         self.get_logger().info(f"recording to {self._bag.path}")
 
     def _full_name(self, name: str) -> str:
@@ -96,7 +96,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             raise ParameterError(f"recorder.topics: found {name!r}, expected the name of a topic") from None
 
     def _open_bag(self) -> BagWriter:
-        """The bag with its attachments. Raises ParameterError when it cannot be written."""
+        """The bag with its attachments. Raises ParameterError when the bag cannot be written."""
         parameters = self.parameters
         attachments = LogAttachments(
             _file(parameters.scenario_file, "scenario_file"),
@@ -131,10 +131,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return period_ns(self.parameters.rate, "rate")
 
     def runs_in_lockstep(self) -> bool:
-        return False  # in lockstep it also writes at its ticks, many instants at a time, and publishes how far it is
+        return False  # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the progress
 
     def advance(self) -> bool:
-        """In one process with other nodes: write at ticks between their steps. It never delays them."""
+        """In a process with further nodes: write at ticks between the steps of the nodes, without delay of a node."""
         if time.monotonic_ns() - self._drained_ns > self.period_ns():
             self._write()
         return False
@@ -165,7 +165,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._end(f"min_free: {sentence}")
 
     def _drain_subscriptions(self) -> None:
-        """Write all received messages. In lockstep publish the stamp of the newest sample of `truth`, for which it waits."""
+        """Write the received messages. In lockstep publish the stamp of the newest sample of `truth` in the bag."""
         recorded = b""
         for topic in self._topics:
             received = topic.subscription.take()
@@ -178,7 +178,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, topic.channel
-        # The sequences of several publishers interleave: a gap between two of them is no loss. Foreign topics name none.
+        # The sequences of several publishers interleave: a gap between publishers is no loss. Foreign topics name no publisher.
         counted = not topic.foreign
         for message, sent_ns, received_ns, sequence in received:
             write(channel, received_ns, sent_ns, sequence, message)
@@ -207,7 +207,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self.get_logger().error(self._ended)
 
     def _close_bag(self) -> str:
-        """Finish the bag. Return the error text when it cannot be finished."""
+        """Finish the bag. Return the error text when the bag cannot be finished."""
         try:
             self._bag.add_metadata(LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()})
             self._bag.close()
@@ -230,10 +230,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self._subscribe(name, offered[0].topic_type)
         if self._missing and now_ns > self._warn_missing_ns:
             self._warn_missing_ns = now_ns + 10 * NO_PUBLISHER_WARNING_NS
-            self.get_logger().warning(f"no publisher of {', '.join(self._missing)}; recording starts with the first one")
+            self.get_logger().warning(f"no publisher of {', '.join(self._missing)}; recording starts with the first publisher")
 
     def _warn_of_a_part(self) -> None:
-        """Warn of a log with some of y, y_m and u: a flight has all of them, but discovery may have failed on a busy domain."""
+        """Warn of a log with some of y, y_m and u: a flight has y, y_m and u, but discovery may fail on a busy domain."""
         loop = [topic for topic in self._topics if topic.subscription.topic in LOOP]
         if any(topic.channel.messages for topic in loop):
             for topic in loop:
@@ -241,9 +241,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
                     self.warn_no_publisher(topic.subscription)
 
     def _warn_of_silence(self, now_ns: int) -> None:
-        """Warn, once, when y, y_m and u have all stopped: their publishers have ended, or this process receives nothing.
+        """Warn, once, when y, y_m and u have stopped: the publishers have ended, or this process receives nothing.
 
-        Fast DDS can block the threads that receive while it removes a participant that leaves (eProsima/Fast-DDS, issue 6502).
+        Fast DDS can block the receiving threads during the removal of a leaving participant (eProsima/Fast-DDS, issue 6502).
         """
         heard = sum(topic.channel.messages for topic in self._topics if topic.subscription.topic in LOOP)
         if heard != self._heard:
@@ -278,7 +278,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
         """Subscribe again with a weaker QoS when a new publisher offers less than is requested."""
         subscription, offered = topic.subscription, self._offered(topic.name, topic.channel.type.name)
-        if all(qos_check_compatible(one, subscription.qos)[0] != QoSCompatibility.ERROR for one in offered):
+        if all(qos_check_compatible(profile, subscription.qos)[0] != QoSCompatibility.ERROR for profile in offered):
             return
         # Volatile, because the transient-local samples have been recorded already.
         weaker = QoSProfile(depth=subscription.qos.depth, reliability=strongest_compatible(offered).reliability)
