@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly every law through it.
+"""Protocol of a control law: pure functions over a state. Controller, replay and campaigns fly every law by the protocol.
 
-A law with its validated parameters is a subclass of `params.ControllerConfig`, which the controller finds by its name under
-the entry point group `laws.GROUP`. See docs/laws.md.
+A law with validated parameters is a subclass of `params.ControllerConfig`. The controller finds the subclass by name under the
+entry point group `laws.GROUP`. See docs/laws.md.
 """
 
 from collections.abc import Callable
@@ -17,17 +17,17 @@ from rise_di_controller.saturation import Limits
 class Measurements(NamedTuple):
     """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
 
-    One aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N); what they share is (m, 1). The last
-    four fields are not on the topics. Campaigns alone have them, for laws that need more sensors.
+    A single aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N), or (m, 1) for shared values. The
+    last four fields are not on the topics. Campaigns alone have these fields, for laws with more sensors.
     """
 
     y: Array  # measured outputs
     y_m: Array  # reference at the stamp of y
     y_m_dot: Array  # slope of y_m since the previous tick
-    u_trim: Array  # the input that the law adds to: u at engagement, and the feedforward
+    u_trim: Array  # the law adds to this input: u at engagement, and the feedforward
     u_before: Array  # the last command, after saturation
     position: Array | None = None  # of the actuators
-    x: Array | None = None  # (n, N) state: measured values of the outputs, true values of the other states
+    x: Array | None = None  # (n, N) state: measured values of the outputs, true values of the remaining states
     x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
 
@@ -37,15 +37,15 @@ def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:
 
 
 class ControlLaw(NamedTuple):
-    """A control law as pure functions of its state and of its parameters, with NumPy and JAX arrays.
+    """A control law as pure functions of state and parameters, with NumPy and JAX arrays.
 
-    The state is a NamedTuple of arrays, (m,) or (m, N). The log holds each of its fields by name, so that replay can continue
-    from any tick. The parameters are any NamedTuple of arrays.
+    The state is a NamedTuple of arrays, (m,) or (m, N). The log holds the fields by name, so replay can continue from any tick.
+    The parameters are any NamedTuple of arrays.
 
-    `engage` makes the state at engagement: u has to be u_trim then. `step` is one tick of dt seconds without limits.
-    `limited` is the same tick inside limits, with the law's anti-windup: where no limit acts, it gives the same bits as `step`.
-    `retune` makes the state for new parameters, without a jump of u. `missed` predicts the state over one period without a
-    sample, u held.
+    `engage` makes the state at engagement: u has to be u_trim then. `step` is a tick of dt seconds without limits.
+    `limited` is the same tick inside limits, with the law's anti-windup: where no limit acts, `limited` gives the bits of
+    `step`. `retune` makes the state for new parameters, without a jump of u. `missed` predicts the state over one period
+    without a sample, u held.
     """
 
     state: type[Any]
@@ -55,11 +55,11 @@ class ControlLaw(NamedTuple):
     """(state, measured, dt, params, limits) -> (state, u before saturation, u)"""
     retune: Callable[[Any, Any, Any], Any]  # (state, old params, new params) -> state
     missed: Callable[[Any, Measurements, Any], Any] = _no_prediction  # (state, measured, params) -> state
-    inner: "ControlLaw | None" = None  # the law that this one extends; its state is the field `law`
+    inner: "ControlLaw | None" = None  # the law extended by this law; the state field `law` is the state of `inner`
 
 
 class TunedLaw(NamedTuple):
-    """A control law with its parameters."""
+    """A control law with parameters."""
 
     control_law: ControlLaw
     params: Any
@@ -68,7 +68,7 @@ class TunedLaw(NamedTuple):
 def without_limits(
     limited: Callable[[Any, Measurements, Array, Any, Limits], tuple[Any, Array, Array]],
 ) -> Callable[[Any, Measurements, Array, Any], tuple[Any, Array]]:
-    """The function `step` of a law from its function `limited`, with infinite limits."""
+    """The function `step` of a law from the function `limited`, with infinite limits."""
 
     def step(state: Any, measured: Measurements, dt: Array, params: Any) -> tuple[Any, Array]:
         infinite = array_namespace(measured.y).inf + 0.0 * measured.y
@@ -79,7 +79,7 @@ def without_limits(
 
 
 def fields(state: Any) -> dict[str, Array]:
-    """The arrays of a law's state by name; those of an extended law first."""
+    """The arrays of a law's state by name; arrays of an extended law first."""
     values: dict[str, Array] = {}
     for name, value in state._asdict().items():
         values |= fields(value) if hasattr(value, "_asdict") else {name: value}
@@ -87,7 +87,7 @@ def fields(state: Any) -> dict[str, Array]:
 
 
 def restored(law: ControlLaw, values: Any) -> Any:
-    """The state of a law from its arrays by name, the inverse of `fields`."""
+    """The state of a law from the arrays by name, the inverse of `fields`."""
     of_inner = {} if law.inner is None else {"law": restored(law.inner, values)}
     return law.state(**of_inner, **{name: values[name] for name in law.state._fields if name not in of_inner})
 

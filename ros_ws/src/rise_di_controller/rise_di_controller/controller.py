@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and its log. For node and simulation."""
+"""The controller without ROS: buffers y and y_m, steps the guarded law, returns u and a log. For node and simulation."""
 
 from collections import deque
 from collections.abc import Callable
@@ -16,20 +16,20 @@ from rise_di_controller.params import ControllerConfig
 
 
 class ControlOutput(NamedTuple):
-    """Output of one tick."""
+    """Output of a tick."""
 
-    stamp_ns: int  # of the y from which u was computed
+    stamp_ns: int  # of y, the source of u
     u: FloatArray  # (m,) in the order of the parameters' inputs
     log: Callable[[], FloatArray]
 
     @property
     def internals(self) -> FloatArray:
-        """Values for the log in the order of `Controller.names`. They are computed on access, so that u is published first."""
+        """Values for the log in the order of `Controller.names`. Computed on access, so u is published first."""
         return self.log()
 
 
 class Controller:
-    """`guard.tick` with its state and the last samples of y and y_m."""
+    """`guard.tick` with state and the last samples of y and y_m."""
 
     def __init__(self, parameters: ControllerConfig) -> None:
         self._law, self._guard = parameters.tuned_law(), parameters.guard()
@@ -48,7 +48,7 @@ class Controller:
 
     @property
     def has_internals(self) -> bool:
-        """Whether the law has a state to log: from its first engagement on."""
+        """Whether the law has a state to log: from the first engagement on."""
         return self._state.law is not None
 
     def restart(self) -> None:
@@ -57,16 +57,16 @@ class Controller:
             self._state = self._state._replace(mode=Mode.WAITING)
 
     def retune(self, parameters: ControllerConfig) -> None:
-        """Replace all parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
+        """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
 
-        Raises ParameterError for parameters with another state: of another law, or with an observer that was not there.
+        Raises ParameterError for parameters with a different state: of a different law, or with an observer added.
         """
         law, digest = parameters.tuned_law(), parameters.digest()
         if digest == self._digest:
             return
-        found = internals.names(parameters.logged_groups())
+        names = internals.names(parameters.logged_groups())
         require(
-            found == self.names,
+            names == self.names,
             "controller.law",
             parameters.law,
             "the law and the observer that fly: these change at a restart",
@@ -78,7 +78,7 @@ class Controller:
         """Buffer a sample of y, shape (m,), in the law's order.
 
         Raises ChannelError: reason "future" for a stamp more than the age limit ahead of the clock, reason "order" for a stamp
-        that is not later than the previous one.
+        not later than the previous stamp.
         """
         self._take(self._y, sample, now_ns)
 
@@ -93,7 +93,7 @@ class Controller:
         samples.append(sample)
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
-        """One tick at `now_ns`, `late_ns` after its deadline. Returns None where nothing is to be published."""
+        """A tick at `now_ns`, `late_ns` after the deadline. Returns None where nothing is to be published."""
         y = self._newest_paired_y()
         self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if inputs is None:
@@ -105,16 +105,16 @@ class Controller:
         return ControlOutput(inputs.stamp_ns, self._state.u, log)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
-        """Instants of further ticks before the one at `now_ns`, where the last one is longer ago than the age limit.
+        """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago than the age limit.
 
-        The aircraft has started its own failsafe for u meanwhile. Two ticks without fresh inputs bring u of the controller to
-        where the aircraft has it, so that the re-engagement is bumpless.
+        The aircraft has started a failsafe for u meanwhile. Two ticks without fresh inputs bring u of the controller to the
+        failsafe u of the aircraft: the re-engagement is bumpless.
         """
         begin_ns = last_ns + self._guard.max_age_ns
         return (begin_ns + self.period_ns, now_ns) if now_ns > begin_ns else ()
 
     def _newest_paired_y(self) -> StampedVector | None:
-        """The newest y at whose stamp y_m is known. Where y_m is late, an earlier y is used, so that no failsafe starts."""
+        """The newest y up to a period after the newest y_m: with a late y_m an earlier y is used, and no failsafe starts."""
         newest = self._y[-1] if self._y else None
         if not self._y_m:
             return newest
@@ -122,11 +122,11 @@ class Controller:
         return next((sample for sample in reversed(self._y) if sample.stamp_ns <= known_ns), newest)
 
     def ages(self, now_ns: int) -> dict[str, float]:
-        """Ages of the newest y and y_m, s, of those that were received."""
+        """Ages of the newest received y and y_m, s; an input never received is absent."""
         newest = {"y": self._y, "y_m": self._y_m}
         return {name: seconds(now_ns - samples[-1].stamp_ns) for name, samples in newest.items() if samples}
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
-        """Names of the stale inputs: y or y_m that was never received or is older than the age limit."""
+        """Names of the stale inputs: y or y_m never received or older than the age limit."""
         ages, limit = self.ages(now_ns), seconds(self._guard.max_age_ns)
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SDU decomposition Omega = C B = S D U, equations (10)-(11). D is all that the law has to know of the aircraft.
+"""SDU decomposition Omega = C B = S D U, equations (10)-(11). The law has to know D alone of the aircraft.
 
-D depends on the order of the channels, on the pairing of inputs with outputs and on the sign of each input, so it is validated
-together with them. U measures the quality of the pairing: beta and K of channel i grow with abs(U_ij), j > i.
+D depends on the order of the channels, on the pairing of inputs with outputs and on the signs of the inputs, so D is
+validated together with the channels. U measures the quality of the pairing: beta and K of channel i grow with abs(U_ij), j > i.
 """
 
 import math
@@ -17,15 +17,15 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 
 NEARLY_ZERO = 1e-9
-"""Minor k is nearly zero if a change of every entry of Omega by this fraction of its size could turn the sign of
+"""Minor k is nearly zero if a change of every entry of Omega by this fraction of the entry's size could turn the sign of
 Delta_k / Delta_(k-1), to first order. Rounding is 2e-16 times the growth of the elimination, so a growth of 1e6 is allowed.
 Published and identified values are six orders of magnitude coarser."""
 
-_EQUILIBRATIONS = 10  # each one halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
+_EQUILIBRATIONS = 10  # a round halves the spread of the exponents: 10 reduce a spread of 1e300 to less than a factor of 2
 
 
 class DecompositionError(ParameterError):
-    """A matrix without S D U. `minor` is the number of its first minor that is zero or nearly so, None if not square."""
+    """A matrix without S D U. `minor` is the number of the first minor zero or nearly so, None if not square."""
 
     def __init__(self, sentence: str, minor: int | None = None) -> None:
         super().__init__(sentence)
@@ -43,9 +43,9 @@ class SDU(NamedTuple):
 class Pairing(NamedTuple):
     """A choice of channels with D = I: Omega[outputs][:, inputs] * signs, channel k of the law is row and column k."""
 
-    outputs: tuple[int, ...]  # row of Omega for each channel
-    inputs: tuple[int, ...]  # column of Omega for each channel
-    signs: tuple[int, ...]  # for each channel +1, or -1 where the sign of its input changes
+    outputs: tuple[int, ...]  # row of Omega by channel
+    inputs: tuple[int, ...]  # column of Omega by channel
+    signs: tuple[int, ...]  # by channel +1, or -1 where the sign of the input changes
     U: FloatArray  # (m, m) of the reordered matrix in inputs of unit response
 
 
@@ -81,7 +81,7 @@ def leading_minors(Omega: FloatArray) -> FloatArray:
 def unit_diagonal(Omega: FloatArray) -> FloatArray:
     """Omega in inputs scaled to unit response, v_i = abs(Omega_ii) u_i: Omega_ij / abs(Omega_jj), shape (m, m).
 
-    Raises DecompositionError if Omega is not square or not finite, or if an output does not respond to its own input.
+    Raises DecompositionError if Omega is not square or not finite, or if an output does not respond to the paired input.
     """
     matrix = _square(Omega)
     diagonal = np.abs(np.diag(matrix))
@@ -94,21 +94,21 @@ def unit_diagonal(Omega: FloatArray) -> FloatArray:
 def coupling(Omega: FloatArray) -> float:
     """Coupling max abs(U - I) of `unit_diagonal(Omega)`, in inputs of unit response; a large value is a bad pairing.
 
-    It is infinite where an output does not respond to its own input. It depends on the units of y, not on the units or signs
-    of u. Raises DecompositionError as `decompose` does.
+    Infinite where an output does not respond to the paired input. The coupling depends on the units of y, not on the units or
+    signs of u. Raises DecompositionError as `decompose` does.
     """
     signs(Omega)
     return _excess(decompose(unit_diagonal(Omega)).U) if np.diag(Omega).all() else math.inf
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """The smallest change of the channels that gives D = I, or None where there is none.
+    """The smallest change of the channels to D = I, or None where no change gives D = I.
 
-    All orders of the outputs are combined with all orders of the inputs. Each has one choice of input signs, namely D, because
-    a change of the sign of input k changes D_k only. Preferred are, in this order: outputs that keep their inputs, outputs that
-    keep their places, inputs that keep their signs, the smallest max abs(U - I) in inputs of unit response. Orders with a zero
-    on the diagonal, or with max abs(U - I) above `largest_U`, are excluded. There are (m!)^2 orders: 576 for four channels,
-    518 400 for six.
+    Every order of the outputs is combined with every order of the inputs. A combination has a single choice of input signs,
+    namely D, because a change of the sign of input k changes D_k only. The preference is, in this order: most outputs with the
+    same input, most outputs in the same place, most inputs with the same sign, the smallest max abs(U - I) in inputs of unit
+    response. Orders with a zero on the diagonal, or with max abs(U - I) above `largest_U`, are excluded. There are (m!)^2
+    orders: 576 for four channels, 518 400 for six.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -151,10 +151,10 @@ def _square(Omega: FloatArray) -> FloatArray:
 
 
 def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in each row and column.
+    """Scales (m,) and (m,) of rows and columns: the largest abs(Omega_ij) / (rows_i columns_j) is 1 in every row and column.
 
-    They scale with the units of each channel, so a comparison with them does not depend on units. A row or column of zeros
-    keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
+    The scales follow the units of the channels, so a comparison with the scales does not depend on units. A row or column of
+    zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
     Matrices", RAL-TR-2001-034.
     """
     rows, columns = np.ones(len(matrix)), np.ones(len(matrix))
@@ -169,7 +169,7 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _eliminate(Omega: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper triangular.
 
-    p_k = (L^-1)_k Omega (W^-1)_k, from which the certainty of its sign follows.
+    p_k = (L^-1)_k Omega (W^-1)_k gives the certainty of the sign of p_k.
     """
     rest = _square(Omega)
     m = len(rest)

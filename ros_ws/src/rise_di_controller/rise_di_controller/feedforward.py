@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedforward by model inversion, an extension of the paper, off by default: the input of a nominal model along y_m.
 
-It uses y_m only, no state of the aircraft, and does not change the law. See docs/theory.md.
+The feedforward uses y_m only, no state of the aircraft, and does not change the law. See docs/theory.md.
 """
 
 from typing import NamedTuple
@@ -27,11 +27,11 @@ class Nominal(NamedTuple):
     path: Array  # (n, n), I - B Omega^-1 C: what the ideal input leaves of a drift
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
-    lead: Array  # (m,) time from a tick until its input acts: half a period of hold, delay, actuator lag; s
+    lead: Array  # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
 
 
 def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array) -> Nominal:
-    """The nominal model with the products that each tick uses. Omega = C B is regular."""
+    """The nominal model with the products for a tick. Omega = C B is regular."""
     inverse = np.linalg.inv(C @ B)
     path = np.eye(len(A)) - B @ inverse @ C
     return Nominal(A, B, C, gravity, inverse, path, path @ A, path @ gravity, lead)
@@ -48,20 +48,20 @@ class FeedforwardState(NamedTuple):
 
 
 def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
-    """State at engagement: the outputs at y_m, shape (m,), the other states at 0, their trim."""
+    """State at engagement: the outputs at y_m, shape (m,), the remaining states at 0, the trim."""
     xp = array_namespace(y_m)
     zeros, zero = xp.zeros_like(y_m), xp.zeros_like(y_m[0])
     return FeedforwardState(nominal.C.T @ y_m, zeros, zero, zero, zeros)
 
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
-    """Input that moves the outputs of the nominal model by y_m_dot: Omega^-1 (y_m_dot - C (A x + f(x))), shape (m,)."""
+    """Input for the motion y_m_dot of the outputs of the nominal model: Omega^-1 (y_m_dot - C (A x + f(x))), shape (m,)."""
     xp = array_namespace(x)
     return nominal.inverse @ (y_m_dot - nominal.C @ (nominal.A @ x + nominal.gravity @ xp.sin(x)))
 
 
 def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
-    """Nominal model under its ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so that C x_dot = y_m_dot.
+    """Nominal model under the ideal input, shape (n,): A x + f(x) + B ideal(x, y_m_dot), so C x_dot = y_m_dot.
 
     As (I - B Omega^-1 C) (A x + f(x)) + forced, with forced = B Omega^-1 y_m_dot.
     """
@@ -69,19 +69,19 @@ def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
 
 
 def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tuple[FeedforwardState, Array]:
-    """One tick: (state, y_m, dt) -> (state, u_ff - u_0), which is added to u of the law.
+    """A tick: (state, y_m, dt) -> (state, u_ff - u_0), a term added to u of the law.
 
-    y_m is linear over the last tick. The outputs of the nominal model follow it, and its other states (the zero dynamics) are
-    integrated with the input that this takes:
+    y_m is linear over the last tick. The outputs of the nominal model follow y_m. The remaining states (the zero dynamics) are
+    integrated with the required input:
 
-        y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m one tick ago
+        y_m_dot = (y_m - C x_p) / dt                       C x_p = y_m a tick ago
         x       = Runge-Kutta step of x_dot from x_p       C x = y_m
         u       = ideal((x + x_p) / 2, y_m_dot)            in the middle of the tick, dt / 2 ago
         u_ff    = u + (dt / 2 + lead) (u - u_p) / ((dt + dt_p) / 2)
 
-    u_ff extrapolates the last two u linearly to the instant at which the input of this tick acts: an actuator of first order
-    moves by u if it is commanded u + lag u_dot. The first two ticks after engagement only determine the slope and add
-    nothing. u_0 is u_ff of the second one, so that u does not jump (bumpless transfer). dt > 0.
+    u_ff extrapolates the last two u linearly to the instant of action of this tick's input: an actuator of first order
+    moves by u at the command u + lag u_dot. The first two ticks after engagement only determine the slope and add
+    nothing. u_0 is u_ff of the second tick, so u does not jump (bumpless transfer). dt > 0.
 
     Shapes: y_m, u_ff (m,), dt (). Units: SI and radians; u in the units of B. Source: this project, after the feedforward
     of model inversion; see docs/theory.md.
@@ -98,7 +98,7 @@ def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tu
 def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:
     """Eigenvalues of the zero dynamics, shape (n - m,), 1/s: the zeros of the nominal model.
 
-    They are those of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I that are not outputs and sin(x)
+    Eigenvalues of H' (I - B Omega^-1 C) (A + gravity) H, with H the columns of I for states not outputs, and sin(x)
     linearised to x. NumPy arrays only.
     """
     hidden = ~np.asarray(nominal.C).any(axis=0)

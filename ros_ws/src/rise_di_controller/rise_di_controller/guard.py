@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; it guards every control law.
+"""Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for every control law.
 
-- Saturation: magnitude and rate limits of u (`saturation.saturate`). The law has its own anti-windup (`ControlLaw.limited`).
+- Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law (`ControlLaw.limited`).
 - Watchdog: an input older than `max_age` is stale (`tick`).
-- Failsafe for stale inputs: hold u, then ramp it to trim (modes HOLD, RAMP, TRIM).
-- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first one.
+- Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
+- Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first engagement.
 """
 
 from collections.abc import Sequence
@@ -23,11 +23,11 @@ from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.observer import ObserverParams, ObserverState
 from rise_di_controller.saturation import Limits, saturate
 
-# Least distance of two samples from which a slope is taken, as a fraction of the extrapolation. Closer samples are noisier:
-# the extrapolation would amplify the noise of their difference more than 20 times.
+# Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
+# the extrapolation would amplify the noise of the difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
 
-# Samples kept of y and of y_m, so that y_m at the stamp of y is among them: 0.1 s at 1 kHz, more at lower rates.
+# Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower rates.
 SAMPLE_BUFFER_SIZE = 100
 
 
@@ -38,7 +38,7 @@ class GuardParams(NamedTuple):
     max_age_ns: int  # an older sample is stale
     hold_ns: int  # failsafe: how long u is held
     ramp_ns: int  # failsafe: how long u then takes to trim
-    deactivation_holds: bool  # whether u is held when deactivated; otherwise it ramps to trim
+    deactivation_holds: bool  # whether u is held when deactivated; otherwise u ramps to trim
     limits: Limits
     nominal: Nominal | None = None  # None: no feedforward
 
@@ -58,9 +58,9 @@ class ControllerState(NamedTuple):
     y_m: FloatArray | None  # the reference at the stamp of y
     u: FloatArray  # commanded, after saturation
     u_free: FloatArray  # before saturation
-    u_trim: FloatArray  # u at engagement; the law adds to it
+    u_trim: FloatArray  # u at engagement, term of u added by the law
     failsafe_start_ns: int  # when the inputs became stale, or the controller was deactivated
-    u_failsafe: FloatArray  # u at that instant
+    u_failsafe: FloatArray  # u at the start of the failsafe
     u_ff: FloatArray  # the feedforward, 0 where there is none
     feedforward: FeedforwardState | None = None
     hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
@@ -68,13 +68,13 @@ class ControllerState(NamedTuple):
 
 
 class TickInputs(NamedTuple):
-    """Inputs of one tick, for the log. Recomputing the tick from them gives u to the last bit."""
+    """Inputs of a tick, for the log. The tick recomputed from these inputs gives u to the last bit."""
 
     stamp_ns: int  # of y, and so of u; the instant of the tick where no y is used
     y: FloatArray
     y_m: FloatArray  # interpolated to the stamp of y
     y_m_offset: float  # stamp of the newest y_m minus stamp of y, s
-    dt: float  # step of the law, s; 0 where it took none
+    dt: float  # step of the law, s; 0 without a step
 
 
 def initial_state(m: int) -> ControllerState:
@@ -84,11 +84,11 @@ def initial_state(m: int) -> ControllerState:
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
-    """The signal at an instant, shape (m,); None where it cannot be interpolated or extrapolated.
+    """The signal at an instant, shape (m,); None where neither interpolation nor extrapolation is possible.
 
-    A sample with that stamp is returned as it is. Between two samples the signal is linear. Beyond the newest sample it is
-    extrapolated by at most `reach_ns`, with the slope to the newest sample that is at least MIN_SLOPE_SPAN `reach_ns` older.
-    Where there is none, the newest sample is held.
+    A sample with the stamp of the instant is returned unchanged. Between two samples the signal is linear. Beyond the newest
+    sample the signal is extrapolated by at most `reach_ns`, with the slope to the newest sample at least MIN_SLOPE_SPAN
+    `reach_ns` older. Without an older sample, the newest sample is held.
 
     Arguments: samples with increasing stamps.
     """
@@ -121,17 +121,17 @@ def tick(
     active: bool = True,
     u_ff_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
-    """One tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
+    """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
-    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). Each new y is one step of the law with the
-    measured dt, clipped to DT_RANGE periods. A law that predicts does so for each whole period without a y before that. The law
-    adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
+    Fresh inputs engage or re-engage the law with u_trim = u (bumpless transfer). A new y is a step of the law with the
+    measured dt, clipped to DT_RANGE periods. `ControlLaw.missed` predicts over every whole period without a y before the step.
+    The law adds to u_trim, or to u_trim + u_ff with a feedforward. Without a new y nothing changes.
     Stale inputs start the failsafe: HOLD (nothing is integrated), then RAMP to trim, then TRIM. Where `active` is false the
-    mode is INACTIVE, and u is held or ramps to trim; with fresh inputs it is published at trim before the first engagement too.
+    mode is INACTIVE, and u is held or ramps to trim; with fresh inputs u is published at trim before the first engagement too.
     Returns None for the inputs where nothing is to be published.
 
-    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps; both in the law's order. `u_ff_recorded`
-    stands in for a feedforward whose state is not known, in replay.
+    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's order. `u_ff_recorded`
+    replaces a feedforward of unknown state, in replay.
     """
     reference = None
     if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
@@ -173,7 +173,7 @@ def tick(
     measured = Measurements(y.value, reference, (reference - state.y_m) / dt, u_trim, state.u)
     after, u_free = control_law.step(law_state, measured, dt, params)
     u = saturate(u_free, state.u, dt, guard.limits)
-    if not np.array_equal(u, u_free):  # otherwise it gives the same and takes three times as long
+    if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
         after, u_free, u = control_law.limited(law_state, measured, dt, params, guard.limits)
     state = state._replace(law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
@@ -182,7 +182,7 @@ def tick(
 def retune(state: ControllerState, old: TunedLaw, new: TunedLaw) -> ControllerState:
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
-    An observer with the same matrices continues. One with other matrices starts again from the present error: its u_o becomes
+    An observer with the same matrices continues. An observer with new matrices starts again from the present error: u_o becomes
     part of u_trim, and then fades in from 0.
     """
     if state.law is None or state.y is None or state.y_m is None:

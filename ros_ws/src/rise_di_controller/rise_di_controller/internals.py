@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's log: one named vector a tick. With the parameters it is enough to recompute u."""
+"""The controller's log: a named vector per tick. With the parameters the log is enough to recompute u."""
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
@@ -17,11 +17,11 @@ OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
 RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS}) - {"e"}
-"""Names that the state of a law does not have: the log has them already. Its e is y - y_m."""
+"""Names reserved by the log, not for the state of a law. e is y - y_m."""
 
 
 class Saturation(IntEnum):
-    """Which limit saturated an input in a tick; published as a number in `internals`."""
+    """Limit of a saturated input in a tick; published as a number in `internals`."""
 
     NO = 0
     MAGNITUDE = 1
@@ -31,11 +31,11 @@ class Saturation(IntEnum):
 def groups(
     law: ControlLaw, outputs: Sequence[str], inputs: Sequence[str], estimates: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Groups of channels of `internals` and the names in each, in the order of the log.
+    """Groups of channels of `internals` and the names per group, in the order of the log.
 
     By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement), integral_e (units of y times
     s) and Pi (scaled input). By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff
-    (feedforward). Of an observer: its estimates z, by input u_o, and sigma, the fade-in.
+    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in.
     """
     of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS)]
     grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
@@ -58,7 +58,7 @@ def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 def values(
     state: ControllerState, inputs: TickInputs, limits: Limits, late: float, age: float, number: int, parameters: int
 ) -> FloatArray:
-    """Values of `internals` in the order of `names`. Raises ValueError for a state that was never engaged."""
+    """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged."""
     if state.law is None:
         raise ValueError("internals: found a controller that was never engaged, expected an engaged one")
     scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])

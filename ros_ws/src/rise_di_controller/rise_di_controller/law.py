@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control law, equations (20)-(22), as one pure step: from y and y_m only, without A, B, f or any acceleration.
+"""The control law, equations (20)-(22), as a pure step: from y and y_m only, without A, B, f or any acceleration.
 
-`CONTROL_LAWS` has it in the protocol of `control_law`, with its anti-windup and retuning.
+`CONTROL_LAWS` has the law in the protocol of `control_law`, with anti-windup and retuning.
 """
 
 from enum import IntEnum
@@ -25,7 +25,7 @@ class LawParams(NamedTuple):
     """Parameters of the law over m channels.
 
     The law works in inputs scaled to unit response, v_i = u_i / input_scale_i with abs(Omega_ii) about 1. So K is a bandwidth
-    in rad/s, and beta has units of y / s^2. The theorem holds for v as it does for u.
+    in rad/s, and beta has units of y / s^2. The theorem holds for v as for u.
     """
 
     K: Array  # (m,) diagonal of equation (22), 1/s
@@ -39,7 +39,7 @@ class LawParams(NamedTuple):
 
 
 class LawState(NamedTuple):
-    """State of the law between two ticks, each field of shape (m,)."""
+    """State of the law between two ticks, fields of shape (m,)."""
 
     e_0: Array  # e at engagement
     e: Array  # e at the previous tick
@@ -59,29 +59,29 @@ def total_lag(lag: Array, delay: float, period: float) -> Array:
 
 
 def engage(y: Array, y_m: Array) -> LawState:
-    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at that instant (bumpless transfer)."""
+    """State at engagement: e_0 = y - y_m, integral_e = 0, Pi = 0. So u = 0 at engagement (bumpless transfer)."""
     xp = array_namespace(y)
     e = y - y_m
     return LawState(e, e, xp.zeros_like(e), xp.zeros_like(e))
 
 
 def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) -> tuple[LawState, Array]:
-    """One tick of the law: (state, y, y_m, dt) -> (state, u).
+    """A tick of the law: (state, y, y_m, dt) -> (state, u).
 
-    With e = y - y_m (3), e_p its value at the previous tick, dt the time between the two:
+    With e = y - y_m (3), e_p = e at the previous tick, dt the time between the two ticks:
 
         integral_e += dt (e + e_p) / 2                                    trapezoid
-        LITERAL:   u from Pi as it stands, then Pi += dt beta sgn(e)      (21) by forward Euler
+        LITERAL:   u from the present Pi, then Pi += dt beta sgn(e)       (21) by forward Euler
         IMPLICIT:  Pi += dt beta s first, s = clip(e_hat / (dt^2 omega beta), -1, 1)
                    e_hat = e + (e - e_p) - dt omega K ((e - e_p) + Lambda dt (e + e_p) / 2)
         SOFT:      Pi += dt beta s first, s = clip(e / eps, -1, 1)
         u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi)         (20)
 
-    e_hat predicts e one tick ahead with an unchanged Pi, and s is the element of Sgn(e one tick ahead) that is consistent
-    with the prediction. That is backward Euler of (21): its error falls with dt^2, and it does not chatter. SOFT is for loops
-    with lag. u is the deviation from the input at engagement. sgn(0) = 0. dt > 0.
+    e_hat predicts e a tick ahead with an unchanged Pi, and s is the element of Sgn(e a tick ahead) consistent with the
+    prediction: backward Euler of (21), with an error of order dt^2 and without chatter. SOFT is for loops with lag. u is the
+    deviation from the input at engagement. sgn(0) = 0. dt > 0.
 
-    Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units that input_scale gives it.
+    Shapes: y, y_m, u (m,), dt (). Units: SI and radians; u in the units of input_scale.
     Source: (20)-(22) of Tanyer, Tatlicioglu, Zergeroglu; the sampling is this project's, see docs/theory.md.
     """
     xp = array_namespace(y)
@@ -97,8 +97,8 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
             s = e_hat / (dt * dt * params.omega * params.beta)
         else:
             s = e / params.eps
-        one = xp.ones_like(e)
-        s = xp.minimum(xp.maximum(s, -one), one)
+        unit = xp.ones_like(e)
+        s = xp.minimum(xp.maximum(s, -unit), unit)
         Pi = state.Pi + dt * params.beta * s
     after = LawState(state.e_0, e, integral_e, Pi)
     return after, control(state, after, params)
@@ -107,8 +107,8 @@ def step(state: LawState, y: Array, y_m: Array, dt: Array, params: LawParams) ->
 def control(before: LawState, after: LawState, params: LawParams) -> Array:
     """Equation (20), shape (m,): u = -input_scale D (K (e - e_0 + Lambda integral_e) + Pi).
 
-    e and integral_e are the values after the tick. Pi is the value before the tick with the literal sign, which is used and
-    then updated, and the value after the tick with the other signs. Units of u.
+    e and integral_e are the values after the tick. Pi is the value before the tick with the literal sign (first used,
+    then updated), and the value after the tick with the soft and implicit signs. Units of u.
     """
     Pi = before.Pi if params.sign is Sign.LITERAL else after.Pi
     return params.input_scale * (-params.D * (params.K * (after.e - after.e_0 + params.Lambda * after.integral_e) + Pi))
@@ -117,17 +117,17 @@ def control(before: LawState, after: LawState, params: LawParams) -> Array:
 def step_with_anti_windup(
     state: LawState, y: Array, y_m: Array, dt: Array, u_trim: Array, u_before: Array, params: LawParams, limits: Limits
 ) -> tuple[LawState, Array, Array]:
-    """One step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape (m,).
+    """A step of the law with anti-windup: (law state, u before saturation, u commanded), u of shape (m,).
 
-    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an increment of integral_e or of Pi that
-    moves u further outwards is reduced; an increment that moves u inwards stays. The increment of integral_e is dropped.
-    The increment of Pi, the faster integral, is scaled so that u ends at the limit:
+    Conditional integration. Where u_trim + u exceeds a magnitude or rate limit, an outward increment of integral_e or of Pi is
+    reduced; an inward increment stays. The increment of integral_e is dropped. The increment of Pi, the faster integral, is
+    scaled to bring u to the limit:
 
         excess = max(abs(u_trim + u - saturated) - abs(change of u by the increment of integral_e), 0)
         change = abs(change of u by the increment of Pi)
-        Pi+    = Pi + max(change - excess, 0) / change times its increment
+        Pi+    = Pi + max(change - excess, 0) / change (increment of Pi)
 
-    Without saturation every bit is that of the law alone. Theorem 1 does not cover saturation.
+    Without saturation every bit equals the law alone. Theorem 1 does not cover saturation.
     """
     xp = array_namespace(y)
     after, u = step(state, y, y_m, dt, params)
@@ -152,8 +152,8 @@ def step_with_anti_windup(
 def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
     """State for new parameters, without a jump of u (bumpless transfer): Pi absorbs the change of the linear term.
 
-    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K, Lambda and u of the old ones.
-    The other states stay. Equation (23) continues from the same u with the new gains.
+    Pi+ = -D u / input_scale - K (e - e_0 + Lambda integral_e), with the new D, input_scale, K, Lambda and u of the old
+    parameters. The remaining states stay. Equation (23) continues from the same u with the new gains.
     """
     u = control(state, state, old)
     Pi = -new.D * u / new.input_scale - new.K * (state.e - state.e_0 + new.Lambda * state.integral_e)
@@ -185,5 +185,5 @@ CONTROL_LAWS = {sign: _control_law(sign) for sign in Sign}
 
 
 def tuned(params: LawParams) -> TunedLaw:
-    """RISE-DI with its parameters."""
+    """RISE-DI with parameters."""
     return TunedLaw(CONTROL_LAWS[Sign.SOFT if params.sign is None else params.sign], params)

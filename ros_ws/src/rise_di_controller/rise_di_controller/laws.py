@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws that the controller can fly, by name: RISE-DI, and every law that an installed package registers.
+"""The control laws of the controller, by name: RISE-DI, and the laws registered by installed packages.
 
-A package registers a law by an entry point in its setup.py; see docs/laws.md:
+A package registers a law by an entry point in setup.py; see docs/laws.md:
 
     entry_points={"rise_di_controller.laws": ["pi = control_laws.pi:PiConfig"]}
 """
@@ -26,12 +26,12 @@ def _registered() -> EntryPoints:
 
 
 def names() -> tuple[str, ...]:
-    """Names of all laws, sorted."""
+    """Names of the laws, sorted."""
     return tuple(sorted({DEFAULT, *_registered().names}))
 
 
 def schema(name: object) -> type[ControllerConfig]:
-    """The parameters of a law. Raises ParameterError for a law that is not registered, or twice, or that cannot be loaded."""
+    """The parameters of a law. Raises ParameterError for a law not registered, registered twice, or not loadable."""
     if name == DEFAULT:
         return RiseDiConfig
     if name not in names():
@@ -40,20 +40,20 @@ def schema(name: object) -> type[ControllerConfig]:
     if len(entries) > 1:
         raise ParameterError(f"law: found {name!r}, registered as {' and as '.join(sorted(entries))}, expected one of them")
     try:
-        found = next(iter(entries.values())).load()
+        schema = next(iter(entries.values())).load()
     except (ImportError, AttributeError) as error:
         raise ParameterError(f"law: found {name!r}, which cannot be loaded ({error}), expected an installed package") from None
-    if not (isinstance(found, type) and issubclass(found, ControllerConfig)):
-        raise ParameterError(f"law: found {name!r}, registered as {found!r}, expected a subclass of ControllerConfig")
-    if found.needs:
+    if not (isinstance(schema, type) and issubclass(schema, ControllerConfig)):
+        raise ParameterError(f"law: found {name!r}, registered as {schema!r}, expected a subclass of ControllerConfig")
+    if schema.needs:
         raise ParameterError(
-            f"law: found {name!r}, which needs {found.needs}, expected a law of y and y_m: the topics have no more"
+            f"law: found {name!r}, which needs {schema.needs}, expected a law of y and y_m: the topics have no more"
         )
-    return found
+    return schema
 
 
 class AnyLaw(ControllerConfig):
-    """The section `controller` of a scenario: the parameters of the law that its key `law` names, RISE-DI by default."""
+    """The section `controller` of a scenario: the parameters of the law named by the key `law`, RISE-DI by default."""
 
     @classmethod
     def validate_mapping(cls, values: Mapping[str, Any], where: str) -> ControllerConfig:  # type: ignore[override]

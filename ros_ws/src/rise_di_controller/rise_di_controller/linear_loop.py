@@ -15,16 +15,16 @@ from rise_di_controller.law import LawParams, Sign, total_lag
 
 SPECTRAL_RADIUS_TOLERANCE = 1e-6
 """A spectral radius above 1 by more than this is unstable. Angles that integrate the outputs give a double eigenvalue 1, which
-rounding splits by the root of its size, 1e-8."""
+rounding splits by the root of the rounding error, 1e-8."""
 
 MAX_DELAY_MARGIN = 0.5
-"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any that this stack flies."""
+"""s, upper end of the search for a delay margin. A loop that tolerates more is slower than any loop of this stack."""
 
 SMALL = 2.0**-40  # size of the steps from 0: below every limit and every width of a sign; a power of two loses no digit
 
 
 class LinearPlant(NamedTuple):
-    """x_dot = A x + B u_a, y = C x with one actuator an input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
+    """x_dot = A x + B u_a, y = C x with an actuator per input, lag_i u_a,i_dot = u_i - u_a,i; the law's order, SI."""
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
@@ -34,7 +34,7 @@ class LinearPlant(NamedTuple):
 class Loop(NamedTuple):
     """Actuators, delay and sampling between y and the response of the aircraft, over m channels."""
 
-    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without one
+    lag: FloatArray  # (m,) time constants of the actuators, s; 0 without an actuator
     delay: float  # pure delay beyond sampling, s
     period: float  # of the law, s
 
@@ -45,7 +45,7 @@ class Loop(NamedTuple):
 
 
 class LinearLaw(NamedTuple):
-    """A law near e = 0 with k values in its state: z+ = A z + B y, u = C z + D y, at y_m = 0."""
+    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0."""
 
     A: FloatArray  # (k, k)
     B: FloatArray  # (k, m)
@@ -54,12 +54,12 @@ class LinearLaw(NamedTuple):
 
 
 def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
-    """A law's step near e = 0 over m channels: the columns are its steps by SMALL in each value of its state and of y.
+    """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the state or of y.
 
-    An observer has faded in. Raises ParameterError for the literal sign, which is not linear anywhere.
+    An observer has faded in. Raises ParameterError for the literal sign: not linear anywhere.
     """
     control_law, params = law
-    of_law = getattr(params, "law", params)  # that of an observer or a schedule
+    of_law = getattr(params, "law", params)  # the law under an observer or a schedule
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     zero = np.zeros(m)
@@ -78,7 +78,7 @@ def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
 
     begin = np.concatenate([*at_rest.values(), zero])
     rest = step(begin[:size], zero)
-    columns = [(step((begin + one)[:size], (begin + one)[size:]) - rest) / SMALL for one in SMALL * np.eye(size + m)]
+    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in SMALL * np.eye(size + m)]
     matrix = np.array(columns).T
     return LinearLaw(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], matrix[size:, size:])
 
@@ -101,7 +101,7 @@ def _exponential(matrices: bytes, shape: tuple[int, ...]) -> FloatArray:
     from scipy.linalg import expm  # noqa: PLC0415 - a controller without an observer starts without it
 
     exponential = np.asarray(expm(np.frombuffer(matrices).reshape(shape).copy()), dtype=np.float64)
-    exponential.flags.writeable = False  # the cache returns it again
+    exponential.flags.writeable = False  # the cache returns the array again
     return exponential
 
 
@@ -114,7 +114,7 @@ class SampledPlant(NamedTuple):
 
 
 def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledPlant:
-    """The exact motion over one period, with k = n + m + held m states: x, the actuators, u of earlier ticks.
+    """The exact motion over a period, with k = n + m + held m states: x, the actuators, u of earlier ticks.
 
     u of a tick is held for a period and reaches actuator i after delay + extra_i, s, shape (m,). Source: K. J. Astrom,
     B. Wittenmark, "Computer-Controlled Systems", section 2.3, for the sampling of a plant with delay.
@@ -122,7 +122,7 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     n, m = plant.B.shape[-2:]
     batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
-    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any, it drives nothing
+    rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any rate, unused
     motion, drive = np.zeros((*batch, n + m, n + m)), np.zeros((*batch, n + m, m))
     motion[..., :n, :n], motion[..., :n, n:], motion[..., n:, n:] = plant.A, plant.B * has_lag, -np.diag(rate)
     drive[..., :n, :], drive[..., n:, :] = plant.B * ~has_lag, np.diag(rate * has_lag)
@@ -147,9 +147,9 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
 
 
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
-    """One period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
+    """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
 
-    The state is that of `sampled_plant`, then the law's. Leading axes of the plant are batches.
+    The state is the state of `sampled_plant`, then the state of the law. Leading axes of the plant are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
     k, size = A.shape[-1], A.shape[-1] + len(law.A)
@@ -170,10 +170,10 @@ def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray)
 
 
 def delay_margin(plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | None = None) -> float:
-    """Delay margin: pure delay beyond loop.delay, s, at which the linear loop turns unstable, in all channels or in one.
+    """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all channels or in `channel`.
 
-    0 if the loop is unstable without it, infinite if the loop tolerates half a second. The search takes steps of half a period,
-    then bisects down to 0.1 ms.
+    0 if the loop is unstable without extra delay, infinite if the loop tolerates half a second. The search takes steps of half
+    a period, then bisects down to 0.1 ms.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     if not is_stable(plant, law, loop, 0.0 * delayed):

@@ -30,17 +30,17 @@ ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
 DECADES, PER_DECADE = 5, 40
-"""Grid of frequencies below pi / T. The frequencies of all modes are added, and eight points around each peak."""
+"""Grid of frequencies below pi / T. The frequencies of the modes are added, and eight points around every peak."""
 
 SLOW = np.pi / 2.0
 """rad, largest natural frequency times T of a slow mode: four ticks a cycle. A faster mode shows in gain margin and S."""
 
-NO_MODE = 1e-6  # rad, natural frequency times T below which an eigenvalue is that of an integral or of a kept constant
-VANISHED = 1e-9  # magnitude of an eigenvalue that ends within a period: a delayed input, or rounding
+NO_MODE = 1e-6  # rad, natural frequency times T below which an eigenvalue belongs to an integral or a kept constant
+VANISHED = 1e-9  # magnitude of an eigenvalue of a motion ended within a period: a delayed input, or rounding
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
-SERIAL_SIZE = 4000  # entries of a complex matrix below which OpenBLAS starts no threads, which would only wait
+SERIAL_SIZE = 4000  # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
 PHASE_AT_ZERO = 0.01  # rad, phase of -L at the lowest frequency below which L is taken as real there
-BALANCED_ROUNDS, DESCENT_STEPS, MAX_REFINED = 6, 40, 40  # of `scaled_norm`, and of the search for its peak
+BALANCED_ROUNDS, DESCENT_STEPS, MAX_REFINED = 6, 40, 40  # of `scaled_norm`, and of the search for the peak
 
 
 class Margins(NamedTuple):
@@ -48,14 +48,14 @@ class Margins(NamedTuple):
 
     stable: NDArray[np.bool_]  # (...) whether no eigenvalue lies outside the unit circle
     phase: FloatArray  # (..., m) rad, infinite where abs(L_i) is never 1
-    crossover: FloatArray  # (..., m) rad/s of this phase margin, 0 without one
-    gain_decrease: FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without one
-    gain_increase: FloatArray  # (..., m) factor above 1, infinite without one
+    crossover: FloatArray  # (..., m) rad/s of this phase margin, 0 without a crossover
+    gain_decrease: FloatArray  # (..., m) factor below 1 at which the loop turns unstable, 0 without a limit
+    gain_increase: FloatArray  # (..., m) factor above 1, infinite without a limit
     sensitivity: FloatArray  # (..., m) largest abs(S_ii)
-    disk: FloatArray  # (..., m) balanced disk margin of one input, 0 to 2
+    disk: FloatArray  # (..., m) balanced disk margin of an input, 0 to 2
     sensitivity_all: FloatArray  # (...) largest singular value of S, scaled diagonally: all inputs at once
-    disk_all: FloatArray  # (...) balanced disk margin, an independent disk in each input at once
-    damping: FloatArray  # (...) least damping ratio of a slow mode, 1 without one
+    disk_all: FloatArray  # (...) balanced disk margin, independent disks in the inputs at once
+    damping: FloatArray  # (...) least damping ratio of a slow mode, 1 without a slow mode
 
     @property
     def gain(self) -> FloatArray:
@@ -92,7 +92,7 @@ class SlowModes(NamedTuple):
 
 
 def slow_modes(plant: LinearPlant, law: LinearLaw, loop: Loop) -> SlowModes:
-    """The slow modes of one aircraft: p = log(eigenvalue) / T, frequency abs(p), damping -Re p / abs(p)."""
+    """The slow modes of an aircraft: p = log(eigenvalue) / T, frequency abs(p), damping -Re p / abs(p)."""
     eigenvalues = np.linalg.eigvals(closed_loop(plant, law, loop, np.zeros(len(loop.lag))))
     return _slow_modes(eigenvalues.astype(np.complex128), loop.period)
 
@@ -105,22 +105,22 @@ def _slow_modes(eigenvalues: ComplexArray, period: float) -> SlowModes:
 
 
 def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray) -> ComplexArray:
-    """L_i of one aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
+    """L_i of an aircraft at the frequencies w, (F,) rad/s up to pi / T, shape (F, m)."""
     form = _schur_form(LinearPlant(plant.A[None], plant.B[None], plant.C), law, loop)
     S = _sensitivity(form, np.exp(1j * w * loop.period)[None])[0]
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
 
 
 def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
-    """Margins of one aircraft, or of N aircraft under one law: A (N, n, n) and B (N, n, m) of the plant.
+    """Margins of an aircraft, or of N aircraft under the same law: A (N, n, n) and B (N, n, m) of the plant.
 
-    Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of their height. The phase margin is the
+    Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The phase margin is the
     smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are 1 / abs(L_i) at real L_i < 0, next to 1 on either side.
-    The disk margin is 1 / max_w abs(S_ii - 1/2) of one input, and with an independent disk in each input at once
+    The disk margin is 1 / max_w abs(S_ii - 1/2) of an input, and with independent disks in the inputs at once
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
-    which is exact for m <= 3 and at most the disk margin for more inputs.
+    exact for m <= 3 and at most the disk margin for more inputs.
     """
     shape = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     n, m = plant.B.shape[-2:]
@@ -160,7 +160,7 @@ def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
 
 
 def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
-    """S at the points z (N, F), shape (N, F, m, m), by back substitution for all points of a part at once."""
+    """S at the points z (N, F), shape (N, F, m, m), by back substitution for the points of a part at once."""
     (N, k, m), F = form.R.shape, z.shape[1]
     size = min(max(SERIAL_SIZE // (k * m), 1), F)
     z = np.pad(z, ((0, 0), (0, -F % size)), mode="edge").reshape(N, -1, size)
@@ -203,7 +203,7 @@ def _margins(form: _SchurForm, period: float) -> Margins:
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
-    """Grid for each aircraft, (N, F), rad/s, ascending: a common one, and the frequency of each mode."""
+    """Grids of the aircraft, (N, F), rad/s, ascending: a common grid, and the frequencies of the modes."""
     highest = np.pi / period
     turns = np.log(np.where(np.abs(eigenvalues) > VANISHED, eigenvalues, VANISHED)) / period
     modes = np.where(turns.imag != 0.0, np.abs(turns.imag), np.abs(turns))
@@ -213,7 +213,7 @@ def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:
 
 
 def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
-    """Four points on either side of the peaks of S_ii, of S_ii - 1/2 and of their norms over all inputs, (N, G), S balanced."""
+    """Four points on either side of the peaks of S_ii, of S_ii - 1/2 and of norms over the inputs, (N, G), S balanced."""
     diagonal = np.einsum("NFii->NFi", S)
     half = S - np.eye(S.shape[-1]) / 2.0
     norms = [_norm_bound(matrix)[..., None] for matrix in (S, half)]
@@ -229,7 +229,7 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
 
 
 def _crossings(values: FloatArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Aircraft, place and input of each change of sign along the second axis of (N, F, m)."""
+    """Aircraft, place and input of the changes of sign along the second axis of (N, F, m)."""
     return np.nonzero(np.signbit(values[:, :-1]) != np.signbit(values[:, 1:]))  # type: ignore[return-value]
 
 
@@ -241,7 +241,7 @@ def _refined(
     period: float,
     of_L: Callable[[ComplexArray], FloatArray],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies at which of_L(L_i) is 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
+    """Frequencies of of_L(L_i) = 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
     aircraft, place, channel = places
     of_each = _SchurForm(*(part[aircraft] for part in form))
     low, high = w[aircraft, place], w[aircraft, place + 1]
@@ -252,11 +252,11 @@ def _refined(
         middle = np.where(gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap))
         S = _sensitivity(of_each, np.exp(1j * middle * period)[:, None])[:, 0]
         L = 1.0 / S[np.arange(len(low)), channel, channel] - 1.0
-        found = of_L(L)
-        side = np.where(np.signbit(found) == np.signbit(at_high), 1.0, -1.0)
-        kept = np.where(side == before, 0.5, 1.0)  # the value of an end that stays twice is halved
+        value = of_L(L)
+        side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
+        kept = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved
         low, high = np.where(side > 0.0, low, middle), np.where(side > 0.0, middle, high)
-        at_low, at_high = np.where(side > 0.0, kept * at_low, found), np.where(side > 0.0, found, kept * at_high)
+        at_low, at_high = np.where(side > 0.0, kept * at_low, value), np.where(side > 0.0, value, kept * at_high)
         before = side
     return middle, L
 
@@ -267,7 +267,7 @@ def _log_gain(L: ComplexArray) -> FloatArray:
 
 
 def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and its frequency, (N, m)."""
+    """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and the frequency, (N, m)."""
     gains = _log_gain(L)
     places = _crossings(gains)
     frequency, at = _refined(form, w, places, gains, period, _log_gain)
@@ -279,7 +279,7 @@ def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: flo
 
 
 def _gain_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: float) -> tuple[FloatArray, FloatArray]:
-    """Factors next to 1 below and above at which L_i is -1, (N, m); L_i is real at w = 0 and at pi / T too."""
+    """Factors next to 1 below and above for L_i = -1, (N, m); L_i is real at w = 0 and at pi / T too."""
     imaginary = np.imag(L) / (1.0 + np.abs(L))
     imaginary[:, -1] = 0.0  # rounding apart
     places = _crossings(imaginary)
@@ -346,9 +346,9 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
-    """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is refined until it stays."""
+    """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is refined to convergence."""
     bounds, rows = _norm_bound(balanced), np.arange(len(balanced))
-    least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))  # a diagonal entry, which no D changes
+    least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))  # a diagonal entry, unchanged by D
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))
     refined = np.zeros(bounds.shape, dtype=bool)

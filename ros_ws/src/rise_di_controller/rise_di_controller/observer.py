@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Observer, an extension of the paper, off by default: estimates of states, wind and disturbances correct the trim of a law.
 
-It extends any control law: the law's own equations do not change. Its matrices are parameters, so nothing is solved here. See
-docs/theory.md.
+The observer extends any control law: the law's own equations do not change. The matrices are parameters, so nothing is solved
+here. See docs/theory.md.
 """
 
 from functools import lru_cache
@@ -15,7 +15,7 @@ from rise_di_controller.saturation import Limits, saturate
 
 
 class ObserverParams(NamedTuple):
-    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N aircraft as its last axis.
+    """Parameters of the extended law and of the observer, s estimates; a matrix may have the N aircraft as the last axis.
 
     The model of the deviation from the reference, u held over a period: z+ = Phi z + Gamma (u - u_trim), e = H z.
     """
@@ -27,7 +27,7 @@ class ObserverParams(NamedTuple):
     L: Array  # (s, m) correction of the estimates by the innovation
     F: Array  # (m, s) u per estimate
     limits: Limits  # of u_o
-    fade_rate: Array  # () 1/s, inverse of the time in which u_o fades in after engagement
+    fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
 
 
 class ObserverState(NamedTuple):
@@ -50,12 +50,12 @@ def product(matrix: Array, vector: Array) -> Array:
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:
-    """Estimates one period later: Phi z + Gamma u, with u the deviation from u_trim."""
+    """Estimates a period later: Phi z + Gamma u, with u the deviation from u_trim."""
     return product(params.Phi, z) + product(params.Gamma, u)
 
 
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
-    """Estimates at engagement: H'e, the outputs at their errors and all else 0."""
+    """Estimates at engagement: H'e, the outputs at the errors and the rest 0."""
     return product(params.H.swapaxes(0, 1), e)
 
 
@@ -64,7 +64,7 @@ def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -
 
         z     = z + L (e - H z)
         sigma = min(1, sigma + dt fade_rate)
-        u_o   = -sigma F z, inside its limits of magnitude and rate
+        u_o   = -sigma F z, inside limits of magnitude and rate
 
     The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
     """
@@ -78,9 +78,9 @@ def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -
 def with_observer(law: ControlLaw) -> ControlLaw:
     """A control law from the trim u_trim + u_o; the observer takes u after saturation (anti-windup).
 
-        u_o as `correct` computes it
+        u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
-        z  += Phi z + Gamma (u - u_trim)        for the next tick, and again for each missed one
+        z  += Phi z + Gamma (u - u_trim)        for the next tick, and again per missed tick
 
     The law takes the measured e, not the estimate.
     """

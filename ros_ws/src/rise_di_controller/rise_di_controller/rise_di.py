@@ -50,7 +50,7 @@ class RiseDiConfig(ControllerConfig):
     )
 
     def check_law(self) -> None:
-        """One value for each channel; k_d has none for the last. A schedule needs V, and no model of the trim beside it."""
+        """A value per channel; k_d has no value for the last. A schedule needs V, and no model of the trim besides."""
         require_length("k_d", self.k_d, self.outputs[:-1])
         for key in ("Lambda", "beta", "omega"):
             require_length(key, getattr(self, key), self.outputs)
@@ -62,12 +62,12 @@ class RiseDiConfig(ControllerConfig):
             require(alone, "schedule", "a feedforward or an observer beside it", "neither: their model holds at the trim speed")
 
     def tuned_law(self) -> TunedLaw:
-        """The law with its parameters, extended by the observer or the schedule where there is one."""
+        """The law with parameters, extended by the observer or the schedule, if any."""
         law = super().tuned_law()
         return law if self.schedule is None else self.schedule.extended(law, self.outputs)
 
     def control_law(self) -> ControlLaw:
-        """RISE-DI with its sampled sign."""
+        """RISE-DI with the sampled sign."""
         return CONTROL_LAWS[self.sampled_sign()[0]]
 
     def law_params(self) -> LawParams:

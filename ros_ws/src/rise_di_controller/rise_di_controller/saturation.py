@@ -18,7 +18,7 @@ class Limits(NamedTuple):
 def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
     """Saturation of u, shape (m,): clipped to [lower, upper] and to u_before +- rate dt. Inside, u returns to the last bit.
 
-    Where u_before is outside of new limits, u moves to them at its rate.
+    Where u_before is outside of new limits, u moves to the limits at the rate.
     """
     xp = array_namespace(u)
     reach = limits.rate * dt
@@ -28,12 +28,12 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
 
 
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:
-    """An integral after a tick, shape (m,): an increment that moves u further beyond a limit is reduced (anti-windup).
+    """An integral after a tick, shape (m,): an outward increment beyond a limit is reduced (anti-windup).
 
         before + max(1 - beyond / change, 0) (after - before)    where change beyond > 0, otherwise `after`, to the last bit
 
-    So u ends at the limit, and moves at its rate where the limit is one of rate. Arguments: `change` of u by the increment;
-    `beyond`, u with the increment less u after saturation; both in the same units. Source: conditional integration,
+    So u ends at the limit, and moves at the rate where a rate limit acts. Arguments: `change` of u by the increment;
+    `beyond`, u with the increment less u after saturation, in the same units. Source: conditional integration,
     K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5; the reduced increment is this project's.
     """
     xp = array_namespace(before)

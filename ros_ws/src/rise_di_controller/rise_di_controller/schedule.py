@@ -3,8 +3,8 @@
 """Schedule of input_scale over dynamic pressure, an extension of the paper, off by default.
 
 A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of fixed gains falls as much.
-The schedule keeps Omega input_scale near that of the trim. It extends a law whose parameters have input_scale; the law's own
-equations do not change.
+The schedule keeps Omega input_scale near the value of the trim. The schedule extends a law with the parameter input_scale; the
+law's own equations do not change.
 """
 
 import math
@@ -36,10 +36,10 @@ class ScheduleState(NamedTuple):
 
 
 def target_scale(y: Array, params: ScheduleParams) -> Array:
-    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within SCALE_RANGE; 1 for V itself.
+    """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within SCALE_RANGE; 1 in channel V.
 
-    The ratio is that of dynamic pressures at one density: for V in y as equivalent airspeed at any altitude, for true airspeed
-    near the altitude of the trim. A thrust does not follow it.
+    A ratio of dynamic pressures at equal density: for V in y as equivalent airspeed at any altitude, for true airspeed
+    near the altitude of the trim. A thrust does not follow the ratio.
     """
     xp = array_namespace(y)
     least, largest = (params.speed / math.sqrt(scale) for scale in reversed(SCALE_RANGE))
@@ -50,10 +50,10 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
 
 @lru_cache(maxsize=64)
 def with_schedule(law: ControlLaw) -> ControlLaw:
-    """A control law whose input_scale follows the dynamic pressure:
+    """A control law with input_scale scheduled over the dynamic pressure:
 
         scale += min(dt / time, 1) (target_scale(y) - scale)
-        the law is retuned to input_scale scale (bumpless transfer), then takes its step
+        the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
     The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y).
     """  # noqa: D400, D415 - what follows is an equation
