@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The graph of a flight: its nodes, their start order, their parameter overrides. Launch files and process runner share it."""
+"""The graph of a flight: nodes, start order, parameter overrides. Launch files and process runner share the graph."""
 
 import time
 from collections.abc import Collection, Mapping
@@ -15,7 +15,7 @@ from flight_core.parameters import require
 
 
 class NodeSpec(NamedTuple):
-    """One process of a flight."""
+    """A process of a flight."""
 
     package: str
     executable: str  # also the node's name, and its section in a scenario
@@ -68,12 +68,12 @@ class Autopilot(NamedTuple):
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: those of the map, the pose where the map has one, WOULD_SEND, ENGAGEMENT."""
+        """The topics to record: topics of the map, the pose of a map with a pose, WOULD_SEND, ENGAGEMENT."""
         return [*self.channel_map.topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND, ENGAGEMENT]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
-    """An autopilot by the name of its channel map, or the path of one. Raises ParameterError."""
+    """An autopilot by the name or the path of a channel map. Raises ParameterError."""
     return Autopilot(load_map(map_name), find_map(map_name), dry_run)
 
 
@@ -81,7 +81,7 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     """Raise ParameterError where the controller may command more than the map sends; a dry run sends nothing.
 
     The bridge would clip u, and the anti-windup of the law would not know. The limits of the scenario are not narrowed here:
-    the log holds the parameters that flew. A controller that holds u while it is inactive is refused, too: the bridge engages
+    the log holds the parameters that flew. A controller with a held u while inactive is refused, too: the bridge engages
     only from a u near trim.
     """
     if autopilot.dry_run:
@@ -101,7 +101,7 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance where the scenario has it.
+    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance of a guided scenario.
 
     Raises ParameterError where guidance cannot fly the simulated aircraft.
     """
@@ -114,25 +114,25 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
 def start_lead(startup: float) -> float:
     """Time from the start of the second stage to t = 0, s, given the time until the first stage was ready.
 
-    The second stage gets half as long again as the first one took. The nodes get half a second to discover each other.
+    The second stage gets half as long again as the first stage took. The nodes get half a second for discovery.
     """
     return 0.5 + 1.5 * startup
 
 
 def start_instant(lead: float) -> float:
-    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so that nodes with and without `start_time` tick together."""
+    """System time of t = 0, s, `lead` from now: a whole 0.01 s, so nodes with and without `start_time` tick together."""
     return round(time.time() + lead, 2)
 
 
 def parameter_overrides(
     spec: NodeSpec, scenario: Scenario, run: Path, start_time: float, *, lockstep: bool, autopilot: Autopilot | None = None
 ) -> ParameterOverrides:
-    """The parameters of a process beside its section of the scenario file; "node:name" where it holds several nodes.
+    """The parameters of a process beside the section of the scenario file; "node:name" for several nodes.
 
-    Real time: the nodes with a t = 0 get its instant. Lockstep: the aircraft gets the rate of u and the duration, controller
-    and guidance the rate of y, the reference model that of u_m. Guidance gets the numbers that follow from other sections. The
-    recorder gets the files to attach to the log; this function writes them into the folder of the run. With an autopilot the
-    bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts inactive.
+    Real time: the nodes with a t = 0 get the instant. Lockstep: the aircraft gets the rate of u and the duration, controller
+    and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule. The
+    recorder gets the files to attach to the log; this function writes the files into the folder of the run. With an autopilot
+    the bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts inactive.
     """
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
@@ -175,9 +175,9 @@ def parameter_overrides(
 def replayed_topics(
     recorded: Collection[str], nodes: Collection[NodeSpec], namespace: str = "", autopilot: Autopilot | None = None
 ) -> list[str]:
-    """Those of the recorded topics that none of the nodes publishes; full names, in order.
+    """The recorded topics without a publisher among the nodes; full names, in order.
 
-    `namespace` is that of the nodes. A bridge among the nodes also publishes the messages of its channel map.
+    `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its channel map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
     published = {prefix + name for node in nodes for name in PUBLISHED_TOPICS[node]}

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark course of all aircraft, tick by tick: reference, wind, errors of the sensors, feedforward.
+"""The benchmark course of the aircraft, tick by tick: reference, wind, errors of the sensors, feedforward.
 
-It does not depend on the aircraft. It is computed once, with the functions of the simulation in one process.
+The course does not depend on the aircraft and is computed once, with the functions of the simulation in one process.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ HOLD, ENGAGE, STEP = range(3)
 
 
 class Segments(NamedTuple):
-    """The parts of a course that change from tick to tick."""
+    """The changing parts of a course, tick by tick."""
 
     t: FloatArray  # (T,) s
     phase: NDArray[np.int32]  # (T,) HOLD, ENGAGE or STEP
@@ -57,10 +57,10 @@ class Course(NamedTuple):
 
 
 def build_course(scenario: Scenario) -> Course:
-    """The course of a scenario, with the feedforward of its controller.
+    """The course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario that a campaign cannot fly: an aircraft of JSBSim, a delay of y by a part of a tick,
-    dropouts of a y with another rate than the ticks, or dropouts longer than the age limit.
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y by a part of a tick,
+    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")

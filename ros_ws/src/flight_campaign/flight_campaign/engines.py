@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Engines that run the chunks of a campaign: threads of this process, or dask workers. The results are the same."""
+"""Engines for the chunks of a campaign: threads of this process, or dask workers, with equal results."""
 
 import logging
 import os
@@ -38,7 +38,7 @@ def threads(workers: int | None = None) -> Engine:
                 done, _ = wait(underway, return_when=FIRST_COMPLETED)
                 for future in done:
                     job = underway.pop(future)
-                    underway.update((pool.submit(work, other), other) for other in islice(waiting, 1))
+                    underway.update((pool.submit(work, following), following) for following in islice(waiting, 1))
                     yield job, future.result()
         finally:
             pool.shutdown(cancel_futures=True)
@@ -47,9 +47,9 @@ def threads(workers: int | None = None) -> Engine:
 
 
 def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
-    """Processes of this machine, or the workers of a scheduler. The chunks of a worker that dies run again.
+    """Processes of this machine, or the workers of a scheduler. The chunks of a dead worker run again.
 
-    The chunks that a scheduler had when it was lost are given to it again, if it is back within RECONNECT.
+    A scheduler gets the lost chunks again when the scheduler is back within RECONNECT.
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
@@ -82,9 +82,9 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     for future in done:
                         result = future.result()
                         job = underway.pop(future)
-                        for other in islice(waiting, 1):
-                            more = client.submit(work, other, pure=False)
-                            underway[more] = other
+                        for following in islice(waiting, 1):
+                            more = client.submit(work, following, pure=False)
+                            underway[more] = following
                             done.add(more)
                         yield job, result
                 except (CancelledError, CommClosedError):

@@ -80,8 +80,8 @@ def vehicle(scenario: Scenario) -> Vehicle:
         np.argmax(aircraft.C[order], axis=1),
         np.array([list(channels.inputs).index(name) for name in scenario.controller.inputs]),
         *_reduced(aircraft),
-        Actuators(*(None if one is None else one[:, None] for one in plant.actuators)),
-        Limits(*(one[:, None] for one in scenario.controller.guard().limits)),
+        Actuators(*(None if values is None else values[:, None] for values in plant.actuators)),
+        Limits(*(values[:, None] for values in scenario.controller.guard().limits)),
         None if quantum is None else quantum[:, None],
         seconds(plant.step_ns),
     )
@@ -273,7 +273,7 @@ def _fly(
         segment, action = at_tick
         true, flown = now.x[vehicle.outputs], now.mission
         if mission is None:
-            y_m, *reference = (one[:, None] for one in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
+            y_m, *reference = (values[:, None] for values in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
         else:
             flown, y_m, *reference = missions.reference(flown, mission)
         e = true - y_m

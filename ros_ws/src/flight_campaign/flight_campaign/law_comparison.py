@@ -22,7 +22,7 @@ TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
 
 
 class Scores(NamedTuple):
-    """Scores of the uncertain aircraft of one level in one wind."""
+    """Scores of the uncertain aircraft of a level in a wind."""
 
     mean: float  # infinite if one diverged
     worst: float
@@ -30,14 +30,14 @@ class Scores(NamedTuple):
 
 
 class Level(NamedTuple):
-    """Results of a law on the uncertain aircraft of one level, u in time."""
+    """Results of a law on the uncertain aircraft of a level, u in time."""
 
     uncertainty: float
     scores: dict[str, Scores]  # by wind
 
 
 class LawResult(NamedTuple):
-    """Results of one law; channels in the law's order, SI."""
+    """Results of a law; channels in the law's order, SI."""
 
     law: str
     objective: str  # what it was tuned on
@@ -57,10 +57,10 @@ def compare(
     seed: int,
     delays: Sequence[int] = DELAY_TICKS,
 ) -> Iterator[LawResult]:
-    """Simulate each law with each of its gain sets on the same flights; a thread flies one law.
+    """Simulate the laws with their gain sets on the same flights; a thread flies a law.
 
-    The flights, in each wind: the nominal aircraft and `aircraft` uncertain ones of `seed` at each level. In gusts also the
-    aircraft of the first level with u late by each of `delays`, ticks. Raises ParameterError for an uncertainty outside [0, 1).
+    The flights, by wind: the nominal aircraft and `aircraft` uncertain aircraft of `seed` per level. In gusts also the aircraft
+    of the first level with u late by `delays`, ticks. Raises ParameterError for an uncertainty outside [0, 1).
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
@@ -104,16 +104,16 @@ def compare(
         return found
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for found in pool.map(results, tuned):
-            yield from found
+        for scored in pool.map(results, tuned):
+            yield from scored
 
 
 def score_cells(result: LawResult) -> list[str]:
-    """The scores of a law as cells of a table: in each wind that of the nominal aircraft, then mean (worst) at each level."""
+    """The scores of a law as cells of a table: by wind the score of the nominal aircraft, then mean (worst) by level."""
     cells = []
     for wind, nominal in result.scores.items():
         uncertain = (level.scores[wind] for level in result.levels)
-        cells += [f"{nominal:.2f}", *(f"{one.mean:.2f} ({one.worst:.2f})" for one in uncertain)]
+        cells += [f"{nominal:.2f}", *(f"{scores.mean:.2f} ({scores.worst:.2f})" for scores in uncertain)]
     return cells
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Missions of a fleet: the aircraft of a guided scenario fly its route, with reference model, pose and guidance of each.
+"""Missions of a fleet: the aircraft of a guided scenario fly the route, with a reference model, pose and guidance per aircraft.
 
-The last axis of every array is the aircraft. The equations are those of the nodes: `flight_guidance.modes.follow` and
+The last axis of every array is the aircraft. The equations come from the nodes: `flight_guidance.modes.follow` and
 `command`, `aircraft_sim.pose`, `reference_model.model`.
 """
 
@@ -34,7 +34,7 @@ from reference_model import model
 
 
 class Legs(NamedTuple):
-    """The L legs of a route, (L,) each, points (2, L): north, east, m."""
+    """The L legs of a route, shapes (L,), points (2, L): north, east, m."""
 
     is_line: Array
     origin: Array  # start of a line, centre of an arc
@@ -55,7 +55,7 @@ class Legs(NamedTuple):
 )
 @dataclass(frozen=True)
 class Mission:
-    """What all aircraft of a fleet share. m outputs, in the reference model's order; n states of the reference model."""
+    """Common parameters of a fleet. m outputs, in the reference model's order; n states of the reference model."""
 
     action: Array  # (T,) of guidance at the ticks: HOLD, ENGAGE or STEP
     legs: Legs
@@ -97,7 +97,7 @@ class MissionState(NamedTuple):
 
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
-    """The section `guidance` of a scenario. Raises ParameterError where a campaign of missions cannot fly or judge it."""
+    """The section `guidance` of a scenario. Raises ParameterError for a guidance beyond a campaign of missions."""
     guidance, aircraft, reference = scenario.guidance, scenario.aircraft, scenario.reference_model
     if guidance is None or guidance.route is None:
         expected = "a route, whose cross-track error is the score of a campaign of missions"
@@ -116,7 +116,7 @@ def require_mission(scenario: Scenario) -> GuidanceConfig:
 def build(scenario: Scenario, course: Course) -> Mission:
     """The mission of a guided scenario over a course.
 
-    Raises ParameterError for what `require_mission` refuses, and for a rate of guidance that does not meet the ticks.
+    Raises ParameterError as `require_mission`, and for a rate of guidance that does not meet the ticks.
     """
     guidance, aircraft, reference = require_mission(scenario), scenario.aircraft, scenario.reference_model
     params, names = guidance.params(), scenario.controller.outputs
@@ -170,7 +170,7 @@ def legs_of(route: Route) -> Legs:
 
 
 def initial_state(count: int, late: int, mission: Mission) -> MissionState:
-    """N aircraft in trim, heading north, y of them `late` ticks old."""
+    """N aircraft in trim, heading north, y `late` ticks old."""
     n, m = mission.Gamma.shape
     none, zeros = jnp.zeros(count), jnp.zeros((m, count))
     velocity = jnp.zeros((3, count)).at[0].set(mission.speed)
@@ -195,7 +195,7 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
 
 
 def reference(state: MissionState, mission: Mission) -> tuple[MissionState, Array, Array, Array]:
-    """The state with y_m of a tick; y_m at the tick, y_m at the stamp of y, and its slope since the last tick; (m, N) each."""
+    """The state with y_m of a tick; y_m at the tick, y_m at the stamp of y, and the slope; shapes (m, N)."""
     y_m = mission.C @ state.x_m
     arriving = jnp.concatenate([y_m[None], state.y_m_before])
     sampled = arriving[-1]
@@ -204,7 +204,7 @@ def reference(state: MissionState, mission: Mission) -> tuple[MissionState, Arra
 
 
 def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Array, mission: Mission) -> MissionState:
-    """The state after guidance at a tick, from x (n, N), and y in the law's order, (m, N), where one arrives."""
+    """The state after guidance at a tick, from x (n, N), and an arriving y in the law's order, (m, N)."""
     y = jnp.where(segment.phase == HOLD, state.y, y)
     state = state._replace(y=y)
     pose, params = _pose(state, x, segment.t, mission), mission.guidance
@@ -279,12 +279,12 @@ def advance(state: MissionState, x: Array, mission: Mission) -> MissionState:
 
 
 def _states(x: Array, mission: Mission) -> list[Array]:
-    """The POSE_STATES, deviations from trim, (N,) each."""
+    """The POSE_STATES, deviations from trim, shapes (N,)."""
     return [0.0 * x[0] if place is None else x[place] for place in mission.states]
 
 
 def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str, Array]:
-    """The pose over ground by channel of `channels.POSE`, (N,) each; psi is not wrapped."""
+    """The pose over ground by channel of `channels.POSE`, shapes (N,); psi is not wrapped."""
     _, _, beta, phi, theta, *_ = _states(x, mission)
     north, east, altitude = state.position
     v_north, v_east, climb = state.velocity
@@ -296,10 +296,10 @@ def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str
 
 
 def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
-    """Score, cross-track error and altitude error on the route, largest bank, (N,) each, SI.
+    """Score, cross-track error and altitude error on the route, largest bank, shapes (N,), SI.
 
-    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the last waypoint is left out:
-    it begins at its centre.
+    The score is the largest cross-track error in half seconds of flight at V0. The orbit round the last waypoint, which
+    begins at the centre, is left out.
     """
     samples = jnp.maximum(state.samples, 1.0)
     return {

@@ -29,7 +29,7 @@ WORST_KEPT = 10  # number of worst flights in a tally
 
 
 class Figure(Config):
-    """One figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
+    """A figure over many flights. Sums have a fixed order: the same chunks give the same bits."""
 
     count: int = 0
     mean: float = 0.0
@@ -48,7 +48,7 @@ class Figure(Config):
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, other: Self) -> Self:
-        """Both together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
+        """The figures together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
         count = self.count + other.count
         if not count:
             return self
@@ -67,7 +67,7 @@ class Figure(Config):
         return math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
 
     def quantile(self, share: float) -> float:
-        """The value below which a share of the flights lies, to the width of a bin (2.3 %)."""
+        """The upper bound of a share of the flights, to the width of a bin (2.3 %)."""
         wanted, below = share * self.count, 0
         for place, found in self.bins.items():
             if below + found >= wanted:
@@ -78,7 +78,7 @@ class Figure(Config):
 
 
 class Worst(Config):
-    """One of the worst flights: number of its aircraft and its score, None if it diverged."""
+    """A flight among the worst: number of the aircraft and score, None for divergence."""
 
     number: int
     score: float | None
@@ -95,7 +95,7 @@ class Tally(Config):
 
     @classmethod
     def of(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
-        """Of the aircraft first, first + 1, ...; every figure of shape (N,), one of them the "score"."""
+        """Of the aircraft first, first + 1, ...; every figure of shape (N,), the "score" included."""
         bounded, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
         rank = np.where(bounded, score, np.inf)
         order = np.argsort(-rank, kind="stable")[:WORST_KEPT]
@@ -129,10 +129,10 @@ class Tally(Config):
             | {f"q{100 * part:g}": of.quantile(part) for part in QUANTILES}
             for name, of in self.figures.items()
         }
-        return {"flights": self.flights, **shares, "figures": named, "worst": [one.model_dump() for one in self.worst]}
+        return {"flights": self.flights, **shares, "figures": named, "worst": [flight.model_dump() for flight in self.worst]}
 
     def share(self, of: int) -> tuple[float, float, float]:
-        """A number of flights as a share of all, and its 95 % confidence interval (Clopper-Pearson), each 0 to 1."""
+        """A number of flights as a share, and the 95 % confidence interval (Clopper-Pearson), 0 to 1."""
         from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
 
         interval = binomtest(of, self.flights).proportion_ci(0.95, method="exact")
@@ -140,7 +140,7 @@ class Tally(Config):
 
 
 def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
-    """Unit of the rms error of each channel in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
+    """Units of the rms errors of the channels in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
     for name in outputs:
         expected = f"units a score counts: {', '.join(SCORE_UNIT)}"
         require(units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", expected)
@@ -148,5 +148,5 @@ def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:
-    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): one a channel is 10 mrad/s or 0.1 m/s, 20 in p."""
+    """Sum over the channels of rms / unit, shape (N,), from (m, N) and (m,): 1 a channel is 10 mrad/s or 0.1 m/s, 20 in p."""
     return np.asarray(np.sum(rms / unit[:, None], axis=0))

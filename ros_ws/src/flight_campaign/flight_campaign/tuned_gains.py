@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of tuned gains: one a scenario, with the gains of each law by objective."""
+"""Files of tuned gains: a file per scenario, with gains by law and objective."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +27,7 @@ class TuningResult(NamedTuple):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes a tuning result in flow style: one or two lines a gain set."""
+    """Writes a tuning result in flow style: a line or two per gain set."""
 
 
 _Dumper.add_representer(
@@ -41,7 +41,7 @@ def tuned_file(scenario: Scenario) -> Path:
 
 
 def load(path: Path) -> dict[str, dict[str, TuningResult]]:
-    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for a file that cannot be read."""
+    """Tuned gains by law and objective; empty if there is no file. Raises ParameterError for an unreadable file."""
     if not path.exists():
         return {}
     content = read_yaml(path, path.name, "a file of tuned gains")
@@ -53,12 +53,12 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
-    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for a file that cannot be read."""
+    """The tuned gains of a law in a scenario, None without any. Raises ParameterError for an unreadable file."""
     return load(tuned_file(scenario)).get(law, {}).get(objective)
 
 
 def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str) -> None:
-    """Write tuned gains, their costs and the command that finds them; laws as in the catalogue, objectives as given.
+    """Write tuned gains, costs and the tuning command; laws as in the catalogue, objectives as given.
 
     Raises ParameterError where the file cannot be written.
     """

@@ -16,31 +16,33 @@ def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the fa
     """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
     facts = library()
     if as_json:
-        print_json([_as_json(one) for one in facts])
+        print_json([_as_json(airframe) for airframe in facts])
         return
     console = Console()
     signs = _table("Signs and pairing", "airframe", "D", "for D = I", "coupling")
-    for one in facts:
+    for airframe in facts:
         signs.add_row(
-            one.name,
-            "none" if one.D is None else " ".join("+" if sign > 0 else "-" for sign in one.D),
-            one.remedy,
-            "-" if one.coupling is None else f"{one.coupling:.3g}",
+            airframe.name,
+            "none" if airframe.D is None else " ".join("+" if sign > 0 else "-" for sign in airframe.D),
+            airframe.remedy,
+            "-" if airframe.coupling is None else f"{airframe.coupling:.3g}",
         )
     console.print(signs)
     assumptions = _table("Assumptions 1 and 3", "airframe", "n, m", "controllable", "zeros", "integrated")
-    for one in facts:
-        yes = "yes" if one.controllable else "no"
-        assumptions.add_row(one.name, f"{one.n}, {one.m}", yes, one.zero_dynamics, ", ".join(one.integrated) or "-")
+    for airframe in facts:
+        yes = "yes" if airframe.controllable else "no"
+        assumptions.add_row(
+            airframe.name, f"{airframe.n}, {airframe.m}", yes, airframe.zero_dynamics, ", ".join(airframe.integrated) or "-"
+        )
     console.print(assumptions)
     roots = _table("Poles and zeros in 1/s, leading minors of C B in SI", "airframe", "poles", "zeros at", "minors")
-    for one in facts:
-        minors = "  ".join(f"{minor:.3g}" for minor in one.minors)
-        roots.add_row(one.name, _format_roots(one.poles), _format_roots(one.zeros), minors)
+    for airframe in facts:
+        minors = "  ".join(f"{minor:.3g}" for minor in airframe.minors)
+        roots.add_row(airframe.name, _format_roots(airframe.poles), _format_roots(airframe.zeros), minors)
     console.print(roots)
-    outside = [one.name for one in facts if not one.in_theorem]
+    outside = [airframe.name for airframe in facts if not airframe.in_theorem]
     console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)
-    integrated = ", ".join(dict.fromkeys(state for one in facts for state in one.integrated))
+    integrated = ", ".join(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
     if integrated:
         console.print(f"marginal: {integrated} integrate the outputs and need an outer loop.", soft_wrap=True)
 

@@ -28,17 +28,17 @@ def check_signs(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Compare the D of the controller with the D that follows from a channel map, and with a recorded flight.
+    """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
-    A sign that the flight does not show for certain is no contradiction: a ? in the table, and a sentence with the excitation
-    that would show it. Exit status: 0 they agree, 1 they contradict each other, 2 bad input.
+    A sign without a certain measurement is no contradiction: a ? in the table, and a sentence with the necessary excitation.
+    Exit status: 0 agreement, 1 contradiction, 2 bad input.
     """
     channel_map = load_map(map_name)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     checked = check_scenario(channel_map, chosen, frame, bag)
     if as_json:
-        channels, sentences = [one._asdict() for one in checked.channels], list(checked.contradictions)
+        channels, sentences = [channel._asdict() for channel in checked.channels], list(checked.contradictions)
         result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}
         print_json(result)
     else:
@@ -55,25 +55,25 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
     title = f"Map {channel_map.name}, airframe {airframe}: what a positive u does"
     headings = ("u", "moves", "seen in", "effect", "D", "of law", *(["recorded"] if checked.seconds else []))
     table = new_table(title, headings, left=("u", "moves", "seen in"))
-    for one in checked.channels:
+    for channel in checked.channels:
         cells = [
-            one.input,
-            motion_as_channel_grows(channel_map.inputs[one.input]),
-            f"{one.output} ({motion_as_channel_grows(channel_map.outputs[one.output])})",
-            f"{one.effect:+.3g}",
-            f"{one.D:+d}",
-            f"{one.D_controller:+d}" + ("" if one.D_controller == one.D else " !"),
+            channel.input,
+            motion_as_channel_grows(channel_map.inputs[channel.input]),
+            f"{channel.output} ({motion_as_channel_grows(channel_map.outputs[channel.output])})",
+            f"{channel.effect:+.3g}",
+            f"{channel.D:+d}",
+            f"{channel.D_controller:+d}" + ("" if channel.D_controller == channel.D else " !"),
         ]
-        if one.measured is not None and one.ratio is not None:
-            cells.append(f"{one.measured:+.3g} ({one.ratio:.0f}){' ' if one.ratio >= MIN_RATIO else '?'}")
+        if channel.measured is not None and channel.ratio is not None:
+            cells.append(f"{channel.measured:+.3g} ({channel.ratio:.0f}){' ' if channel.ratio >= MIN_RATIO else '?'}")
         table.add_row(*cells)
     console.print(table)
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left=headings)
-    for one in checked.channels:
-        given, taken = channel_map.inputs[one.input], channel_map.outputs[one.output]
-        fields.add_row(f"u.{one.input}", _format_field(given), channel_map.messages[given.message].topic)
-        fields.add_row(f"y.{one.output}", _format_field(taken), taken.topic)
+    for channel in checked.channels:
+        given, taken = channel_map.inputs[channel.input], channel_map.outputs[channel.output]
+        fields.add_row(f"u.{channel.input}", _format_field(given), channel_map.messages[given.message].topic)
+        fields.add_row(f"y.{channel.output}", _format_field(taken), taken.topic)
     console.print(fields)
     if checked.seconds:
         console.print(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di compare`: RISE-DI and other control laws on the same aircraft, each tuned by the same procedure."""
+"""`rise-di compare`: RISE-DI and further control laws on the same aircraft, tuned by the same procedure."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -67,7 +67,7 @@ def compare(
     gains: Annotated[Path | None, typer.Option(help="File of tuned gains; by default the one of the stack.")] = None,
     to_json: Annotated[Path | None, typer.Option("--json", help="File to write the figures to, SI.")] = None,
 ) -> None:
-    """Fly RISE-DI and other laws side by side: same aircraft, reference, winds, noise, limits, uncertainty, tuning.
+    """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits, uncertainty, tuning.
 
     Exit status: 0, or 2 bad input.
     """
@@ -97,13 +97,13 @@ def compare(
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
         benchmark = gain_tuning.build_benchmark(chosen, turbulence_seed)
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
-        for one in law_comparison.compare(benchmark, tuned, aircraft, levels, seed):
-            results.append(one)
+        for result in law_comparison.compare(benchmark, tuned, aircraft, levels, seed):
+            results.append(result)
             bar.advance(task)
     console = Console()
     console.width = max(console.width, WIDTH)
     for aim in aims:
-        if found := [one for one in results if one.objective == aim]:
+        if found := [result for result in results if result.objective == aim]:
             console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, chosen))
     notes = _notes(chosen, benchmark, tuned, aims)
     flown = f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
@@ -113,13 +113,13 @@ def compare(
         missing = ", ".join(f"{name} ({aim})" for name, aim in wanted)
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if to_json is not None:
-        rows = [_as_json(one, chosen) for one in results]
+        rows = [_as_json(result, chosen) for result in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
         write_text("--json", to_json, json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1) + "\n")
 
 
 def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, command: str, bar: Progress) -> None:
-    """Tune laws, each for an objective. The file is written after each of them, with what it then holds."""
+    """Tune laws for an objective per law. The file is written after every law."""
     benchmark = gain_tuning.build_benchmark(chosen)
     for name, aim in wanted:
         task = bar.add_task("", total=gain_tuning.generation_count(LAWS[name], benchmark))
@@ -145,15 +145,15 @@ def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Tab
         "cost",
     )
     table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees", "knows"))
-    for one in found:
-        lost = (one.levels[0].scores[gain_tuning.GUST].lost, *one.lost_late.values())
-        slew = zip(scenario.controller.inputs, one.slew.tolist(), strict=True)
+    for result in found:
+        lost = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
+        slew = zip(scenario.controller.inputs, result.slew.tolist(), strict=True)
         table.add_row(
-            *(one.law, LAWS[one.law].measurements, LAWS[one.law].model_data),
-            *law_comparison.score_cells(one),
+            *(result.law, LAWS[result.law].measurements, LAWS[result.law].model_data),
+            *law_comparison.score_cells(result),
             "/".join(f"{100.0 * share:.3g}" for share in lost),
             of(f"{value * units[name].factor:.0f}" for name, value in slew),
-            f"{min(one.costs):.2f} +{max(one.costs) - min(one.costs):.2f}",
+            f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}",
         )
     return table
 
@@ -174,7 +174,7 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: 
         titles="\n".join(f"{name}: {LAWS[name].title}" for name in laws),
         unit=", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in errors),
         slew=", ".join(f"{one * units[name].factor:g} {units[name].unit}/s of {name}" for name, one in slews),
-        costs="\n".join(f"  {one}" for one in costs),
+        costs="\n".join(f"  {cost}" for cost in costs),
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
         level=100.0 * gain_tuning.UNCERTAINTY,
         seeds=len(SEEDS),

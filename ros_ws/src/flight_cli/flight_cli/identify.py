@@ -266,14 +266,14 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
 def _show_model(console: Console, found: Identification) -> None:
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
     table = new_table(f"A and B of {found.airframe.name}, SI; deviation: of the change, standard", headings, left=("entry",))
-    for one in found.entries:
-        values = f"{one.nominal:.4g}", f"{one.nominal * (1.0 + one.error):.4g}"
-        table.add_row(escape(one.name), *values, f"{100 * one.error:+.1f}", f"{100 * one.deviation:.1f}")
+    for entry in found.entries:
+        values = f"{entry.nominal:.4g}", f"{entry.nominal * (1.0 + entry.error):.4g}"
+        table.add_row(escape(entry.name), *values, f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}")
     console.print(table)
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
     table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left=("output",))
     for i, (name, unit) in enumerate(_units(found).items()):
-        figures = [(one.rms[i] * unit.factor, one.whiteness[i]) for one in (found.before, found.after)]
+        figures = [(model.rms[i] * unit.factor, model.whiteness[i]) for model in (found.before, found.after)]
         table.add_row(f"{name} ({unit.unit})", *(f"{figure:.3g}" for pair in figures for figure in pair))
     console.print(table)
     gain = found.after.log_likelihood - found.before.log_likelihood
@@ -303,7 +303,8 @@ def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
     return {
         "airframe": found.airframe.name,
         "entries": {
-            one.name: {"nominal": one.nominal, "change": one.error, "deviation": one.deviation} for one in found.entries
+            entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation}
+            for entry in found.entries
         },
         "held_out": {
             model: {

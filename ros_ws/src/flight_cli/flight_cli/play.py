@@ -33,8 +33,8 @@ def play(
 ) -> None:
     """Publish the topics of a recorded flight again with their timing, and /clock with the time of the log.
 
-    The bytes are those of the log but for the stamps. A domain with another publisher on one of the topics is refused.
-    Exit status: 0 played to its end, 2 bad input, 130 interrupted.
+    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log is refused.
+    Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
     for option, value in (("--rate", rate), ("--start", start)):
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above

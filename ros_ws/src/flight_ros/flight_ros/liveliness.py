@@ -34,15 +34,15 @@ class LivelinessMonitor:
         self._subscriptions = [
             node.create_subscription(
                 Empty,
-                f"alive/{other}",
+                f"alive/{peer}",
                 lambda _: None,
                 LIVELINESS,
                 event_callbacks=SubscriptionEventCallbacks(
-                    liveliness=partial(self._on_liveliness, other), matched=partial(self._on_matched, other)
+                    liveliness=partial(self._on_liveliness, peer), matched=partial(self._on_matched, peer)
                 ),
             )
-            for other in ROLES
-            if other != role
+            for peer in ROLES
+            if peer != role
         ]
 
     def lost(self) -> str:

@@ -15,8 +15,8 @@ INFINITE_NS = 2**63 - 1  # rmw: RMW_DURATION_INFINITE
 
 def strongest_compatible(offered: Sequence[QoSProfile]) -> QoSProfile:
     """The strongest profile that is compatible with all offered ones."""
-    reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
-    durable = reliable and all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
+    reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in offered)
+    durable = reliable and all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in offered)
     return QoSProfile(
         depth=RECORD.depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,

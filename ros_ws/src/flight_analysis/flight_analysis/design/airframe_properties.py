@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The theorem's assumptions on an airframe, checked on its matrices: Remark 1 and Assumptions 1 and 3 as a table.
+"""The theorem's assumptions on an airframe, checked on the matrices: Remark 1 and Assumptions 1 and 3 as a table.
 
-Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and sine terms, which are C1, and
-their rates are bounded if the angular rates are.
+Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema bounds gusts and sine terms, which are C1 and
+have bounded rates for bounded angular rates.
 """
 
 from enum import StrEnum
@@ -37,7 +37,7 @@ class ZeroDynamics(StrEnum):
 
 
 class AirframeFacts(NamedTuple):
-    """The theorem's assumptions on one airframe, in SI: a row of the table."""
+    """The theorem's assumptions on an airframe, in SI: a row of the table."""
 
     name: str
     n: int
@@ -57,12 +57,12 @@ class AirframeFacts(NamedTuple):
 
     @property
     def in_theorem(self) -> bool:
-        """Whether all checks hold: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
+        """Whether the checks hold: Assumption 1, D exists (10)-(11), no zero in the right half plane."""
         return self.controllable and self.D is not None and self.zero_dynamics is not ZeroDynamics.UNSTABLE
 
     @property
     def remedy(self) -> str:
-        """Change that gives D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
+        """Change for D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
         if self.pairing is None:
             return "none"
         outputs, inputs, input_signs, _ = self.pairing
@@ -74,7 +74,7 @@ class AirframeFacts(NamedTuple):
 
 
 def airframe_facts(airframe: Airframe) -> AirframeFacts:
-    """Poles, zeros, Omega = C B with its D, and Assumptions 1 and 3 of an airframe; SI.
+    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe; SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
     part (A, B, C): f is left out. A published A may contain gravity.
@@ -115,7 +115,7 @@ def library() -> list[AirframeFacts]:
 def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
     """Finite s, 1/s, at which Rosenbrock's pencil [[A - s I, B], [C, 0]] loses rank, by real part.
 
-    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. They are the poles of the zero dynamics, the
+    Shapes: A (n, n), B (n, m), C (m, n); n - m zeros if C B is nonsingular. These are the poles of the zero dynamics, the
     motion of the aircraft with y = 0. Source: H. H. Rosenbrock, "State-Space and Multivariable Theory", 1970.
     """
     n, m = B.shape

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a channel map to gains without a model: the scenario of an experiment, and a scenario that flies its aircraft.
+"""From a channel map to gains without a model: the scenario of an experiment, and a scenario for the aircraft.
 
-The experiment excites one input after another, open loop. `identify_response` estimates Omega, lags and delays from its log.
-The airframe of both scenarios is y_dot = Omega u: nothing else is known of the aircraft.
+The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and delays from the log. The
+airframe of the scenarios is y_dot = Omega u: nothing further is known of the aircraft.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,9 +55,9 @@ WAIT = 30.0  # s before the first command of the flight: the time to engage
 
 
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
-    """Outputs and the inputs that drive them by the motions of the map, and the sign of each effect, (m,).
+    """Outputs and driving inputs by the motions of the map, and the signs of the effects, (m,).
 
-    Raises ParameterError for an output that no input drives, or that the reference model does not know.
+    Raises ParameterError for an output without an input, or unknown to the reference model.
     """
     driven: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
@@ -76,7 +76,7 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a map without limits of the speed, and of the attitude where it has one: nothing else guards."""
+    """Raise ParameterError for a map without limits of the speed, and of a measured attitude: nothing further guards."""
     needed = [name for name in ("phi", "theta", "V") if name in channel_map.pose or name in channel_map.outputs]
     missing = [name for name in needed if name not in channel_map.envelope]
     limits = ", ".join(needed)
@@ -93,24 +93,24 @@ class Experiment(NamedTuple):
 
 
 def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe_file: str, wait: float = WAIT) -> Experiment:
-    """The experiment of a channel map: every input at `amplitude` of its smaller limit; `speed` in trim, m/s."""
+    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s."""
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     thrust = [name == "V" for name in pairing.outputs]
-    m, lowest = len(rows), [SPEED_BAND[0] if one else BAND[0] for one in thrust]
+    m, lowest = len(rows), [SPEED_BAND[0] if drives_speed else BAND[0] for drives_speed in thrust]
     controller = ExcitationConfig.validate_mapping(
         _controller(channel_map, pairing)
         | {
             "law": "excitation",
-            "D": [int(one) for one in sign],
+            "D": [int(value) for value in sign],
             "input_scale": [1.0] * m,
             "lag": [0.0] * m,
             "delay": 0.0,
             "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
-            "width": [SPEED_WIDTH if one else WIDTH for one in thrust],
-            "period": [SPEED_PERIOD if one else PERIOD for one in thrust],
+            "width": [SPEED_WIDTH if drives_speed else WIDTH for drives_speed in thrust],
+            "period": [SPEED_PERIOD if drives_speed else PERIOD for drives_speed in thrust],
             "lowest": lowest,
-            "highest": [SPEED_BAND[1] if one else BAND[1] for one in thrust],
+            "highest": [SPEED_BAND[1] if drives_speed else BAND[1] for drives_speed in thrust],
             "pause": PAUSE,
         },
         "controller",
@@ -126,7 +126,7 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
 
 
 def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float) -> list[ChannelModel | None]:
-    """The model of each channel of a map from the log of its experiment, engaged in `spans`; None where there is none.
+    """The models of the channels of a map from the log of an experiment, engaged in `spans`; None for no model.
 
     V has no model without a measured climb: the phugoid, which thrust excites too, would be taken for a response to thrust.
     """
@@ -161,9 +161,9 @@ class Channels(NamedTuple):
 
 
 def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]) -> Channels:
-    """The models of the channels that have one, the step responses of the others.
+    """The models of the channels with a model, the step responses of the rest.
 
-    Raises ParameterError for a channel of which neither is certain, and for signs that contradict each other or the map.
+    Raises ParameterError for a channel without a certain result, and for signs in contradiction to the map or among themselves.
     """
     pairing, sign = channel_pairs(channel_map)
     Omega, m = np.where(np.isfinite(response.Omega), response.Omega, 0.0), len(sign)
@@ -190,7 +190,7 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
 
 
 class Flyable(NamedTuple):
-    """A controller for an identified aircraft, and the files that fly it."""
+    """A controller for an identified aircraft, and the files for a flight."""
 
     controller: RiseDiConfig
     delay_margin: float | None  # s, of y_dot = Omega u with the lags and the delay; None for the literal sign
@@ -199,10 +199,10 @@ class Flyable(NamedTuple):
 
 
 def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str) -> Flyable:
-    """Gains for identified channels, and the texts of the airframe and of the scenario that fly them.
+    """Gains for identified channels, and the texts of airframe and scenario.
 
     The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. The integrals follow
-    from damping and stiffness. The feedforward has the airframe as its model, in coordinated turns without sideslip.
+    from damping and stiffness. The feedforward has the airframe as model, in coordinated turns without sideslip.
     """
     pairing, _ = channel_pairs(channel_map)
     delay = float(np.min(found.delay))
@@ -251,9 +251,9 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
 
 
 def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
-    """Channels whose r has its damping alone: what holds the nose in a straight flight turns it in a coordinated turn.
+    """Channels of r with damping alone: the stiffness of a straight flight would skid in a coordinated turn.
 
-    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against it would skid.
+    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the stiffness would skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
     damping = np.where(turns, found.damping - found.zero, found.damping)
@@ -263,11 +263,11 @@ def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
 
 
 def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiConfig:
-    """The controller with integrals by which the loop of each channel's model crosses 1 where that of y_dot = Omega u does.
+    """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
 
     Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
-    order the integral is the damping, and the loop is K / s. A stiff channel answers u with a rate and needs a larger one.
-    It is lower where the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    order the integral is the damping, and the loop is K / s. A stiff channel answers u with a rate and needs a larger integral,
+    but a lower integral where the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
     Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
@@ -282,18 +282,20 @@ def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Ch
 
 
 def _integral(found: Channels, i: int, crossover: float, total_lag: float) -> float:
-    """The integral of a channel, 1/s, by which its loop crosses 1 at `crossover`, rad/s, or the largest safe one below."""
+    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the largest safe integral below."""
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
-        """Of K times the model, without its delay."""
+        """Of K times the model, without the delay."""
         s = 1j * omega
         return crossover * (s + found.zero[i]) / (s**2 + found.damping[i] * s + found.stiffness[i])
 
     wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
     delayed = response(omega) * np.exp(-1j * omega * total_lag)
     safe = (
-        one for one in wanted * INTEGRALS if np.min(np.abs(1.0 + delayed * (1.0 - 1j * one / omega))) > 1.0 / MAX_SENSITIVITY
+        integral
+        for integral in wanted * INTEGRALS
+        if np.min(np.abs(1.0 + delayed * (1.0 - 1j * integral / omega))) > 1.0 / MAX_SENSITIVITY
     )
     return float(next(safe, 0.0))
 
@@ -308,7 +310,7 @@ def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int)
 
 
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
-    """The text of a channel map with measured trims. A captured trim is measured again at each engagement."""
+    """The text of a channel map with measured trims. A captured trim is measured again at every engagement."""
     values = channel_map.model_dump(exclude_unset=True)
     values["source"] = f"{values['source']}; trims measured in {source}"
     for name, trim in trims.items():
@@ -318,14 +320,14 @@ def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -
 
 
 class _WholeRows(yaml.SafeDumper):
-    """Rows without references to each other."""
+    """Rows without shared references."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
 def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, Any]:
-    """Parameters of the controller that follow from the map."""
+    """Parameters of the controller by the map."""
     rows = [channel_map.inputs[name] for name in pairing.inputs]
     limits = {"lower": [row.lower for row in rows], "upper": [row.upper for row in rows]}
     common = {"rate": RATE, "outputs": list(pairing.outputs), "inputs": list(pairing.inputs)}
@@ -336,7 +338,7 @@ def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, A
 def _commands(
     outputs: Sequence[str], bandwidth: Mapping[str, float], speed: float, authority: float, held: float
 ) -> dict[str, Any]:
-    """The manoeuvre of `reference_parameters` after WAIT, by a reference model that the loop can follow; V to `held` m/s."""
+    """The manoeuvre of `reference_parameters` after WAIT, by a reference model within reach of the loop; V to `held` m/s."""
     commands = reference_parameters(speed, authority)
     frequency = dict(zip(commands["outputs"], commands["second_order"]["natural_frequency"], strict=True))
     damping = dict(zip(commands["outputs"], commands["second_order"]["damping"], strict=True))
@@ -396,7 +398,7 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
 
 
 def signs_alone(sign: FloatArray) -> Channels:
-    """Channels of which nothing but the sign is known."""
+    """Channels with a known sign alone."""
     none = 0.0 * sign
     return Channels(np.diag(sign), none + np.nan, none, none, none, none, none, none + np.nan)
 
@@ -421,7 +423,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
     def plain(value: Any) -> Any:
         if isinstance(value, (list, tuple)):
-            return [plain(one) for one in value]
+            return [plain(entry) for entry in value]
         if isinstance(value, Mapping):
             return {key: plain(one) for key, one in value.items()}
         return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -121,7 +121,7 @@ def step_responses(
     for j, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         progress(f"steps of {name}")
         responses: list[tuple[Tangent, float, FloatArray]] = []
-        for step in sorted({min(one, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for one in SIZES}):
+        for step in sorted({min(size, MAX_STEP_FRACTION * float(min(-lower[j], upper[j]))) for size in SIZES}):
             u = step * np.eye(m)[j]
             try:
                 y = (fly(u, WINDOWS.get(output, WINDOW)) - fly(-u, WINDOWS.get(output, WINDOW))) / (2.0 * step)

@@ -361,7 +361,7 @@ def model_yaml(found: Identification, origin: str) -> str:
         figures = zip(found.airframe.outputs, prediction.rms, prediction.whiteness, strict=True)
         lines.append(f"  {name}: " + ", ".join(f"{output} {rms:.3g}, {white:.3g}" for output, rms, white in figures))
     lines += ["", f"Changes of entries and their standard deviations in %, {100 * PRIOR:g} before the flight:"]
-    lines += [f"  {one.name}: {100 * one.error:+.1f}, {100 * one.deviation:.1f}" for one in found.entries]
+    lines += [f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}" for entry in found.entries]
     return "".join(f"# {line}".rstrip() + "\n" for line in lines) + as_yaml(found.airframe)
 
 
@@ -371,7 +371,7 @@ def model_yaml(found: Identification, origin: str) -> str:
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
     """The output whose inputs are known worst, if the best known effect on it has a deviation above MAX_DEVIATION."""
     effects = [entry for entry in entries if entry.matrix == "B"]
-    best = [min((one for one in effects if one.row == output), key=lambda one: one.deviation) for output in outputs]
+    best = [min((entry for entry in effects if entry.row == output), key=lambda one: one.deviation) for output in outputs]
     worst = max(best, key=lambda one: one.deviation)
     if worst.deviation <= MAX_DEVIATION:
         return ""
@@ -400,7 +400,7 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
     order = np.ix_([nominal.outputs.index(name) for name in channels.outputs], columns)
     before, after = (
         [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
-        for Omega in ((one.matrix_c() @ one.matrix_b())[order] for one in (nominal, identified))
+        for Omega in ((frame.matrix_c() @ frame.matrix_b())[order] for frame in (nominal, identified))
     )
     return "" if before == after else "C B: found other signs of its minors than in the nominal airframe, expected the same D"
 

@@ -24,9 +24,9 @@ def sizes(units: Iterable[str]) -> FloatArray:
 def nominal_model(
     airframe: Airframe, outputs: Sequence[str], inputs: Sequence[str], noise: FloatArray, loop: Loop
 ) -> NominalModel:
-    """The model of an airframe with its channels in this order, without limits, and with D = I until a caller sets another.
+    """The model of an airframe with its channels in this order, without limits, and with D = I until a caller sets D.
 
-    Arguments: `noise` of the outputs, (m,), rms per sample, and `loop`, both in this order.
+    Arguments: `noise` of the outputs, (m,), rms per sample, and `loop`, in this order.
     """
     rows, columns = [airframe.outputs.index(name) for name in outputs], [list(airframe.inputs).index(name) for name in inputs]
     B, C, unlimited = airframe.matrix_b()[:, columns], airframe.matrix_c()[rows], np.full(len(columns), np.inf)

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A low-order model of each channel from a log in which one input after another was excited, open loop.
+"""A low-order model per channel from a log of an open-loop excitation of the inputs in turn.
 
     lag v_dot = u(t - delay) - v,    z'' + damping z' + stiffness z = v,    y = Omega z' + slow z
 
-The output error is fitted: the model is simulated from u alone, and y less its output is smallest in the squares. Without
-stiffness the response does not tell lag from 1 / damping: the lag is the smaller of the two, that of the faster pole. Source:
+The output error is fitted: the model is simulated from u alone, with the least squares of y less the output. Without
+stiffness the response does not tell lag from 1 / damping: the lag is the smaller of the two, of the faster pole. Source:
 L. Ljung, "System Identification", 1999, 4.2 and 10.2.
 
-Thrust also moves the airspeed by the climb that follows it, the phugoid. With the climb measured the model of V is without it:
+Thrust also moves the airspeed by the following climb, the phugoid. With a measured climb the model of V excludes the phugoid:
 
     V_dot = -damping V + Omega v - g climb / speed
 
@@ -42,7 +42,7 @@ CORRELATION = 0.5  # s, over which errors of neighbouring samples are taken as c
 
 
 class Estimate(NamedTuple):
-    """A value and its standard error."""
+    """A value and a standard error."""
 
     value: float
     deviation: float
@@ -54,7 +54,7 @@ class Estimate(NamedTuple):
 
 
 class ChannelModel(NamedTuple):
-    """The model of one channel, SI, and the covariance of its parameters in their order."""
+    """The model of a channel, SI, and the covariance of the parameters in their order."""
 
     delay: float  # s
     lag: float  # s
@@ -72,9 +72,9 @@ class ChannelModel(NamedTuple):
         return gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY and self.slow * self.Omega >= 0.0
 
     def at_loop_frequency(self) -> tuple[Estimate, Estimate]:
-        """abs(y / u), and the phase by which y is behind u, rad, at LOOP_FREQUENCY.
+        """abs(y / u), and the phase lag of y behind u, rad, at LOOP_FREQUENCY.
 
-        Omega, damping, lag and delay may take each other's place in a fit; these two are what the loop needs.
+        Omega, damping, lag and delay are interchangeable in a fit; the loop needs gain and phase.
         """
         theta = np.array(self[:6])
         s = 1j * LOOP_FREQUENCY / (self.delay + self.lag)
@@ -94,11 +94,10 @@ class ChannelModel(NamedTuple):
 def fit_channel(
     y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None
 ) -> ChannelModel | None:
-    """The model from the time in which an input is excited, of the lowest order that explains it.
+    """The model from the time of excitation of an input, of the lowest sufficient order.
 
-    None where the input never is, or the output is constant then. The search begins with an Omega of this sign, and may end
-    with the other one. `gravity` is a measured part of y_dot that is not of u itself, one channel: then the model is of first
-    order.
+    None without excitation, or for a constant output. The search begins with an Omega of this sign, and may end with the
+    opposite sign. `gravity` is a measured part of y_dot without u, a channel: then the model is of first order.
     """
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
@@ -117,7 +116,7 @@ def fit_channel(
         gained = np.concatenate([[0.0], np.cumsum(gravity.values[:-1, 0] * np.diff(t_g))])
 
     def response(theta: FloatArray) -> FloatArray:
-        """Of the model to u, less that to gravity."""
+        """Of the model to u, less the response to gravity."""
         to_u = _simulated(t, t_u, impulse, np.concatenate([theta, np.zeros(6 - len(theta))]))
         if gravity is None:
             return to_u
@@ -138,19 +137,19 @@ def fit_channel(
 
 
 def _decay(t: FloatArray, damping: float) -> FloatArray:
-    """Beside a constant and t: the decay of a first value, exp(-damping t), which is t^2 where the damping is 0."""
+    """Beside a constant and t: the decay of a first value, exp(-damping t), or t^2 for a damping of 0."""
     x = damping * t
     return np.where(x > 1e-4, (np.expm1(-x) + x) / max(damping, 1e-9) ** 2, 0.5 * t**2)
 
 
 def _has_zero_of_its_own(theta: FloatArray) -> bool:
-    """Whether the zero of a second order is stable, and slow enough not to cancel the lag, which then would be none."""
+    """Whether the zero of a second order is stable, and slow enough not to cancel the lag."""
     _, lag, Omega, _, _, slow = theta
     return bool(0.0 <= slow * Omega * lag <= MAX_ZERO_LAG * Omega**2)
 
 
 def _simulated(t: FloatArray, t_u: FloatArray, impulse: FloatArray, theta: FloatArray) -> FloatArray:
-    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, which is held between t_u."""
+    """Output of the model from rest at the instants t, (N,). `impulse` is the integral of u, held between t_u."""
     delay, lag, Omega, damping, stiffness, slow = theta
     grid = np.arange(0.0, t[-1] + 2.0 * STEP, STEP)
     u = np.diff(np.interp(grid - delay, t_u, impulse)) / STEP
@@ -177,7 +176,7 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
 
 
 def _model(fit: Any, misfit: float, period: float) -> ChannelModel:
-    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (errors that are not white)."""
+    """Standard errors with the correlation of the output error. Source: L. Ljung, 9.4 (coloured errors)."""
     e = fit.fun
     lags = max(round(CORRELATION / period), 1)
     rho = np.correlate(e, e, "full")[len(e) : len(e) + lags] / (e @ e)

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Input-output response of an aircraft from a log of y and u: Omega, lags and delays with standard errors, without a model.
 
-A predictor of every sample of y from the samples before it and from u is fitted by least squares. It is long enough that the
-disturbances are part of it. Its response to a step of one input is that of the aircraft. A second-order response with a delay
+A predictor of every sample of y from earlier samples and from u is fitted by least squares, long enough to include the
+disturbances. The step response of the predictor is the step response of the aircraft. A second-order response with a delay
 and a lag, fitted to the begin of the step response, has Omega, the lag and the delay. Sources: L. Ljung, "System
 Identification", 1999, 7.3 and 13.4 (direct identification in closed loop); U. Forssell, L. Ljung, Automatica 35, 1999;
 Y. Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a high-order ARX model, then a reduced one).
@@ -61,7 +61,7 @@ Spans = Sequence[tuple[int, int]]
 
 
 class Response(NamedTuple):
-    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has NaN in its row of the results.
+    """Response of m outputs to m inputs, output i driven by input i; SI. A refused channel has a row of NaN in the results.
 
     y_i_dot = sum_j Omega_ij v_j + slower terms,   lag_j v_j_dot = u_j(t - delay_j) - v_j
     """
@@ -80,7 +80,7 @@ class Response(NamedTuple):
     sign_ratio: FloatArray  # (m,) response i to input i in standard errors: the sign of Omega_ii is certain from MIN_RATIO on
 
     def sign_refusal(self, i: int) -> str:
-        """Why the sign of Omega_ii is not certain, one sentence; empty if it is."""
+        """The reason of an uncertain sign of Omega_ii, a sentence; empty for a certain sign."""
         output, name, ratio = self.outputs[i], self.inputs[i], float(self.sign_ratio[i])
         if ratio == 0.0 and self.refusal[i]:
             return self.refusal[i]
@@ -101,10 +101,10 @@ def identify_response(
 ) -> Response:
     """Omega, lag and delay of every channel of a log, with standard errors, or a refusal of the channel.
 
-    Arguments: `y`, `u` (after limits) at their stamps, which may be irregular, of one clock; `outputs` and `inputs` the
-    channels in pairs; `excitation` what moves u from outside in a closed loop, such as y_m, None where u itself is that, as in
-    an open-loop experiment; `engaged` the spans in ns in which u acts on the aircraft, by default all of the log.
-    Raises ParameterError where the log lacks a channel, or holds too few samples for any result.
+    Arguments: `y`, `u` (after limits) at their stamps of a clock, regular or not; `outputs` and `inputs` the
+    channels in pairs; `excitation` what moves u from outside in a closed loop, such as y_m, None where u itself is the
+    excitation, as in an open-loop experiment; `engaged` the spans in ns in which u acts on the aircraft, by default the whole
+    log. Raises ParameterError for a missing channel, or too few samples for any result.
     """
     for topic, signal, names in (("y", y, outputs), ("u", u, inputs)):
         missing = [name for name in names if name not in signal.names]
@@ -146,7 +146,7 @@ class Layout(NamedTuple):
 
     @property
     def past(self) -> int:
-        """Samples of y before the first one that is predicted."""
+        """Samples of y before the first predicted sample."""
         return self.y_windows[-1][1]
 
     def y_decay(self) -> FloatArray:
@@ -178,13 +178,13 @@ def _within(signal: Signal, names: Sequence[str], span: tuple[int, int]) -> tupl
 
 
 def _integral(t: FloatArray, steps: FloatArray, at: FloatArray) -> FloatArray:
-    """Integral from t[0] to the instants `at` of a signal with the means `steps` from one t to the next."""
+    """Integral from t[0] to the instants `at` of a signal with the means `steps` from t to t."""
     sums = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)])
     return np.stack([np.interp(at, t, column) for column in sums.T], axis=1)
 
 
 def _rows(y: Signal, u: Signal, outputs: Sequence[str], inputs: Sequence[str], layout: Layout, span: tuple[int, int]) -> _Rows:
-    """Regressors and predicted samples of one span."""
+    """Regressors and predicted samples of a span."""
     (t, values), (t_u, held), m = _within(y, outputs, span), _within(u, inputs, span), len(outputs)
     k = np.arange(layout.past, len(t))
     if len(t_u) > 1:
@@ -208,9 +208,9 @@ class _Predictor(NamedTuple):
     roots: FloatArray  # (m, m lags, m lags) roots of the covariance of each column
 
     def step_responses(self) -> FloatArray:
-        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the estimate, then draws of it.
+        """Responses of every output to a unit step of every input, (1 + DRAWS, K, m, m): the estimate, then draws.
 
-        At whole periods after the step, K of them up to HORIZON.
+        At K whole periods after the step, up to HORIZON.
         """
         m, layout = self.coefficients.shape[1], self.layout
         normal = np.random.default_rng(0).standard_normal((DRAWS, *self.coefficients.shape))
@@ -232,19 +232,19 @@ class _Predictor(NamedTuple):
 
 
 def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
-    """Least squares over all spans, each with a constant of its own."""
-    used = [one for one in rows if len(one.y)]
-    samples = sum(len(one.y) for one in used)
+    """Least squares over the spans, with a constant per span."""
+    used = [part for part in rows if len(part.y)]
+    samples = sum(len(part.y) for part in used)
     coefficients = m * (layout.recent + len(layout.y_windows) + len(layout.u_windows))
     least = MIN_ROWS_PER_COEFFICIENT * coefficients
     found = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
     require(samples >= least, "the log", found, f"{least * layout.period:.3g} s or more")
-    X = np.concatenate([one.regressors - one.regressors.mean(axis=0) for one in used])
-    Y = np.concatenate([one.y - one.y.mean(axis=0) for one in used])
+    X = np.concatenate([part.regressors - part.regressors.mean(axis=0) for part in used])
+    Y = np.concatenate([part.y - part.y.mean(axis=0) for part in used])
     first_u = m * (layout.recent + len(layout.y_windows))
     moves = np.std(np.diff(Y, axis=0), axis=0) * max(WINDOW / layout.period, 1.0) ** 0.5
     spread = np.std(X[:, first_u : first_u + m], axis=0)
-    per_y, per_u = (1.0 / np.where(one > 0.0, one, np.inf) for one in (moves, spread))
+    per_y, per_u = (1.0 / np.where(power > 0.0, power, np.inf) for power in (moves, spread))
     prior = PRIOR * block_diag(np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u)))
     scaled = X @ prior
     normal = scaled.T @ scaled
@@ -266,10 +266,10 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
 
 
 def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: Spans) -> FloatArray:
-    """Share of the variance of each channel that the excitation explains, (k,): 1 without disturbances, 0 or less without it.
+    """Share of the variance of the channels explained by the excitation, (k,); 1 without disturbances.
 
-    The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. Each of FOLDS parts of the flight
-    is predicted with coefficients from the others. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
+    The channel is a sum of means of the excitation over windows before, up to LOOP_MEMORY. FOLDS parts of the flight
+    are predicted with coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
     1974.
     """
     left, total = np.zeros((len(RIDGES), len(names))), np.zeros(len(names))
@@ -326,26 +326,28 @@ def _responses(
     t, responses = layout.period * np.arange(every, responses.shape[1] + 1, every), responses[:, every - 1 :: every]
     columns, refusal = [], []
     for j in range(len(inputs)):
-        recorded = {inputs[j]: [one.u[:, j] for one in rows], outputs[j]: [one.y[:, j] for one in rows]}
-        still = next((name for name, parts in recorded.items() if not any(len(one) and np.ptp(one) > 0.0 for one in parts)), "")
+        recorded = {inputs[j]: [part.u[:, j] for part in rows], outputs[j]: [part.y[:, j] for part in rows]}
+        still = next(
+            (name for name, parts in recorded.items() if not any(len(part) and np.ptp(part) > 0.0 for part in parts)), ""
+        )
         usable = not still and bool(np.isfinite(responses[..., j]).all())
         columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
-    counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([one.delay for one in columns]) < LEAST_DELAY))
+    counts = (share >= MIN_SHARE) & ~((share < 1.0) & (np.array([column.delay for column in columns]) < LEAST_DELAY))
     counted = np.where(share < 1.0, counts / CLOSED_LOOP_ERRORS, counts)
     return Response(
         outputs,
         inputs,
-        np.stack([one.Omega for one in columns], axis=1),
-        np.stack([one.deviation for one in columns], axis=1),
-        np.array([one.lag for one in columns]),
-        np.array([one.lag_deviation for one in columns]),
-        np.array([one.delay for one in columns]),
-        np.array([one.delay_deviation for one in columns]),
+        np.stack([column.Omega for column in columns], axis=1),
+        np.stack([column.deviation for column in columns], axis=1),
+        np.array([column.lag for column in columns]),
+        np.array([column.lag_deviation for column in columns]),
+        np.array([column.delay for column in columns]),
+        np.array([column.delay_deviation for column in columns]),
         tuple(refusal),
-        sum(len(one.y) for one in rows) * layout.period,
+        sum(len(part.y) for part in rows) * layout.period,
         share,
-        np.array([one.sign_ratio for one in columns]) * counted,
+        np.array([column.sign_ratio for column in columns]) * counted,
     )
 
 
@@ -368,7 +370,7 @@ def _refusal(output: str, name: str, column: _Column, j: int, still: str, share:
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
-    """The share is P / (P + Q) with P the power of the excitation and Q that of the disturbances."""
+    """The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances."""
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
     found = (
         f"found {100.0 * max(share, 0.0):.0f} % of the motion of {output} and {name} by the excitation, the rest by feedback"
@@ -379,13 +381,16 @@ def _too_little_share(output: str, name: str, share: float) -> str:
 
 
 def _more_excitation(name: str, ratio: float) -> str:
-    """Errors fall with the excitation, and with the root of its time."""
+    """Errors fall with the excitation, and with the root of time."""
     factor = MIN_RATIO / max(ratio, 0.5)
     return f"excite {name} {factor:.1f} times as strongly, or for {factor**2:.1f} times as long"
 
 
 def second_order(t: FloatArray, delay: float, lag: float, damping: float, stiffness: float) -> tuple[FloatArray, FloatArray]:
-    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t - delay) - v; (N,) each."""
+    """Step responses y of y'' + damping y' + stiffness y = v' and = v, from rest, with lag v' = u(t - delay) - v.
+
+    Shapes (N,).
+    """
     begin = np.maximum(t - delay, 0.0)
     A = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, -1.0 / lag]])  # z, z', v; y = z' or z
     values, vectors = np.linalg.eig(A + np.diag([0.0, 1e-3, 2e-3]))  # distinct eigenvalues
@@ -398,7 +403,7 @@ def second_order(t: FloatArray, delay: float, lag: float, damping: float, stiffn
 
 
 def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
-    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the other outputs with this delay and lag.
+    """Delay, lag and Omega_jj of input j from output j, then Omega_ij of the further outputs with this delay and lag.
 
     Arguments: t (N,); responses (1 + DRAWS, N, m), the estimate first.
     """
@@ -429,9 +434,9 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
 
 
 def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 - the symbol
-    """Whether a fitted response has the sign of its Omega up to EARLY after delay and lag.
+    """Whether a fitted response has the sign of Omega up to EARLY after delay and lag.
 
-    Otherwise the slow part is the whole response, two poles are in the place of one and a lag, and Omega is about 0.
+    Otherwise the slow part is the whole response, two poles are in the place of a pole and a lag, and Omega is about 0.
     """
     delay, lag, Omega, damping, stiffness, slow = theta
     first, second = second_order(t[t <= delay + lag + EARLY], delay, lag, damping, stiffness)
@@ -439,7 +444,7 @@ def begins_with_Omega(t: FloatArray, theta: FloatArray) -> bool:  # noqa: N802 -
 
 
 def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size: float) -> float:
-    """Chi squared of no response against the fitted one, up to EARLY after delay and lag, less its parameters."""
+    """Chi squared of no response against the fitted response, up to EARLY after delay and lag, less the parameters."""
     early = t <= theta[0] + theta[1] + EARLY
     first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
     fitted = size * (theta[2] * first + theta[5] * second)
@@ -451,7 +456,7 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
 def _whitener(responses: FloatArray) -> FloatArray:
     """W with W (s - true s) of covariance I, (N, N), of responses (1 + DRAWS, N), to FLOOR of the largest value.
 
-    0 for the responses of an output that is constant.
+    0 for the responses of a constant output.
     """
     values, vectors = np.linalg.eigh(np.atleast_2d(np.cov(responses[1:].T)))
     floor = (FLOOR * np.max(np.abs(responses[0]))) ** 2 + RANK * values[-1]
@@ -494,8 +499,8 @@ def _search(
     bounds = LOWER[fitted], UPPER[fitted]
     best: Any = min(
         (
-            least_squares(residuals, np.clip(one[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted], ftol=TOLERANCE)
-            for one in starts
+            least_squares(residuals, np.clip(start[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted], ftol=TOLERANCE)
+            for start in starts
         ),
         key=lambda one: float(one.cost),
     )

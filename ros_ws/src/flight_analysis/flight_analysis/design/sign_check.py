@@ -23,7 +23,7 @@ OPEN_LOOP = "excitation"  # the law that does not use y
 
 
 class Channel(NamedTuple):
-    """One channel of the law, through the map."""
+    """A channel of the law, through the map."""
 
     output: str
     input: str
@@ -67,11 +67,11 @@ def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe,
 
 
 def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> Response:
-    """Response of the aircraft in a log, from the time in which u acted: all of it, or while its bridge was engaged.
+    """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the engagements of a bridge.
 
     y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
-    Raises ParameterError for a log without y and u, one in which the bridge was never engaged, or one under guidance: its y_m
-    follows y.
+    Raises ParameterError for a log without y and u, for a bridge without engagement, and for a flight under guidance, whose
+    y_m follows y.
     """
     recorded = read_run(bag)
     tape = recorded.tape
@@ -83,7 +83,7 @@ def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ..
         spans = None
     else:
         require(bool(flown), str(bag), "a bridge that was never engaged", "a flight with an engaged bridge")
-        spans = [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
+        spans = [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
     open_loop = recorded.scenario is not None and recorded_parameters(recorded.scenario).law == OPEN_LOOP
     if not open_loop:
         require(
@@ -141,9 +141,9 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """+1 for each output with the sign convention of the stack (q nose up, p roll right, r nose right, V faster), otherwise -1.
+    """+1 for an output with the sign convention of the stack (q nose up, p roll right, r nose right, V faster), otherwise -1.
 
-    Shape (m,) in the map's order. Raises ParameterError where the motion of a row does not belong to its channel.
+    Shape (m,) in the map's order. Raises ParameterError where the motion of a row does not belong to the channel.
     """
     signs = []
     for name, row in channel_map.outputs.items():
@@ -157,9 +157,9 @@ def output_signs(channel_map: ChannelMap) -> FloatArray:
 
 
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
-    """+1 for each input whose effect has the sign of Omega = C B, otherwise -1; shape (m,).
+    """+1 for an input with an effect of the sign of Omega = C B, otherwise -1; shape (m,).
 
-    Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError for an input without effect on its
+    Arguments: Omega (m, m), rows and columns in the map's order. Raises ParameterError for an input without effect on the
     output.
     """
     signs = []

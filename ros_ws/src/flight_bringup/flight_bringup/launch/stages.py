@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Start the nodes of a launch in stages: each stage waits for the `node_state` "ready" of the stage before."""
+"""Start the nodes of a launch in stages: a stage waits for the `node_state` "ready" of the stage before."""
 
 import os
 import shlex
@@ -53,13 +53,13 @@ class NodeStateEvent(Event):
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
-    """The argument `scenario`; `otherwise` describes an empty one."""
+    """The argument `scenario`; `otherwise` describes an empty argument."""
     description = f"name of a scenario ({', '.join(scenarios())}), or path of a scenario file (.yaml){otherwise}"
     return DeclareLaunchArgument("scenario", default_value=default, description=description)
 
 
 def boolean_argument(name: str, default: bool, description: str) -> DeclareLaunchArgument:
-    """An argument that is "true" or "false"."""
+    """An argument "true" or "false"."""
     return DeclareLaunchArgument(name, default_value=str(default).lower(), choices=BOOLEAN, description=description)
 
 
@@ -82,7 +82,7 @@ def watch_argument() -> DeclareLaunchArgument:
 
 
 def watch_page(context: LaunchContext, run: Path) -> list[Action]:
-    """The process that serves the live page of a run, where it is asked for. The flight does not depend on it."""
+    """The process of the live page of a run, on demand. The flight does not depend on this process."""
     if argument(context, "watch") != "true":
         return []
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
@@ -100,12 +100,12 @@ def argument(context: LaunchContext, name: str) -> str:
 
 
 def end_with_launch(context: LaunchContext) -> None:
-    """Let all processes end with this one. Launch leaves them running when anything but SIGINT ends it."""
+    """Let every process end with this process. Launch leaves processes running after an end by anything but SIGINT."""
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
 
 def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides) -> Node:
-    """A node of a flight with its section of the scenario and its parameter overrides."""
+    """A node of a flight with a section of the scenario and parameter overrides."""
     return Node(
         package=spec.package,
         executable=spec.executable,
@@ -118,9 +118,9 @@ def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverride
 
 
 def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOverrides) -> ExecuteProcess:
-    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides` are those of the recorder.
+    """`ros2 bag record` in the place of the stack's recorder, with the same topics. `overrides` belong to the recorder.
 
-    What the recorder attaches to its log is a log of its own in the folder of the run.
+    The attachments of the recorder become a separate log in the folder of the run.
     """
     run = Path(overrides["directory"])
     with BagWriter(run) as bag:
@@ -158,9 +158,9 @@ def on_state(
 def start_in_stages(
     context: LaunchContext, first: Mapping[NodeSpec, Node], second: Callable[[float, float], Sequence[Action]]
 ) -> list[Action]:
-    """Start the first stage. Once all its nodes are ready, run the actions of `second`.
+    """Start the first stage. Once the nodes are ready, run the actions of `second`.
 
-    Its arguments are the time until t = 0 and the system time of t = 0, s.
+    The arguments of `second` are the time until t = 0 and the system time of t = 0, s.
     """
     _subscribe_states(context)
     begin = time.monotonic()
@@ -180,12 +180,12 @@ def start_in_stages(
 
 
 def complete(run: Path, reason: str = "flight completed") -> list[Action]:
-    """The actions at the end of a flight that flew its whole duration."""
+    """The actions at the end of a flight of full duration."""
     return [LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"), Shutdown(reason=reason)]
 
 
 def _subscribe_states(context: LaunchContext) -> None:
-    """Emit a NodeStateEvent for each state that a node of this launch publishes; see launch_ros.actions.LifecycleNode."""
+    """Emit a NodeStateEvent for every published state of a node of this launch; see launch_ros.actions.LifecycleNode."""
 
     def receive(message: KeyValue) -> None:
         node, _, pid = message.key.rpartition("#")
@@ -206,7 +206,7 @@ def _namespace(context: LaunchContext) -> str:
 
 
 def _is_descendant(pid: int) -> bool:
-    """Whether a process belongs to this launch, directly or behind a launch prefix, and not to another flight in the domain."""
+    """Whether a process belongs to this launch, directly or behind a launch prefix, not to a second flight."""
     with suppress(psutil.Error):
         return os.getpid() in {parent.pid for parent in psutil.Process(pid).parents()}
     return False
