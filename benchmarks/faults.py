@@ -96,9 +96,11 @@ def to_table(summaries: Sequence[Row]) -> Table:
     """The table for a terminal, ms."""
     columns = ("fault", "injected", "passed", "reaction", "recovery", "traffic", "pause", "host delay")
     table = new_table("Faults, times in ms, median / worst", columns, texts=1)
-    for one in summaries:
-        times = [milliseconds(one[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause", "held_back")]
-        table.add_row(one["case"], str(one["injected"]), str(one["passed"]), *times)
+    for summary in summaries:
+        times = [
+            milliseconds(summary[key]) for key in ("reaction", "recovery", "ready_to_traffic", "longest_pause", "held_back")
+        ]
+        table.add_row(summary["case"], str(summary["injected"]), str(summary["passed"]), *times)
     table.caption = "traffic: from ready until a killed node publishes all its topics; "
     table.caption += "pause: the longest of a topic that continues; "
     table.caption += "host delay: the longest that a process waited for a processor"
@@ -119,10 +121,10 @@ def main(
     if file is not None:
         file.write_text(json.dumps(summaries, indent=2) + "\n", encoding="utf-8")
     Console(width=None if sys.stdout.isatty() else 160).print(to_table(summaries))
-    for bank in (one for one in summaries if one["bank_deg"]):
+    for bank in (summary for summary in summaries if summary["bank_deg"]):
         largest, last = (f"{bank[key]['median']:.1f} / {bank[key]['worst']:.1f} deg" for key in BANKS)
         print(f"{bank['case']}: largest bank {largest}, after ten seconds {last} (median / worst)")
-    if status or any(one["passed"] < times for one in summaries):
+    if status or any(summary["passed"] < times for summary in summaries):
         raise typer.Exit(1)
 
 

@@ -49,8 +49,8 @@ def main(
         texts=2,
     )
     for name, (base, level, count) in sets.items():
-        for label, one in zip(("without", "with"), both(base), strict=True):
-            tally = fly_tally(one, level, count, seed)
+        for label, variant in zip(("without", "with"), both(base), strict=True):
+            tally = fly_tally(variant, level, count, seed)
             rms = np.array([tally.figures[f"rms.{channel}"].mean for channel in channels.outputs])
             slew = np.array([tally.figures[f"slew.{key}"].mean * units[key].factor for key in channels.inputs])
             score = tally.figures["score"]

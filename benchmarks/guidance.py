@@ -236,7 +236,7 @@ def of_switch(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figur
     """Largest jump of u within 20 ms of a change of the mode, in percent of the range of each input."""
     t, u = tape.time("u"), tape["u"].values
     span = u.max(axis=0) - u.min(axis=0)
-    limits = np.array([RANGES.get(name, one) for name, one in zip(tape["u"].names, span, strict=True)])
+    limits = np.array([RANGES.get(name, width) for name, width in zip(tape["u"].names, span, strict=True)])
     jumps = [np.abs(u[at + 2] - u[at]) / limits for at in np.searchsorted(t, START + SWITCH_PERIOD * np.arange(len(SWITCHES)))]
     yield Figure("jump of u (% of range)", 100.0 * float(np.max(jumps)), 2.0)
 

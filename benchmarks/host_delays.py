@@ -28,7 +28,7 @@ def excluding_delays(intervals: Intervals, delays: Intervals) -> NDArray[np.int6
     begin, end = np.asarray(intervals, dtype=np.int64).reshape(-1, 2).T
     origin = int(begin.min(initial=np.iinfo(np.int64).max))
     edges, total = [0], [0]  # of the disjoint delays: begins and ends after the origin, and the time in delays until each
-    for since, until in sorted((int(one) - origin, int(other) - origin) for one, other in delays):
+    for since, until in sorted((int(begin_ns) - origin, int(end_ns) - origin) for begin_ns, end_ns in delays):
         first = max(since, edges[-1])
         if until > first:
             edges += [first, until]

@@ -67,17 +67,17 @@ def main(
     tuned = {name: {tuning: sets[tuning]} for name, sets in load(tuned_file(scenario)).items() if tuning in sets}
     observers = {name: sets for name, sets in tuned.items() if "wind" in LAWS[name].model_data}
     flown = benchmarks(scenario)
-    cases = [(name, one, tuned) for name, one in flown.items()]
-    cases += [(name, one, observers) for name, one in wrong_wind(flown["as tuned"])]
+    cases = [(name, benchmark, tuned) for name, benchmark in flown.items()]
+    cases += [(name, benchmark, observers) for name, benchmark in wrong_wind(flown["as tuned"])]
     rows: list[tuple[str, LawResult]] = []
     for name, benchmark, laws in track(cases, "courses", console=Console(stderr=True)):
-        rows += [(name, one) for one in compare(benchmark, laws, aircraft, LEVELS, seed, delays=())]
+        rows += [(name, result) for result in compare(benchmark, laws, aircraft, LEVELS, seed, delays=())]
     levels = ("nominal", *(f"+-{100.0 * level:g} %" for level in LEVELS))
     title = f"Scores, mean (worst) of {aircraft} aircraft a level, seed {seed}, tuned on {tuning}, effect of wind: {wind}"
     heads = (f"{wind}\n{level}" for wind in flown["as tuned"].courses for level in levels)
     table = new_table(title, ("course", "law", *heads), texts=2)
-    for name, one in rows:
-        table.add_row(name, one.law, *score_cells(one))
+    for name, result in rows:
+        table.add_row(name, result.law, *score_cells(result))
     wide_console().print(table)
 
 

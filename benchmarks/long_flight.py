@@ -161,7 +161,7 @@ def longest_skips(tape: Tape, scenario: Scenario, delays: Intervals) -> list[dic
             for (begin, _), length in zip(ends, lengths, strict=True)
             if length >= period
         ]
-    return sorted(found, key=lambda one: one["length"], reverse=True)[:LONGEST]
+    return sorted(found, key=lambda pause: pause["length"], reverse=True)[:LONGEST]
 
 
 def opened(report: Path) -> dict[str, float] | None:

@@ -67,11 +67,11 @@ def case(air: str, uncertainty: float, number: int) -> Case:
     found = identify(recorded, nominal, ACTUATORS)
     seconds = time.process_time() - start
     errors, scaled = {}, []
-    for one in found.entries:
-        row, matrix = true.index(one.row), true.matrix_a() if one.matrix == "A" else true.matrix_b()
-        value = matrix[row, true.index(one.column) if one.matrix == "A" else list(true.inputs).index(one.column)]
-        errors[one.name] = float(one.nominal * (1.0 + one.error) / value - 1.0)
-        scaled.append((one.nominal * (1.0 + one.error) - value) / one.nominal / one.deviation)
+    for entry in found.entries:
+        row, matrix = true.index(entry.row), true.matrix_a() if entry.matrix == "A" else true.matrix_b()
+        value = matrix[row, true.index(entry.column) if entry.matrix == "A" else list(true.inputs).index(entry.column)]
+        errors[entry.name] = float(entry.nominal * (1.0 + entry.error) / value - 1.0)
+        scaled.append((entry.nominal * (1.0 + entry.error) - value) / entry.nominal / entry.deviation)
     return Case(found, errors, float(np.sqrt(np.mean(np.square(scaled)))), seconds)
 
 
@@ -153,11 +153,11 @@ def errors_of_entries() -> Table:
         table.add_column(escape(heading), justify="left" if heading == "air" else "right")
     for air, uncertainty in track(list(product(AIR, UNCERTAINTIES)), "flights"):
         cases = [case(air, uncertainty, number) for number in range(AIRCRAFT)]
-        largest = [f"{100.0 * max(abs(one.errors[name]) for one in cases):.1f}" for name in ENTRIES]
-        whiteness = [np.mean([getattr(one.found, when).whiteness for one in cases]) for when in ("before", "after")]
-        figures = f"{max(one.scaled for one in cases):.2f}", f"{whiteness[0]:.0f}", f"{whiteness[1]:.2f}"
-        refused = str(sum(bool(one.found.refusal) for one in cases))
-        seconds = f"{max(one.seconds for one in cases):.1f}"
+        largest = [f"{100.0 * max(abs(flight.errors[name]) for flight in cases):.1f}" for name in ENTRIES]
+        whiteness = [np.mean([getattr(flight.found, when).whiteness for flight in cases]) for when in ("before", "after")]
+        figures = f"{max(flight.scaled for flight in cases):.2f}", f"{whiteness[0]:.0f}", f"{whiteness[1]:.2f}"
+        refused = str(sum(bool(flight.found.refusal) for flight in cases))
+        seconds = f"{max(flight.seconds for flight in cases):.1f}"
         table.add_row(f"{air}, +-{100.0 * uncertainty:g} %", *largest, *figures, refused, seconds)
     return table
 

@@ -84,4 +84,4 @@ def delay_monitors(allowed: bool) -> Iterator[Callable[[], Intervals] | None]:
     with contextlib.ExitStack() as stack:
         cores = sorted(os.sched_getaffinity(0))
         monitors = [stack.enter_context(Child("delay_monitor", "--core", str(core))) for core in cores]
-        yield lambda: [tuple(one) for child in monitors for one in child.stop()["delays"]]
+        yield lambda: [tuple(delay) for child in monitors for delay in child.stop()["delays"]]

@@ -85,18 +85,21 @@ def rewrite(run: Path, folder: Path, compression: CompressionMode) -> Rewritten:
     """Write the messages of a run on TOPICS, read into memory before, to a bag of rosbags' Writer."""
     names = {f"/{topic.name}" for topic in TOPICS}
     with AnyReader([run]) as reader:
-        connections = [one for one in reader.connections if one.topic in names]
+        connections = [connection for connection in reader.connections if connection.topic in names]
         messages = list(reader.messages(connections))
         begin_ns = time.process_time_ns()
         writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
         if compression is not CompressionMode.NONE:
             writer.set_compression(compression, CompressionFormat.ZSTD)
         with writer:
-            made = {one.id: writer.add_connection(one.topic, one.msgtype, typestore=reader.typestore) for one in connections}
-            for one, stamp_ns, data in messages:
-                writer.write(made[one.id], stamp_ns, data)
+            made = {
+                connection.id: writer.add_connection(connection.topic, connection.msgtype, typestore=reader.typestore)
+                for connection in connections
+            }
+            for connection, stamp_ns, data in messages:
+                writer.write(made[connection.id], stamp_ns, data)
         took_us = (time.process_time_ns() - begin_ns) / 1e3
-    counts = Counter(one.topic.lstrip("/") for one, *_ in messages)
+    counts = Counter(connection.topic.lstrip("/") for connection, *_ in messages)
     return Rewritten(counts, took_us / len(messages), mcap_size(folder) / len(messages))
 
 

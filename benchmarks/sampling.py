@@ -197,7 +197,7 @@ def main(
     )
     for (rates, period), figures in zip(gust_rows, pairs[len(rows) :], strict=True):
         beta = cells(np.array(list(rates.values())))
-        table.add_row(beta, f"{period * 1e3:g}", *(cells(one.rms, 1e3) for one in figures))
+        table.add_row(beta, f"{period * 1e3:g}", *(cells(errors.rms, 1e3) for errors in figures))
     console.print(table)
 
 

@@ -67,18 +67,20 @@ def write_long_log(run: Path, hours: float) -> None:
     scenario = find_scenario(SCENARIO).vary(flight={"duration": PIECE})
     with tempfile.TemporaryDirectory() as folder:
         write_run(simulate(scenario), Path(folder), attachments_for(scenario, Path(folder)))
-        messages = [one for one in stored_messages(Path(folder)) if one.received_ns < nanoseconds(PIECE)]
+        messages = [message for message in stored_messages(Path(folder)) if message.received_ns < nanoseconds(PIECE)]
     with BagWriter(run) as bag:
         bag.add_attachments(attachments_for(scenario, run), 0)
-        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one.topic for one in messages)}
+        channels = {
+            topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(message.topic for message in messages)
+        }
         flushed_ns = 0
         for k in range(round(hours * 3600.0 / PIECE)):
-            for one in messages:
-                now_ns = one.received_ns + nanoseconds((k * PIECE) + START_S)
+            for message in messages:
+                now_ns = message.received_ns + nanoseconds((k * PIECE) + START_S)
                 if now_ns - flushed_ns >= FLUSH_PERIOD_NS:
                     bag.flush()
                     flushed_ns = now_ns
-                bag.write(channels[one.topic], now_ns, now_ns, 0, moved(one, now_ns))
+                bag.write(channels[message.topic], now_ns, now_ns, 0, moved(message, now_ns))
 
 
 def moved(one: StoredMessage, now_ns: int) -> bytes:
@@ -256,13 +258,15 @@ def frozen(seconds: float = FREEZE) -> dict[str, Any]:
         page.wait_for("document.getElementById('state')?.textContent === 'LIVE'")
         page.run(f"{MEASURE}({start_of(address)})")
         time.sleep(3.0)
-        renderers = [one for one in psutil.Process(page.pid).children(recursive=True) if "--type=renderer" in one.cmdline()]
-        for one in renderers:
-            one.suspend()
+        renderers = [
+            process for process in psutil.Process(page.pid).children(recursive=True) if "--type=renderer" in process.cmdline()
+        ]
+        for renderer in renderers:
+            renderer.suspend()
         time.sleep(seconds)
         resumed = time.time()
-        for one in renderers:
-            one.resume()
+        for renderer in renderers:
+            renderer.resume()
         page.wait_for(f"window.delays.length > 0 && delays.at(-1) < {RECOVERED} && instants.at(-1) > {resumed}")
         instants, delays = page.run("[instants, delays]")
         flight.terminate()
@@ -325,7 +329,9 @@ def flights(count: int, seconds: float) -> dict[str, Any]:
             found[kind].append(figures_of_ticks(internals, host_delays, period_ns, windows))
         starting.append((joins - starts) / NANOSECONDS)
     names = found["with"][0]
-    shown: dict[str, Any] = {kind: {name: [one[name] for one in figures] for name in names} for kind, figures in found.items()}
+    shown: dict[str, Any] = {
+        kind: {name: [figure[name] for figure in figures] for name in names} for kind, figures in found.items()
+    }
     for kind in ("with", "start included"):
         more = {name: np.subtract(shown[kind][name], shown["without"][name]) for name in names}
         shown[f"more {kind}"] = {name: float(np.median(values)) for name, values in more.items()}

@@ -19,5 +19,5 @@ def vector(stamp_ns: int, names: Sequence[str], values: Sequence[float], sender:
     types: dict[str, Any] = STORE.types
     stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
     header = types["std_msgs/msg/Header"](stamp, sender)
-    fields = [np.array(one, dtype=np.float64) for one in (values, more.get("velocity", ()), more.get("effort", ()))]
+    fields = [np.array(field, dtype=np.float64) for field in (values, more.get("velocity", ()), more.get("effort", ()))]
     return bytes(STORE.serialize_cdr(types[JOINT_STATE](header, list(names), *fields), JOINT_STATE))

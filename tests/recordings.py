@@ -23,7 +23,7 @@ EPOCH = 1_795_000_000_000_000_000  # ns, a stamp of today, which float64 cannot 
 def signal(stamps_ms: Sequence[float], **channels: ArrayLike) -> Signal:
     """Channels by stamps in ms after EPOCH. A number holds at all stamps."""
     stamps = EPOCH + np.array([round(stamp * MS) for stamp in stamps_ms], dtype=np.int64)
-    values = [np.broadcast_to(np.asarray(one, dtype=float), stamps.shape) for one in channels.values()]
+    values = [np.broadcast_to(np.asarray(channel, dtype=float), stamps.shape) for channel in channels.values()]
     return Signal(stamps, tuple(channels), np.column_stack(values))
 
 
@@ -57,10 +57,10 @@ def summary_of(file: Path) -> Summary:
 def messages(run: Path) -> list[tuple[str, int, bytes]]:
     """Topic, log time and bytes of all messages, as rosbags reads them. Each can be deserialised."""
     with AnyReader([run]) as reader:
-        assert sum(one.msgcount for one in reader.connections) == reader.message_count
-        read = [(one.topic, stamp_ns, data) for one, stamp_ns, data in reader.messages()]
-        for one, _, data in reader.messages():
-            reader.deserialize(data, one.msgtype)
+        assert sum(connection.msgcount for connection in reader.connections) == reader.message_count
+        read = [(connection.topic, stamp_ns, data) for connection, stamp_ns, data in reader.messages()]
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
     return read
 
 

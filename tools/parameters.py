@@ -80,15 +80,15 @@ def _resolved(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) 
     """A type without its rules and without the alternative None, and the rules."""
     if get_origin(annotation) is Annotated:
         inner, *outer = get_args(annotation)
-        return _resolved(inner, {rule: limit for one in outer for rule, limit in one.rules.items()} | dict(rules))
+        return _resolved(inner, {rule: limit for field in outer for rule, limit in field.rules.items()} | dict(rules))
     if get_origin(annotation) in (Union, UnionType):
-        return _resolved(next(one for one in get_args(annotation) if one is not NoneType), rules)
+        return _resolved(next(alternative for alternative in get_args(annotation) if alternative is not NoneType), rules)
     return annotation, rules
 
 
 def _type(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
-        return ", ".join(f"`{one}`" for one in get_args(annotation))
+        return ", ".join(f"`{choice}`" for choice in get_args(annotation))
     if get_origin(annotation) is tuple:
         return f"list of {_type(_resolved(get_args(annotation)[0])[0])}"
     return TYPES[get_origin(annotation) or annotation]

@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 from flight_cli.cli import COMMANDS, application
 
 FOLDERS = ("docs", "docker", "examples", "ros_ws/src")
-PAGES = sorted([*REPOSITORY.glob("*.md"), *(page for one in FOLDERS for page in (REPOSITORY / one).rglob("*.md"))])
+PAGES = sorted([*REPOSITORY.glob("*.md"), *(page for folder in FOLDERS for page in (REPOSITORY / folder).rglob("*.md"))])
 SHELL = re.compile(r"^```sh\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^    (?:\$ )?(\S.*)$", re.MULTILINE)
 SPAN = re.compile(r"(?<!`)`rise-di (\w[\w-]*)([^`]*)`(?!`)")
@@ -57,7 +57,7 @@ def ros2(words: list[str]) -> None:
     elif words[0] == "launch":
         with patch.dict(sys.modules, launch_stand_in.modules()):
             launch = runpy.run_path(str(SOURCES / words[1] / "launch" / words[2]))["generate_launch_description"]()
-        known = {one.name for one in launch.entities if isinstance(one, launch_stand_in.DeclareLaunchArgument)}
+        known = {argument.name for argument in launch.entities if isinstance(argument, launch_stand_in.DeclareLaunchArgument)}
         assert {word.partition(":=")[0] for word in words[3:] if not word.startswith("--")} <= known
     else:
         assert words[0] in {"bag", "pkg", "security", "service", "topic"}

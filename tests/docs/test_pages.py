@@ -25,7 +25,7 @@ pytestmark = pytest.mark.timeout(2.0 * TIMEOUT)
 
 def blocks(page: Path) -> list[tuple[str, str, str]]:
     """Kind, text and the reason for not running it, of each block of a page."""
-    return [(one["kind"], one["text"], one["reason"] or "") for one in BLOCK.finditer(page.read_text(encoding="utf-8"))]
+    return [(block["kind"], block["text"], block["reason"] or "") for block in BLOCK.finditer(page.read_text(encoding="utf-8"))]
 
 
 def run(command: list[str], folder: Path) -> None:

@@ -247,7 +247,7 @@ def test_file_that_grows_while_it_read_read_up_to_first_size(tmp_path: Path) -> 
     for number, message in enumerate(SAMPLES):
         bag.write(channel, number, number, number, message)
     bag.close()
-    assert sum(isinstance(one, Message) for one in (first, *records)) == len(SAMPLES)
+    assert sum(isinstance(record, Message) for record in (first, *records)) == len(SAMPLES)
     assert not scan.complete
     assert scan.damaged == 0
 
@@ -494,8 +494,8 @@ def test_other_types_have_no_decoder_and_malformed_messages_counted() -> None:
     decode = decoder(JOINT_STATE)
     assert decode is not None
     decoded = [decode(table) for table in tables([SAMPLES[0][:20], SAMPLES[1], b""])]
-    assert [one.unreadable for one in decoded] == [1, 0, 1]
-    assert [len(samples.stamp_ns) for one in decoded for samples in one.samples] == [1]
+    assert [table.unreadable for table in decoded] == [1, 0, 1]
+    assert [len(samples.stamp_ns) for table in decoded for samples in table.samples] == [1]
 
 
 def test_engagements_of_log_begin_with_phase_engaged_and_end_with_reason(tmp_path: Path) -> None:

@@ -190,7 +190,9 @@ class Known(NamedTuple):
         params = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
         t = np.arange(0.0, 14.0, 0.001)
         arrays = params.law_params()
-        u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in np.floor(t / 0.01 + 1e-9) * 0.01])
+        u = np.array(
+            [(arrays.amplitude * excitation.signal(instant, arrays))[0] for instant in np.floor(t / 0.01 + 1e-9) * 0.01]
+        )
         v, z, y = np.zeros_like(t), np.zeros_like(t), np.zeros_like(t)
         for k in range(len(t) - 1):
             v[k + 1] = v[k] + 0.001 * (u[k] - v[k]) / self.lag
@@ -231,7 +233,7 @@ def test_lag_that_zero_cancels_is_not_taken_for_lag_of_channel() -> None:
     # bandwidth follows from the lag. The first order has one of 1/12 s or less: 23 1/s is the sum of both poles.
     t = np.arange(0.0, 14.0, 0.01)
     arrays = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller.law_params()
-    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[0] for one in t])
+    u = np.array([(arrays.amplitude * excitation.signal(instant, arrays))[0] for instant in t])
     plant = np.array([[0.0, 1.0], [-267.0, -23.0]]), np.array([[0.0], [1120.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
     _, y, _ = dlsim((*cont2discrete(plant, 0.01)[:4], 0.01), np.concatenate([np.zeros(7), u[:-7]]))
     stamps = np.round(t * 1e9).astype(np.int64)
@@ -272,7 +274,7 @@ def thrust_with_phugoid(amplitude: float) -> Tape:
     arrays, step = params.law_params(), 0.01  # s, exact for a u that is held so long
     place = params.inputs.index("thrust")
     t = np.arange(0.0, params.duration, step)
-    u = np.array([(arrays.amplitude * excitation.signal(one, arrays))[place] for one in t])
+    u = np.array([(arrays.amplitude * excitation.signal(instant, arrays))[place] for instant in t])
     A = np.array([[-0.5, -GRAVITY, 14.0], [2.0 * GRAVITY / SPEED**2, 0.0, 0.0], [0.0, 0.0, -10.0]])
     plant = A, np.array([[0.0], [0.0], [10.0]]), np.eye(3), np.zeros((3, 1))
     _, states, _ = dlsim((*cont2discrete(plant, step)[:4], step), u)
@@ -341,7 +343,7 @@ def test_log_of_flight_under_feedback_is_no_experiment(tmp_path: Path) -> None:
 
 def test_written_map_has_trims_that_were_sent() -> None:
     row = MAP.inputs["elevator"]
-    names = tuple(f"{one.message}.{one.field}" for one in MAP.inputs.values())
+    names = tuple(f"{row.message}.{row.field}" for row in MAP.inputs.values())
     raw = np.full((20, 4), 0.25)  # of the axes; the pause after engagement is at trim
     raw[10:] = 0.9
     sent = Signal(np.arange(20) * 150_000_000, names, raw)

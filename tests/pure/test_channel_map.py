@@ -101,9 +101,9 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
             set_field(message, input_row.field, raw)
             error = 1e-7 * abs(raw) if element == "float32" else 0.5
             assert get_field(message, input_row.field) == pytest.approx(raw, rel=0.0, abs=error, nan_ok=True)
-    readers: dict[str, MeasuredRow | OverrideRow] = {"outputs." + one: row for one, row in channel_map.outputs.items()}
-    readers |= {"pose." + one: row for one, row in channel_map.pose.items() if row.function == "value"}
-    readers |= {"overrides." + one: row for one, row in channel_map.overrides.items()}
+    readers: dict[str, MeasuredRow | OverrideRow] = {"outputs." + channel: row for channel, row in channel_map.outputs.items()}
+    readers |= {"pose." + angle: row for angle, row in channel_map.pose.items() if row.function == "value"}
+    readers |= {"overrides." + channel: row for channel, row in channel_map.overrides.items()}
     for key, reader in readers.items():
         if key in messages:
             assert read_raw(messages[key], reader.field, "value") == 0.0
@@ -184,7 +184,7 @@ def test_attitude_of_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta
     assert names == ("phi", "theta", "psi")
     assert pose is not None
     expected = np.array([phi, theta, psi])
-    error = np.array([math.remainder(one, math.tau) for one in (pose.value - expected).tolist()])
+    error = np.array([math.remainder(difference, math.tau) for difference in (pose.value - expected).tolist()])
     assert np.abs(error).max() < 2e-6  # the offset of psi in a map has seven digits
     assert np.abs(pose.value).max() <= math.pi
 
@@ -313,7 +313,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "sentence"), REFUSALS, ids=lambda one: ".".join(one) if isinstance(one, tuple) else ""
+    ("place", "value", "sentence"), REFUSALS, ids=lambda argument: ".".join(argument) if isinstance(argument, tuple) else ""
 )
 def test_bad_map_is_one_sentence_that_names_row(place: tuple[str, ...], value: object, sentence: str) -> None:
     content = yaml.safe_load(MAP_FILES["ardupilot_2024"].read_text(encoding="utf-8"))

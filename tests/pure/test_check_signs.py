@@ -51,7 +51,7 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 def test_shipped_maps_fit_controller_of_osprey(name: str) -> None:
     result = CliRunner().invoke(app, ["check-signs", str(MAP_FILES[name]), "--json"])
     assert result.exit_code == 0
-    channels = [(one["output"], one["input"], one["D"]) for one in json.loads(result.stdout)["channels"]]
+    channels = [(channel["output"], channel["input"], channel["D"]) for channel in json.loads(result.stdout)["channels"]]
     assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
 
 
@@ -69,7 +69,7 @@ def test_input_with_wrong_sign_changes_own_d_only(name: str, channel: str) -> No
     span = sum(row.range)  # the sign changes about the middle, so that trim stays inside the range
     flipped = changed(original, "inputs", channel, sign=-row.sign, offset=row.offset + row.sign * row.scale * span)
     checked = check_osprey(flipped)
-    assert [one.D for one in checked.channels] == [-1 if i == k else 1 for i in range(4)]
+    assert [channel.D for channel in checked.channels] == [-1 if i == k else 1 for i in range(4)]
     assert len(checked.contradictions) == 1
     assert f"D of {OUTPUTS[k]} and {channel} is -1, the controller has +1" in checked.contradictions[0]
 
@@ -80,7 +80,7 @@ def test_two_wrong_signs_that_cancel_in_d_are_still_contradiction(channel: str) 
     original = load_map("ardupilot")
     flipped = changed(original, "outputs", channel, sign=-original.outputs[channel].sign)
     checked = check_osprey(changed(flipped, "inputs", INPUTS[k], sign=-original.inputs[INPUTS[k]].sign))
-    assert [one.D for one in checked.channels] == [1, 1, 1, 1]
+    assert [channel.D for channel in checked.channels] == [1, 1, 1, 1]
     assert f"outputs.{channel} of the map ardupilot has the wrong sign" in checked.contradictions[0]
 
 
@@ -103,7 +103,7 @@ def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
         (("--bridge", "ardupilot", "--send"), "scenario osprey_gust: controller.lower: found -inf, expected at least"),
         (("--bridge", "nowhere"), "map: found 'nowhere', expected one of ardupilot"),
     ],
-    ids=lambda one: " ".join(one) if isinstance(one, tuple) else "",
+    ids=lambda argument: " ".join(argument) if isinstance(argument, tuple) else "",
 )
 def test_options_that_contradict_a_bridge_are_refused(options: tuple[str, ...], sentence: str, tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["fly", "osprey_gust", *options, "--runs", str(tmp_path)])
@@ -170,8 +170,8 @@ def test_an_experiment_in_turbulence_shows_every_sign(experiment: Tape) -> None:
     assert not checked.contradictions
     assert not checked.uncertain
     # within a factor of two of C B: enough for a sign; the elevator's is spread by the short period of 10 rad/s
-    measured = np.array([one.measured for one in checked.channels])
-    assert (np.abs(np.log2(measured / [one.effect for one in checked.channels])) < 1.0).all()
+    measured = np.array([channel.measured for channel in checked.channels])
+    assert (np.abs(np.log2(measured / [channel.effect for channel in checked.channels])) < 1.0).all()
 
 
 @pytest.mark.parametrize("k", range(4), ids=INPUTS)
@@ -193,7 +193,9 @@ def test_feedback_through_delay_is_not_taken_for_response(seed: int) -> None:
     tape = flown(GAINS, 45.0, seed, wind=15.4)
     checked = check_osprey(load_map("ardupilot"), measured=response(tape, tape["y_m"]))
     assert not checked.contradictions
-    assert {one.input for one in checked.channels if one.ratio is not None and one.ratio >= MIN_RATIO} <= {"aileron"}
+    assert {channel.input for channel in checked.channels if channel.ratio is not None and channel.ratio >= MIN_RATIO} <= {
+        "aileron"
+    }
     rudder = next(sentence for sentence in checked.uncertain if "sign of rudder" in sentence)
     assert "by the excitation, the rest by feedback of disturbances, expected 90 % or more: command r" in rudder
 

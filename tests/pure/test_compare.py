@@ -83,8 +83,8 @@ def test_cost_is_mean_of_aircraft_in_each_wind_and_that_of_late_ones(name: str, 
 def test_turbulence_replaces_gusts_and_depends_on_seed(short: Benchmark) -> None:
     other = tuning.build_benchmark(short.scenario, law_comparison.TURBULENCE_SEED)
     forcing = {}
-    for seed, one in (("tuning", short), ("comparison", other)):
-        for wind, courses in one.courses.items():
+    for seed, benchmark in (("tuning", short), ("comparison", other)):
+        for wind, courses in benchmark.courses.items():
             forcing[seed, wind] = courses[LAWS["pi"].feedforward].segments.forcing  # the winds along the axes
     begin = slice(0, 150)  # 1.5 s, before the gust
     assert not forcing["tuning", GUST][begin].any()
@@ -142,7 +142,9 @@ def test_more_aircraft_do_not_change_results_of_first_ones(short: Benchmark) -> 
 def test_effect_of_wind_changes_uncertain_aircraft_and_not_nominal_one(short: Benchmark) -> None:
     published = tuning.build_benchmark(short.scenario.vary(aircraft={"uncertainty": {"wind": "published"}}))
     tuned = {"pi": {"gust": initial("pi", short)}}
-    own, other = (next(iter(law_comparison.compare(one, tuned, 2, [0.3], 1, delays=()))) for one in (short, published))
+    own, other = (
+        next(iter(law_comparison.compare(benchmark, tuned, 2, [0.3], 1, delays=()))) for benchmark in (short, published)
+    )
     assert own.scores == other.scores
     for wind in (GUST, TURBULENCE):
         assert own.levels[0].scores[wind].mean != other.levels[0].scores[wind].mean
@@ -175,12 +177,12 @@ def test_every_law_ships_with_gains_for_gusts_and_turbulence(name: str) -> None:
 def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
     benchmark = tuning.build_benchmark(find_scenario(name).vary(flight={"duration": 0.1}))
     for law, by_aim in tuned_gains.load(tuned_gains.TUNED / f"{name}.yaml").items():
-        for found in by_aim.values():
-            assert found.cost == min(found.costs) < tuning.MAX_COST
-            assert len(found.costs) >= 3  # seeds, so that the spread of the search is known
+        for result in by_aim.values():
+            assert result.cost == min(result.costs) < tuning.MAX_COST
+            assert len(result.costs) >= 3  # seeds, so that the spread of the search is known
             expected = {key: len(gain) for key, gain in initial_gains(LAWS[law], benchmark.model).items()}
-            assert {key: len(values) for key, values in found.gains.items()} == expected
-            assert all(value > 0.0 for values in found.gains.values() for value in values)
+            assert {key: len(values) for key, values in result.gains.items()} == expected
+            assert all(value > 0.0 for values in result.gains.values() for value in values)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -260,9 +262,9 @@ def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tm
         for wind in (GUST, TURBULENCE):
             assert f"{row['score'][wind]:.2f}" in result.stdout
             assert f"{level[wind]['mean']:.2f} ({level[wind]['worst']:.2f})" in result.stdout
-        late = [level[GUST]["lost"], *(one["lost"] for one in row["late"])]
+        late = [level[GUST]["lost"], *(delayed["lost"] for delayed in row["late"])]
         assert "/".join(f"{100.0 * share:.3g}" for share in late) in result.stdout
-        assert [one["delay"] for one in row["late"]] == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.06])
+        assert [delayed["delay"] for delayed in row["late"]] == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.06])
         assert (row["cost"], row["spread"]) == (7.25, 0.125)
         assert "7.25 +0.12" in result.stdout
         assert set(row["slew"]) == {"elevator", "thrust", "aileron", "rudder"}

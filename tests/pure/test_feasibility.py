@@ -84,7 +84,7 @@ def test_altitude_beyond_climb_to_next_point_refused(altitude: float, side: str,
     )
     change = math.copysign(number(sentence), altitude - 1000.0)
     assert flyable_legs(
-        tuple(one._replace(altitude=1000.0 + change * (k > 0)) for k, one in enumerate(route)), RADIUS, PERIOD, CAN
+        tuple(waypoint._replace(altitude=1000.0 + change * (k > 0)) for k, waypoint in enumerate(route)), RADIUS, PERIOD, CAN
     )
 
 
@@ -107,7 +107,7 @@ def test_route_file_replaces_program_of_targets() -> None:
     flown = with_route(turns, [Waypoint(0, 0, 0), Waypoint(2000, 0, 10, 26.0)]).guidance
     assert flown is not None
     assert flown.program == {}
-    assert [one.speed for one in flown.waypoints()] == [25.0, 26.0]
+    assert [waypoint.speed for waypoint in flown.waypoints()] == [25.0, 26.0]
 
 
 def test_leg_too_short_for_fillets_and_route_of_one_waypoint_refused() -> None:

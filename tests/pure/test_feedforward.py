@@ -331,7 +331,7 @@ def scores() -> dict[str, FloatArray]:
         text = define(one, aircraft, level, 1, aircraft).model_dump_json()
         return fly_chunk_figures(text, (0, 0)).figures["score"]
 
-    return {name: np.column_stack([of(one, level, n) for one in both(base)]) for name, (base, level, n) in sets.items()}
+    return {name: np.column_stack([of(variant, level, n) for variant in both(base)]) for name, (base, level, n) in sets.items()}
 
 
 def test_feedforward_reduces_error_of_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:

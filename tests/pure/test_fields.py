@@ -43,7 +43,9 @@ VALUES = st.recursive(
     max_leaves=4,
 )
 STRICT = pydantic.ConfigDict(strict=True, allow_inf_nan=False)
-PAIRS = [(kind_of(one(Field)), pydantic.TypeAdapter(one(pydantic.Field), config=STRICT)) for one in ANNOTATIONS]
+PAIRS = [
+    (kind_of(annotation(Field)), pydantic.TypeAdapter(annotation(pydantic.Field), config=STRICT)) for annotation in ANNOTATIONS
+]
 
 
 @pytest.mark.parametrize(("kind", "adapter"), PAIRS, ids=map(str, range(len(PAIRS))))

@@ -37,8 +37,14 @@ def vectors(found: list[Messages], topic: str) -> tuple[NDArray[np.int64], Float
     """Stamps and values of a topic."""
     decode = decoder(JOINT_STATE)
     assert decode is not None
-    parts = [part for one in found if one.topic == topic for table in tables(one.data) for part in decode(table).samples]
-    return np.concatenate([one.stamp_ns for one in parts]), np.concatenate([one.values for one in parts])
+    parts = [
+        part
+        for messages in found
+        if messages.topic == topic
+        for table in tables(messages.data)
+        for part in decode(table).samples
+    ]
+    return np.concatenate([part.stamp_ns for part in parts]), np.concatenate([part.values for part in parts])
 
 
 @pytest.mark.parametrize("piece", [997, 65_536, 10_000_000])
@@ -53,13 +59,13 @@ def test_log_that_grows_in_pieces_gives_what_whole_log_holds(piece: int, recorde
             stream.write(content[start : start + piece])
         found += follower.read()
     assert (follower.complete, follower.damaged, follower.fault) == (True, 0, "")
-    messages = [one for one in found if isinstance(one, Messages)]
+    messages = [record for record in found if isinstance(record, Messages)]
     for name, signal in tape.signals.items():
         stamps, values = vectors(messages, f"/{name}")
         assert stamps.tolist() == signal.stamp_ns.tolist()
         assert values.tobytes() == signal.values.tobytes()
-    assert next(one.name for one in found if isinstance(one, Attachment)) == "osprey_gust.yaml"
-    assert "rise_di_host" in [one.name for one in found if isinstance(one, Metadata)]
+    assert next(record.name for record in found if isinstance(record, Attachment)) == "osprey_gust.yaml"
+    assert "rise_di_host" in [record.name for record in found if isinstance(record, Metadata)]
 
 
 def test_an_iteration_that_is_left_is_continued(recorded: Path) -> None:
@@ -69,7 +75,7 @@ def test_an_iteration_that_is_left_is_continued(recorded: Path) -> None:
 
 def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
     follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)  # y is sent at 500 Hz
-    stamps, _ = vectors([one for one in follower.read() if isinstance(one, Messages)], "/y")
+    stamps, _ = vectors([record for record in follower.read() if isinstance(record, Messages)], "/y")
     assert stamps.tolist() == tape["y"].stamp_ns[::5].tolist()
     assert set(np.diff(stamps).tolist()) == {10_000_000}
 
@@ -84,7 +90,7 @@ def test_logs_without_message_indexes_or_chunks_read(options: dict[str, object],
         writer.add_message(channel, k, data, k)
     writer.finish()  # type: ignore[no-untyped-call]
     whole, follower = list(Follower(path, all_of).read()), Follower(path, all_of)
-    assert [data for one in whole if isinstance(one, Messages) for data in one.data] == sent
+    assert [data for record in whole if isinstance(record, Messages) for data in record.data] == sent
     assert [next(iter(follower.read())) for _ in whole] == whole  # an iteration that is left is continued here, too
 
 
@@ -99,7 +105,7 @@ def test_all_files_of_split_bag_read_in_order(tmp_path: Path) -> None:
         (run / f"split_{number}.mcap").write_bytes(content)
     first.unlink()
     follower = Follower(run, all_of)
-    assert len([one for one in follower.read() if isinstance(one, Messages)]) == 2
+    assert len([record for record in follower.read() if isinstance(record, Messages)]) == 2
     assert follower.complete
     assert follower.path is None
 
@@ -107,8 +113,8 @@ def test_all_files_of_split_bag_read_in_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
 def test_hostile_log_ends_without_exception_and_without_much_memory(case: Path) -> None:
     follower = Follower(case, all_of)
-    for one in follower.read():
-        assert not isinstance(one, Messages) or sum(map(len, one.data)) < 1 << 25
+    for record in follower.read():
+        assert not isinstance(record, Messages) or sum(map(len, record.data)) < 1 << 25
     assert list(follower.read()) == []
 
 
@@ -154,7 +160,7 @@ def test_index_with_more_entries_than_chunk_has_messages_counts_as_damage(record
     path = tmp_path / "run_0.mcap"
     path.write_bytes(content[:place] + RECORD.pack(Opcode.MESSAGE_INDEX, len(index)) + index)
     follower = Follower(path, all_of)
-    assert not any(isinstance(one, Messages) for one in follower.read())
+    assert not any(isinstance(record, Messages) for record in follower.read())
     assert follower.damaged == 1
 
 

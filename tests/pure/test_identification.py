@@ -293,7 +293,7 @@ def test_shipped_aircraft_fly_closer_than_prototype_did(name: str, cessna: Ident
     calm, gust = PROTOTYPE[name]
     # The shipped scenario of the c172p is that of `cessna`: the test above.
     flights = cessna.flights if name == "jsbsim_c172p" else fly_all(find_scenario(name))
-    assert [one.outcome for one in flights.values()] == [COMPLETED] * 3
+    assert [flight.outcome for flight in flights.values()] == [COMPLETED] * 3
     for output in calm:
         assert flights["calm"].rms[output] <= calm[output]
         assert flights["gust"].rms[output] <= gust[output]

@@ -110,8 +110,8 @@ def test_positive_command_has_sign_of_table(name: str, output: str, sign: float,
     truth = fly(cessna(), command(**{name: 0.1}), duration)
     # A tenth of the travel for this long moves its own output by 0.016 (rudder) to 0.08 rad/s, or 0.07 m/s.
     assert sign * truth[f"x.{output}"][-1] > 0.01
-    rates = {one: abs(truth[f"x.{one}"][-1]) for one in ("q", "p", "r")}
-    assert output == "V" or max(rates, key=lambda one: rates[one]) == output
+    rates = {channel: abs(truth[f"x.{channel}"][-1]) for channel in ("q", "p", "r")}
+    assert output == "V" or max(rates, key=lambda channel: rates[channel]) == output
 
 
 def test_every_engine_gets_the_throttle() -> None:

@@ -77,7 +77,7 @@ def described(name: str) -> Sequence[Any]:
 def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
     """The actions of a launch with arguments, and its context. `pushed` is the namespace of a launch file that includes it."""
     entities = described(name)
-    declared = {one.name: one.default_value for one in every(stand_in.DeclareLaunchArgument, entities)}
+    declared = {argument.name: argument.default_value for argument in every(stand_in.DeclareLaunchArgument, entities)}
     assert given.keys() <= declared.keys()
     context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
     context.launch_configurations.update({key: str(value) for key, value in given.items()})
@@ -89,7 +89,7 @@ def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], La
 
 def nodes(actions: Sequence[Any]) -> dict[str, Node]:
     """The nodes among actions, by their executables."""
-    return {one.executable: one for one in every(Node, actions)}
+    return {node.executable: node for node in every(Node, actions)}
 
 
 def overrides(node: Node) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def ends(actions: Sequence[Any]) -> bool:
 
 
 def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
-    return [one for one in actions if isinstance(one, kind)]
+    return [action for action in actions if isinstance(action, kind)]
 
 
 @pytest.fixture
@@ -155,13 +155,13 @@ def test_every_launch_file_installed_and_tested_here() -> None:
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
 def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> None:
     arguments = every(stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py")))
-    assert len({one.name for one in arguments}) == len(arguments) > 3
-    for one in arguments:
-        assert one.description, one.name
-        if one.choices is not None:
-            assert one.default_value in one.choices, one.name
+    assert len({argument.name for argument in arguments}) == len(arguments) > 3
+    for argument in arguments:
+        assert argument.description, argument.name
+        if argument.choices is not None:
+            assert argument.default_value in argument.choices, argument.name
         else:
-            assert one.default_value not in {"true", "false"}, f"{one.name} needs choices"
+            assert argument.default_value not in {"true", "false"}, f"{argument.name} needs choices"
 
 
 @pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
@@ -222,7 +222,7 @@ def test_states_of_flight_are_those_in_namespace(namespace: str, pushed: str, fu
 
 def test_no_line_of_output_starts_stage(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
-    matchers = [one.event_handler.matcher for one in every(stand_in.RegisterEventHandler, actions)]
+    matchers = [action.event_handler.matcher for action in every(stand_in.RegisterEventHandler, actions)]
     assert matchers
     assert not any(matcher(ProcessExited("[INFO] [12.5] [controller]: ready", 0)) for matcher in matchers)
     assert set(context.ros_node.subscriptions) == {"/node_state"}

@@ -403,9 +403,9 @@ def test_law_is_same_under_numpy_and_jax_and_over_many_aircraft(name: str) -> No
     limits = Limits(*(np.full((4, 1), value) for value in (-0.1, 0.1, 1.0)))
     many = law.control_law.engage(looks[0], params)
     compiled = jax.tree.map(jax.numpy.asarray, many)
-    alone = [law.control_law.engage(Measurements(*(one[:, k] for one in looks[0][:5])), law.params) for k in range(3)]
+    alone = [law.control_law.engage(Measurements(*(signal[:, k] for signal in looks[0][:5])), law.params) for k in range(3)]
     limited = jax.jit(lambda state, measured: law.control_law.limited(state, measured, DT, params, limits))
-    row = Limits(*(one[:, 0] for one in limits))
+    row = Limits(*(limit[:, 0] for limit in limits))
     for measured in looks:
         many, _, u = law.control_law.limited(many, measured, np.float64(DT), params, limits)
         compiled, _, by_jax = limited(compiled, measured)
@@ -547,7 +547,7 @@ def test_observer_with_other_matrices_restarts_without_jump(name: str) -> None:
     e = 1e-3 * np.array([1.0, -1.0, 2.0, -2.0])
     for k in range(50):
         state = tick(parameters, state, 10 * k, e)
-    weaker = [0.9 * one for one in sections()[name]["observer"]["F"]]
+    weaker = [0.9 * gain for gain in sections()[name]["observer"]["F"]]
     new = controller(name, observer=sections()[name]["observer"] | {"F": weaker})
     after = guard.retune(state, parameters.tuned_law(), new.tuned_law())
     assert state.law.u_o.any()
@@ -602,7 +602,7 @@ def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> 
         "function": ["control_laws.pi:params_of"],
         "twice": ["control_laws.pi:PiConfig", "control_laws.l1:L1Config"],
     }
-    entries = EntryPoints(EntryPoint(name, value, laws.GROUP) for name, found in values.items() for value in found)
+    entries = EntryPoints(EntryPoint(name, value, laws.GROUP) for name, targets in values.items() for value in targets)
     monkeypatch.setattr(laws, "_registered", lambda: entries)
     for name, sentence in {
         "absent": "found 'absent', which cannot be loaded (No module named 'absent_package'), expected an installed package",
@@ -699,7 +699,7 @@ def test_an_invalid_observer_is_refused(name: str) -> None:
     refused("controller.observer.states: found x.alpha, x.V, x.q", observed(states=others))
     unstable = np.reshape(observer["Phi"], (s, s)) + 2.0 * np.eye(s)
     refused("controller.observer.L: found a spectral radius of ", observed(Phi=unstable.ravel().tolist()))
-    refused("controller.observer.F: found a spectral radius of ", observed(F=[-3.0 * one for one in observer["F"]]))
+    refused("controller.observer.F: found a spectral radius of ", observed(F=[-3.0 * gain for gain in observer["F"]]))
     refused("controller.observer.margin: found a nominal loop that is unstable with u ", observed(margin=0.2))
     refused("controller.observer.part: found 1.5, expected less than or equal to 1", observed(part=1.5))
 

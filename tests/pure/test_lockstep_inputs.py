@@ -42,11 +42,17 @@ def test_step_waits_for_second_signal_of_instant_and_other_instants_do_not() -> 
     flight = Arriving()
     flight.others.append(sample(0))
     flight.y += [sample(Y_NS * k) for k in range(6)]
-    assert [(one.now_ns, one.due) for one in flight.instants()] == [(0, True), (2, False), (4, False), (6, False), (8, False)]
+    assert [(instant.now_ns, instant.due) for instant in flight.instants()] == [
+        (0, True),
+        (2, False),
+        (4, False),
+        (6, False),
+        (8, False),
+    ]
     assert flight.inputs.has_y
     flight.others += [sample(STEP_NS), sample(STEP_NS + 1)]
     (instant,) = flight.instants()
-    assert (instant.now_ns, [one.stamp_ns for one in instant.others]) == (STEP_NS, [STEP_NS])  # the later one stays
+    assert (instant.now_ns, [sample.stamp_ns for sample in instant.others]) == (STEP_NS, [STEP_NS])  # the later one stays
     assert not flight.inputs.has_y
 
 
@@ -70,9 +76,9 @@ def test_instants_do_not_depend_on_order_of_arrival(order: list[bool]) -> None:
         elif not of_y and others:
             flight.others.append(others.pop(0))
         found += flight.instants()
-    assert [one.now_ns for one in found] == [Y_NS * k for k in range(21)]
-    assert [one.now_ns for one in found if one.due] == [0, 10, 20, 30, 40]
-    assert all(other.stamp_ns <= one.now_ns for one in found for other in one.others)
-    received = [other.stamp_ns for one in found for other in one.others]
+    assert [instant.now_ns for instant in found] == [Y_NS * k for k in range(21)]
+    assert [instant.now_ns for instant in found if instant.due] == [0, 10, 20, 30, 40]
+    assert all(sample.stamp_ns <= instant.now_ns for instant in found for sample in instant.others)
+    received = [sample.stamp_ns for instant in found for sample in instant.others]
     assert received == [Y_NS * k for k in range(21)]
-    assert [one.y.stamp_ns for one in found if one.y is not None] == [one.now_ns for one in found]
+    assert [instant.y.stamp_ns for instant in found if instant.y is not None] == [instant.now_ns for instant in found]

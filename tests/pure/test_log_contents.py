@@ -44,7 +44,7 @@ def recorded(osprey_gust: Scenario, tmp_path_factory: pytest.TempPathFactory) ->
 def stored(files: LogAttachments | RecordedRun, name: str, folder: Path) -> Path:
     """An attachment as a file."""
     if isinstance(files, RecordedRun):
-        (folder / name).write_bytes(next(one.content for one in files.attachments if one.name == name))
+        (folder / name).write_bytes(next(attachment.content for attachment in files.attachments if attachment.name == name))
         return folder / name
     return next(path for path in files.files if path.name == name)
 

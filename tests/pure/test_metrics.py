@@ -81,7 +81,7 @@ def guided(**channels: Any) -> list[Any]:
     level = {"phi_c": 0.0, "climb_c": 0.0, "xtrack": 0.0, "V_c": 40.0}
     changed = {name: np.where((t >= 5_000) & (t < 8_000), value, level[name]) for name, value in channels.items()}
     found = metrics.guided_transients(tape(guidance=signal(t.tolist(), **level | changed)))
-    return [(one.kind, one.start, one.stop) for one in found]
+    return [(transient.kind, transient.start, transient.stop) for transient in found]
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() 
 def test_engagements_are_changes_of_mode_to_engaged() -> None:
     mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
     internals = signal([0, 10, 20, 30, 40], mode=mode)
-    assert [one.start for one in metrics.engagements(tape(internals=internals))] == [0.0, 0.04]
+    assert [engagement.start for engagement in metrics.engagements(tape(internals=internals))] == [0.0, 0.04]
 
 
 def test_close_live_commands_are_one_transient() -> None:

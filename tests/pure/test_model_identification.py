@@ -72,10 +72,10 @@ def true_errors(aircraft: Airframe, entries: tuple[Entry, ...]) -> dict[str, flo
     """Relative errors of the nominal entries."""
     A, B, inputs = aircraft.matrix_a(), aircraft.matrix_b(), list(aircraft.inputs)
     values = {}
-    for one in entries:
-        row = aircraft.index(one.row)
-        value = A[row, aircraft.index(one.column)] if one.matrix == "A" else B[row, inputs.index(one.column)]
-        values[one.name] = float(value / one.nominal - 1.0)
+    for entry in entries:
+        row = aircraft.index(entry.row)
+        value = A[row, aircraft.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
+        values[entry.name] = float(value / entry.nominal - 1.0)
     return values
 
 
@@ -88,7 +88,7 @@ MATTER = ("B[V, thrust]", "B[q, elevator]", "A[p, p]", "B[p, aileron]", "A[beta,
 def test_entries_that_matter_found_within_deviations(air: str, uncertainty: float) -> None:
     found = identified(air, uncertainty)
     true = true_errors(servo(air, uncertainty).aircraft.sampled_airframe(), found.entries)
-    by_name = {one.name: one for one in found.entries}
+    by_name = {entry.name: entry for entry in found.entries}
     for name in MATTER:
         assert abs(by_name[name].error - true[name]) < 3.0 * by_name[name].deviation, name
     # turbulence hides what the inputs do: their effects are known less well
@@ -114,15 +114,15 @@ def test_innovations_of_held_out_samples_are_smaller_and_whiter(air: str, uncert
 def test_the_deviations_are_those_of_the_errors(air: str) -> None:
     found = identified(air, 0.5)
     true = true_errors(servo(air, 0.5).aircraft.sampled_airframe(), found.entries)
-    scaled = np.array([(one.error - true[one.name]) / one.deviation for one in found.entries])
+    scaled = np.array([(entry.error - true[entry.name]) / entry.deviation for entry in found.entries])
     # of 26 normal numbers the mean square is below 2 with a probability of 0.998
     assert np.mean(scaled**2) < 2.0
 
 
 def test_the_true_model_is_left_alone() -> None:
     found = identified("calm", 0.0)
-    for one in found.entries:
-        assert abs(one.error) < 3.0 * one.deviation, one.name
+    for entry in found.entries:
+        assert abs(entry.error) < 3.0 * entry.deviation, entry.name
     assert abs(found.after.log_likelihood - found.before.log_likelihood) < 0.02
 
 
@@ -162,7 +162,7 @@ def test_lost_samples_are_predicted_over() -> None:
     found = identify(recorded, OSPREY, ACTUATORS)
     true = true_errors(servo("calm", 0.5).aircraft.sampled_airframe(), found.entries)
     assert found.refusal == ""
-    assert all(abs(one.error - true[one.name]) < 3.0 * one.deviation for one in found.entries if one.name in MATTER)
+    assert all(abs(entry.error - true[entry.name]) < 3.0 * entry.deviation for entry in found.entries if entry.name in MATTER)
 
 
 # Parts with a known result
@@ -261,7 +261,7 @@ def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None
     found = identified("turbulence", 0.3)
     entries = json.loads(result.stdout)["entries"]
     assert entries == {
-        one.name: {"nominal": one.nominal, "change": one.error, "deviation": one.deviation} for one in found.entries
+        entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation} for entry in found.entries
     }
     written = load_airframe(str(model))
     np.testing.assert_array_equal(written.matrix_b(), found.airframe.matrix_b())

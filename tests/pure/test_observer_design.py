@@ -47,7 +47,9 @@ def weights(*batch: int) -> Weights:
     """Weights around those that a tuning found for the osprey; with leading axes, random ones around these."""
     middle = Weights(*map(np.array, ([0.05] * M, [0.3] * M, [0.9, 0.4, 0.4], [4.7, 0.6, 1.9], [0.004])))
     generator = np.random.default_rng(1)
-    return Weights(*(one * np.exp(0.3 * generator.standard_normal((*batch, len(one)))) if batch else one for one in middle))
+    return Weights(
+        *(weight * np.exp(0.3 * generator.standard_normal((*batch, len(weight)))) if batch else weight for weight in middle)
+    )
 
 
 def extended_weights() -> ExtendedStateWeights:
@@ -108,11 +110,11 @@ def test_many_aircraft_and_weights_side_by_side_are_designs_of_each() -> None:
     many = observer_design.aircraft_observer(models, NAMES, sets)
     for k in range(3):
         alone = observer_design.aircraft_observer(
-            models._replace(A=models.A[k], B=models.B[k]), NAMES, Weights(*(one[k] for one in sets))
+            models._replace(A=models.A[k], B=models.B[k]), NAMES, Weights(*(weight[k] for weight in sets))
         )
         # both stop when a doubling adds less than 1e-13 of P, so they may differ by one of them
-        for found, expected in zip(one_of(many, k)[1:], alone[1:], strict=True):
-            np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-9)
+        for matrix, expected in zip(one_of(many, k)[1:], alone[1:], strict=True):
+            np.testing.assert_allclose(matrix, expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])

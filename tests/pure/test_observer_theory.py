@@ -274,7 +274,7 @@ def slews_of_the_osprey() -> tuple[FloatArray, FloatArray]:
         u_dot = study.u_dot[:, k]
         left = u_dot - calm.u_dot[:, 0]
         of_law = lsim(filtered, left, np.asarray(0.01 * np.arange(len(left)), dtype=np.float64))[1]
-        rows.append([np.abs(one).max(axis=0) * degrees for one in (u_dot, left, of_law)])
+        rows.append([np.abs(rate).max(axis=0) * degrees for rate in (u_dot, left, of_law)])
     return np.array(rows[0]), np.mean(rows[1:], axis=0)
 
 
@@ -506,7 +506,7 @@ def course() -> tuning.Benchmark:
 
 def gain_set(K: str, Lambda: str, beta: str, softening: float, observer: dict[str, list[float]] | None = None) -> TuningResult:
     """Gains of q, p, r, V as a result of a search."""
-    of_law = {name: [float(one) for one in text.split()] for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))}
+    of_law = {name: [float(gain) for gain in text.split()] for name, text in (("K", K), ("Lambda", Lambda), ("beta", beta))}
     return TuningResult(of_law | {"softening": [softening]} | (observer or {}), 1.0, 1, [1.0], 0)
 
 
@@ -544,8 +544,8 @@ def as_pi(course: tuning.Benchmark, law: str, objective: str, channels: int) -> 
     Lambda = np.where(replaced, gains["Lambda"] + 1.0 / T_eps, gains["Lambda"])
     linear = tuned.gains | {"Lambda": Lambda.tolist(), "beta": np.where(replaced, 1e-9, gains["beta"]).tolist()}
     scores = []
-    for one in (linear, tuned.gains):
-        (found,) = law_comparison.compare(course, {law: {objective: tuned._replace(gains=one)}}, 4, [0.3], 1, delays=())
+    for law_gains in (linear, tuned.gains):
+        (found,) = law_comparison.compare(course, {law: {objective: tuned._replace(gains=law_gains)}}, 4, [0.3], 1, delays=())
         scores.append([found.scores[tuning.GUST], found.levels[0].scores[tuning.GUST].mean])
     return np.asarray(np.array(scores[0]) / np.array(scores[1]))
 

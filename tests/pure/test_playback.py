@@ -71,7 +71,7 @@ def test_a_log_without_messages_is_rejected(tmp_path: Path) -> None:
 def bag_of(folder: Path, sent: list[tuple[str, int, int, float]]) -> Path:
     """A log of (topic, time of sending, stamp, value) in the order of receipt. `truth` has the channel t."""
     with BagWriter(folder) as bag:
-        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(one[0] for one in sent)}
+        channels = {topic: bag.add_topic(topic, JOINT_STATE, "") for topic in dict.fromkeys(row[0] for row in sent)}
         for number, (topic, sent_ns, stamp_ns, value) in enumerate(sent, start=1):
             message = vector(stamp_ns, ["t" if topic == "/truth" else "q"], [value], "peer")
             bag.write(channels[topic], EPOCH + number * MS, sent_ns, number, message)

@@ -123,7 +123,7 @@ def guided(signal: Signal) -> dict[str, Any]:
     return {name: signal[name] for name in signal.names}
 
 
-@pytest.mark.parametrize("scenario", [OSPREY, C172P], ids=lambda one: one.name)
+@pytest.mark.parametrize("scenario", [OSPREY, C172P], ids=lambda scenario: scenario.name)
 def test_steady_wind_moves_position_and_nothing_else(scenario: Any) -> None:
     short = scenario.vary(flight={"duration": 3.0}, aircraft=QUIET)
     still, windy = simulate(short), simulate(short.vary(aircraft={"wind": [-4.0, 3.0]}))

@@ -256,7 +256,7 @@ def without(tape: Tape, keep: Callable[[FloatArray], Any]) -> Tape:
     """The tape with those samples of `internals` and `u` whose numbers `keep` accepts."""
     kept = np.asarray(keep(tape["internals"]["number"]), dtype=bool)
     pair = {name: tape[name] for name in ("internals", "u")}
-    cut = {name: Signal(one.stamp_ns[kept], one.names, one.values[kept]) for name, one in pair.items()}
+    cut = {name: Signal(signal.stamp_ns[kept], signal.names, signal.values[kept]) for name, signal in pair.items()}
     return replace(tape, signals={**tape.signals, **cut})
 
 
@@ -402,7 +402,7 @@ def test_each_parameter_set_has_its_own_digest() -> None:
     )
     changes: tuple[dict[str, Any], ...] = ({"k_g": flipped(1.0)}, {"upper": [1.0] * 4}, {"sign": "implicit"})
     others = [*(vary(GUST.controller, change) for change in changes), SERVO.controller, LEADING]
-    assert len({digest, *(other.digest() for other in others)}) == 6
+    assert len({digest, *(parameters.digest() for parameters in others)}) == 6
 
 
 def busy_scenario(folder: Path, **controller: object) -> Path:
@@ -517,7 +517,7 @@ def test_an_invalid_setting_is_one_sentence(setting: str, sentence: str, run: Pa
 def test_log_without_scenario_or_controller_is_one_sentence(tape: Tape, tmp_path: Path) -> None:
     scenario = busy_scenario(tmp_path)
     alone = write_run(Tape({"y": tape["y"]}), tmp_path / "alone", LogAttachments(scenario)).parent
-    short = Tape({name: one.until(0) for name, one in tape.signals.items()})
+    short = Tape({name: signal.until(0) for name, signal in tape.signals.items()})
     none = write_run(without(short, lambda number: number < 1), tmp_path / "none", LogAttachments(scenario)).parent
     for run, sentence in ((alone, "the log: found no sample of internals"), (none, "the log: found no sample")):
         result = command(str(run))

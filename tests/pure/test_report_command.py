@@ -83,7 +83,7 @@ def test_two_runs_are_compared(
     assert output.splitlines()[-1] == "report:  two.html"
     assert (runs[0] / "report.html").read_bytes() == before
     report(runs, as_json=True)
-    assert [one["scenario"] for one in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]
+    assert [report["scenario"] for report in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]
     assert (runs[0].parent / "comparison.html").is_file()
 
 

@@ -44,8 +44,8 @@ def flown(doublets: float, noise: float = 1e-3, seed: int = 1, seconds: float = 
     arrivals = np.cumsum(0.02 + 0.001 * generator.standard_normal(round(seconds / 0.02) - 10))
     places = np.round(arrivals / STEP).astype(int)
     measured = states[places] + noise * generator.standard_normal((len(places), 2))
-    stamps = np.array([nanoseconds(one) for one in STEP * places], dtype=np.int64)
-    commanded = np.array([nanoseconds(one) for one in t[::20]], dtype=np.int64)
+    stamps = np.array([nanoseconds(instant) for instant in STEP * places], dtype=np.int64)
+    commanded = np.array([nanoseconds(instant) for instant in t[::20]], dtype=np.int64)
     return Signal(stamps, OUTPUTS, measured), Signal(commanded, INPUTS, u[::20])
 
 

@@ -138,7 +138,7 @@ def test_many_aircraft_have_each_their_scale() -> None:
     y: Any = np.concatenate([np.zeros((3, 3)), V])
     found = target_scale(y, many)
     assert found.shape == (4, 3)
-    assert found[0] == pytest.approx([target_scale(y_at(one), params)[0] for one in V[0]])
+    assert found[0] == pytest.approx([target_scale(y_at(speed), params)[0] for speed in V[0]])
     zero = np.zeros((4, 3))
     state = control_law.engage(Measurements(y, y, zero, zero, zero), many)
     _, u = control_law.step(state, Measurements(y + 0.01, y, zero, zero, zero), np.float64(0.01), many)

@@ -47,7 +47,7 @@ def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
 def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
     """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
     params = [filters(model, V0, dt, ALL, seed) for seed in range(seeds)]
-    z = np.array([turbulence.initial_state(one) for one in params]).T
+    z = np.array([turbulence.initial_state(filter_params) for filter_params in params]).T
     numbers = np.array([turbulence.normals(0, steps, seed) for seed in range(seeds)])
     winds = np.empty((3, seeds, steps))
     for k in range(steps):

@@ -32,8 +32,8 @@ def test_entries_are_uniform_and_independent() -> None:
     d = A[1:, q, q] / A[0, q, q] - 1.0
     assert kstest(d, "uniform", args=(-0.3, 0.6)).pvalue > 0.01
     others = (A[1:, q, 1] / A[0, q, 1] - 1.0, B[1:, q, 0] / B[0, q, 0] - 1.0)
-    for other in others:  # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of them
-        assert abs(np.corrcoef(d, other)[0, 1]) < 0.09
+    for entry in others:  # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of them
+        assert abs(np.corrcoef(d, entry)[0, 1]) < 0.09
 
 
 def test_sampled_airframe_keeps_zeros_angles_and_everything_but_and_b() -> None:

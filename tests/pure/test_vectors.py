@@ -58,7 +58,7 @@ def test_functions_of_python_float_are_those_of_array_at_that_value() -> None:
         assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), name  # JAX in 32 bit
     for name in ("atan2", "hypot", "copysign", "minimum", "maximum"):
         assert getattr(xp, name)(0.5, -2.0) == pytest.approx(float(getattr(jnp, name)(0.5, -2.0)), rel=1e-6), name
-    assert [xp.where(one, 1.0, 2.0) for one in (True, False)] == [1.0, 2.0]
+    assert [xp.where(condition, 1.0, 2.0) for condition in (True, False)] == [1.0, 2.0]
 
 
 def test_the_namespace_of_numpy_1_has_concat() -> None:

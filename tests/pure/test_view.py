@@ -125,7 +125,7 @@ def test_description_has_units_limits_gusts_and_commands_of_scenario(recorded: P
     assert [name for name, *_ in shown["gusts"]] == ["vertical", "lateral"]
     assert shown["commands"][0][1] > 0.0
     json.dumps(shown, allow_nan=False)
-    assert [(one.kind, one.text) for one in flight.events] == [("mode", "ENGAGED")]
+    assert [(event.kind, event.text) for event in flight.events] == [("mode", "ENGAGED")]
     assert set(flight.bands) == {"q", "V", "p", "r"}
 
 
@@ -285,7 +285,7 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
             bag.write(events, number, number, number, bytes(store.serialize_cdr(message, PARAMETER_EVENT)))
     flight = Flight(tmp_path / "run")
     flight.update()
-    assert sorted(one[1:] for one in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
+    assert sorted(event[1:] for event in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
 
 
 def test_route_that_given_in_flight_replaces_that_of_scenario(tmp_path: Path) -> None:
@@ -296,7 +296,9 @@ def test_route_that_given_in_flight_replaces_that_of_scenario(tmp_path: Path) ->
     point, turn = (store.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion"))
     head = header(time(0, 0), "map")
     pose = made["geometry_msgs/msg/Pose"]
-    poses = [made["geometry_msgs/msg/PoseStamped"](head, pose(point(*one), turn(0.0, 0.0, 0.0, 1.0))) for one in given]
+    poses = [
+        made["geometry_msgs/msg/PoseStamped"](head, pose(point(*position), turn(0.0, 0.0, 0.0, 1.0))) for position in given
+    ]
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(scenario.path), 0)
         route = bag.add_topic("/route", ROUTE_TYPE, "")
@@ -312,8 +314,8 @@ def test_route_that_given_in_flight_replaces_that_of_scenario(tmp_path: Path) ->
     head_of, _ = decoded(answer(flight, {"described": "1"}))
     assert scenario.guidance is not None
     expected = route_outline(scenario.guidance.plan([Waypoint(north, east, altitude) for east, north, altitude in given]))
-    assert [tuple(one) for one in head_of["flight"]["route"]] == expected
-    assert [(one.kind, one.text) for one in flight.events] == [("route", "3 waypoints")]
+    assert [tuple(vertex) for vertex in head_of["flight"]["route"]] == expected
+    assert [(event.kind, event.text) for event in flight.events] == [("route", "3 waypoints")]
     known = {"described": str(head_of["described"]), "epoch": head_of["epoch"]}
     assert "flight" not in decoded(answer(flight, known))[0]
 
@@ -582,8 +584,8 @@ def test_websockets_that_ask_nothing_and_those_beyond_limit_closed(recorded: Pat
     async def client(server: Server) -> None:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
         assert (await get(server, "/news/0", **UPGRADE)).code == 503
-        for one in sockets:
-            one.close()
+        for websocket in sockets:
+            websocket.close()
         await left(server)
         monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
         silent = await stream(server)
@@ -694,7 +696,9 @@ def test_watch_prints_address_and_ends_quietly_with_ctrl_c(recorded: Path, ignor
         port = address.split(":")[2].partition("/")[0]
         assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel
         sockets = psutil.Process(process.pid).net_connections()
-        assert [(one.type, one.laddr.ip) for one in sockets] == [(socket.SOCK_STREAM, "127.0.0.1")]  # no UDP: no ROS
+        assert [(connection.type, connection.laddr.ip) for connection in sockets] == [
+            (socket.SOCK_STREAM, "127.0.0.1")
+        ]  # no UDP: no ROS
         process.send_signal(signal.SIGINT)
         assert process.wait(20.0) == 0
         assert process.stderr.read() == ""

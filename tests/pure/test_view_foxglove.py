@@ -60,7 +60,7 @@ def test_viewer_gets_messages_of_log_with_definitions(recorded: Path, tape: Tape
         received: list[tuple[int, bytes]] = []
         while "/y" not in channels:
             message = await text()
-            channels |= {one["topic"]: one for one in message.get("channels", ())}
+            channels |= {channel["topic"]: channel for channel in message.get("channels", ())}
             assert message.get("capabilities", []) == []  # nothing can be sent
         subscription = {"id": 7, "channelId": channels["/y"]["id"]}
         await connection.write_message(json.dumps({"op": SUBSCRIBE, "subscriptions": [subscription]}))

@@ -187,7 +187,7 @@ def start_node(start: Start, osprey_gust: Scenario) -> Start:
 def recorder(start_node: Start) -> Recorder:
     """Start a recorder with a folder and further parameters."""
     return lambda folder, *parameters: start_node(
-        "flight_recorder", *(word for one in (f"directory:={folder}", *parameters) for word in ("-p", one))
+        "flight_recorder", *(word for parameter in (f"directory:={folder}", *parameters) for word in ("-p", parameter))
     )
 
 

@@ -87,7 +87,7 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
     page = Page(next(line for line in watch.lines if line.startswith("http://")), key)
     state = page.until(flight, nodes=["aircraft", "controller"])
     state = page.until(flight, logged=state["digest"])
-    k_g = next(one["values"][0] for one in state["gains"] if one["name"] == "k_g")
+    k_g = next(gain["values"][0] for gain in state["gains"] if gain["name"] == "k_g")
 
     status, changed = page.post("gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]})
     assert (status, changed["undo"]) == (200, 1), changed
@@ -111,12 +111,12 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
     assert watch.interrupt().end() == 0, watch.output
 
     changes = parameter_changes(run, "/aircraft", {"actuators": None, "sensors": None, "gusts": None})
-    assert [sorted(one) for one in changes[-3:]] == [
+    assert [sorted(change) for change in changes[-3:]] == [
         ["sensors.bias"], ["actuators.stuck_at"], ["gusts.vertical.length", "gusts.vertical.speed", "gusts.vertical.start"],
     ]  # fmt: skip
     log = Flight(run)
     log.update()
-    requests = [one.text for one in log.events if one.kind == "control"]
+    requests = [event.text for event in log.events if event.kind == "control"]
     assert [(re.findall(r"'do': '(\w+)'", text)[0], "refused: " in text) for text in requests] == [
         ("gains", False), ("gains", True), ("gains", True), ("undo", False), ("fault", False), ("fault", False),
         ("gust", False), ("fault", True), ("deactivate", False), ("activate", False),

@@ -66,14 +66,14 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Record
         missing.append(missing_seconds(folder, witness))
         assert process.end() == -signal.SIGKILL
         for topic, (_, sequences) in stamps_and_sequences(folder).items():
-            since = [one for one in sequences if one >= begin[topic]]
+            since = [number for number in sequences if number >= begin[topic]]
             assert since == list(range(since[0], since[-1] + 1)), topic  # no gap before the end
         assert not (folder / "metadata.yaml").exists()
         tape = read_run(folder).tape
         end = max(tape.time(name)[-1] for name in tape.signals)
         assert tape.notes[0] == f"run{k}_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
         assert tape.notes[1] == f"metadata.yaml is missing: rise-di repair {folder}"
-    print([round(one, 3) for one in missing])
+    print([round(duration, 3) for duration in missing])
     assert max(missing) < 0.3, missing
 
 

@@ -87,9 +87,9 @@ def test_law_flies_in_lockstep_as_without_ros_and_replayed(law: str, options: li
         start("flight_cli.cli", "fly", str(scenario), option, "--runs", option.strip("-")).succeed()
         runs.append(tmp_path / option.strip("-") / "latest")
     first = payloads(runs[0])
-    for other in map(payloads, runs[1:]):
+    for payload in map(payloads, runs[1:]):
         for topic in TOPICS:
-            assert first[topic] == other[topic], topic
+            assert first[topic] == payload[topic], topic
     tape, recorded = simulate(load_scenario(scenario)), read_run(runs[0]).tape
     assert tape["u"].values.any(axis=0).all()
     for name, signal in tape.signals.items():

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.package("flight_bringup")
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
     """The newest state by process, filled while the peer spins."""
     states: dict[str, str] = {}
-    peer_node.node.create_subscription(KeyValue, topic, lambda one: states.update({one.key: one.value}), STATES)
+    peer_node.node.create_subscription(KeyValue, topic, lambda message: states.update({message.key: message.value}), STATES)
     return states
 
 

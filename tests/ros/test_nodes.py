@@ -88,7 +88,7 @@ def test_no_module_imported_by_ready_node(start_node: Start, monkeypatch: pytest
     nodes = [start_node(package) for package in NODES]
 
     def reports(name: str) -> int:
-        return sum(one.status[0].name == f"/{name}" for one in peer_node.received["/diagnostics"])
+        return sum(message.status[0].name == f"/{name}" for message in peer_node.received["/diagnostics"])
 
     peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
     assert any("ENGAGED" in node.output for node in nodes)

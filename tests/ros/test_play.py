@@ -71,7 +71,7 @@ def test_stamps_moved_to_now_and_all_other_bytes_unchanged(run: Path, start: Sta
     stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
     assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
     assert np.median(np.abs(stamps - np.array(receiving.sent["y"]))) < 50 * MS  # as fresh as they were
-    received, recorded = ([one[:4] + one[12:] for one in y] for y in (receiving.received["y"], of(run, "y")[-251:]))
+    received, recorded = ([payload[:4] + payload[12:] for payload in y] for y in (receiving.received["y"], of(run, "y")[-251:]))
     assert received == recorded
 
 

@@ -33,7 +33,7 @@ class Access(NamedTuple):
 
     def merged(self, other: "Access") -> "Access":
         """The union of both."""
-        return Access(*(one | more for one, more in zip(self, other, strict=True)))
+        return Access(*(names | more for names, more in zip(self, other, strict=True)))
 
 
 def in_full(name: str, node: str) -> str:
@@ -53,7 +53,7 @@ def allowed() -> dict[str, Access]:
         for verb in Access._fields:
             lists = [part for part in profiles[0] if part.get(verb) is not None]
             assert {part.get(verb) for part in lists} <= {"ALLOW"}
-            texts = [one.text or "" for part in lists for one in part]
+            texts = [element.text or "" for part in lists for element in part]
             assert len(texts) == len(set(texts))
             names.append(frozenset(in_full(text, node) for text in texts))
         found[node] = Access(*names)
@@ -77,7 +77,7 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
             return False
         before = dict(found)
         found.update({node: graph(peer_node, node) for node in nodes})
-        return found == before and all(one.publish and one.reply for one in found.values())
+        return found == before and all(access.publish and access.reply for access in found.values())
 
     for _ in range(3):  # the endpoints of a node are discovered one by one
         peer_node.until(settled)
@@ -99,7 +99,7 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, t
         process.end()
     overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
     overrides.append(f"recorder:directory:={tmp_path / 'run'}")
-    start_node("flight_bringup", *(word for one in overrides for word in ("-p", one)))
+    start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
     lockstep = discovered(peer_node, ROLES)
     for role in ROLES:
         assert real_time[role].merged(lockstep[role]) == policy[role], role

@@ -38,7 +38,7 @@ def diagnostics(peer_node: Peer) -> tuple[int, str, dict[str, str]]:
     """Level, sentence and figures of the recorder's newest diagnostics."""
     for status in (message.status[0] for message in reversed(peer_node.received["/diagnostics"])):
         if status.name == "/recorder":
-            return status.level[0], status.message, {one.key: one.value for one in status.values}
+            return status.level[0], status.message, {value.key: value.value for value in status.values}
     return -1, "", {}
 
 
@@ -61,12 +61,14 @@ def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node:
     peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
     process.interrupt().succeed()
     with AnyReader([tmp_path / "run"]) as reader:
-        recorded_messages = [(one.topic, reader.deserialize(data, one.msgtype)) for one, _, data in reader.messages()]
+        recorded_messages = [
+            (connection.topic, reader.deserialize(data, connection.msgtype)) for connection, _, data in reader.messages()
+        ]
     texts = [message.msg for topic, message in recorded_messages if topic == "/rosout"]  # type: ignore[attr-defined]
     assert "logged before the recorder started" in texts
     assert any("recording to" in text for text in texts)
     events = [message for topic, message in recorded_messages if topic == "/parameter_events"]
-    assert [one.name for event in events for one in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
+    assert [parameter.name for event in events for parameter in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
 
 
 def test_further_topics_recorded_with_any_offered_qos(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:

@@ -153,7 +153,7 @@ def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
         local.bind(("127.0.0.1", 0))
         found = open_to_network()
         assert f"0.0.0.0:{opened.getsockname()[1]}" in found
-        assert not any(one.endswith(f":{local.getsockname()[1]}") for one in found)
+        assert not any(address.endswith(f":{local.getsockname()[1]}") for address in found)
 
 
 # Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet devices

@@ -318,9 +318,9 @@ def recorder_killed_under_the_page(flight: Flight, random: Generator) -> None:
 
 def ready_stamp(flight: Flight, role: str, begin: float) -> float | None:
     """The stamp of a node's line "ready". The line is received later, when the probe has discovered the node."""
-    for one in flight.probe.since("/rosout", begin):
-        if one.message.name == role and one.message.msg == "ready":
-            stamp = one.message.stamp
+    for arrival in flight.probe.since("/rosout", begin):
+        if arrival.message.name == role and arrival.message.msg == "ready":
+            stamp = arrival.message.stamp
             return float(stamp.sec + 1e-9 * stamp.nanosec)
     return None
 
@@ -520,7 +520,7 @@ def step_of_clock(by: float) -> Injection:
 def until_all_log(flight: Flight, pattern: str, begin: float) -> None:
     """Wait until each node has logged a line that matches the pattern."""
     roles = ROLES[flight.kind]
-    flight.until(lambda: all(flight.first_line(one, pattern, begin) for one in roles), 5.0, f"{pattern!r} of all nodes")
+    flight.until(lambda: all(flight.first_line(role, pattern, begin) for role in roles), 5.0, f"{pattern!r} of all nodes")
 
 
 def starve(flight: Flight, random: Generator) -> None:
@@ -530,8 +530,8 @@ def starve(flight: Flight, random: Generator) -> None:
     before = [node.cpu_affinity() for node in nodes]
     busy = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"], start_new_session=True) for _ in range(6)]
     try:
-        for one in busy:
-            os.sched_setaffinity(one.pid, {core})
+        for process in busy:
+            os.sched_setaffinity(process.pid, {core})
         flight.begin_fault()
         for node in nodes:
             node.cpu_affinity([core])
@@ -539,9 +539,9 @@ def starve(flight: Flight, random: Generator) -> None:
                 os.sched_setaffinity(thread.id, {core})
         pause(flight, 3.0)
     finally:
-        for one in busy:
-            one.kill()
-            one.wait()
+        for process in busy:
+            process.kill()
+            process.wait()
         flight.end_fault()
         for node, cores in zip(nodes, before, strict=True):
             for thread in node.threads():

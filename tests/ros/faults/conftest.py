@@ -59,7 +59,7 @@ def draws(pytestconfig: pytest.Config) -> list[Draw]:
     """Failures of the past and random faults, those of one kind of flight after one another; none outside the campaign."""
     first, count = (int(pytestconfig.getoption(f"--faults-{name}", 0)) for name in ("seed", "random"))
     drawn = [*found(), *map(draw, range(first, first + count))] if count else []
-    return sorted(drawn, key=lambda one: one.cases[0].kind.name)
+    return sorted(drawn, key=lambda fault: fault.cases[0].kind.name)
 
 
 @pytest.fixture(scope="session")

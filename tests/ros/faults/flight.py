@@ -140,7 +140,7 @@ class Probe:
         self._thread.start()
 
     def _receive(self) -> None:
-        waiter = WaitSet([one.entity for one in self._subscriptions.values()], self._context)
+        waiter = WaitSet([subscription.entity for subscription in self._subscriptions.values()], self._context)
         sample = 0.0
         while not self._closed:
             waiter.wait(NANOSECONDS // 20)
@@ -150,13 +150,14 @@ class Probe:
             with self._changed:
                 for name, subscription in self._subscriptions.items():
                     self.received[name].extend(
-                        Received(seconds(one.sent_ns), seconds(one.received_ns), one.message) for one in subscription.take()
+                        Received(seconds(arrival.sent_ns), seconds(arrival.received_ns), arrival.message)
+                        for arrival in subscription.take()
                     )
                 self._changed.notify_all()
 
     def _sample_delays(self) -> None:
         before = self._waited_ns
-        ready = [one.popen.pid for one in list(self.monitored) if "]: ready" in one.output]
+        ready = [process.popen.pid for process in list(self.monitored) if "]: ready" in process.output]
         self._waited_ns = {process: _waited_ns(process) for process in (os.getpid(), *ready)}
         longest = max(waited - before.get(process, waited) for process, waited in self._waited_ns.items())
         self.delays.append((time.time(), longest / NANOSECONDS))
@@ -165,11 +166,11 @@ class Probe:
         """The messages of a topic from one instant to another."""
         messages: list[Received] = []
         with self._changed:
-            for one in reversed(self.received[topic]):
-                if one.at < begin:
+            for arrival in reversed(self.received[topic]):
+                if arrival.at < begin:
                     break
-                if one.at <= end:
-                    messages.append(one)
+                if arrival.at <= end:
+                    messages.append(arrival)
         return messages[::-1]
 
     def until(self, condition: Callable[[], Any], timeout: float, what: str) -> Any:
@@ -335,7 +336,7 @@ class Flight:
             return self._run("tests.ros.autopilot", str(self.scenario), str(RELEASE_AFTER), cwd=REPOSITORY)
         if role == "bridge":
             parameters = (f"map:={fast_map(self.folder)}", "dry_run:=false")
-        words = [word for one in parameters for word in ("-p", one)]
+        words = [word for parameter in parameters for word in ("-p", parameter)]
         if role == "aircraft" and self.gate is not None:
             words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
@@ -395,7 +396,7 @@ class Flight:
     def close(self) -> None:
         """End all processes, the recorder last, and the probe."""
         recorder = self.processes["recorder"]
-        for process in (*(one for one in self._all if one is not recorder), recorder):
+        for process in (*(process for process in self._all if process is not recorder), recorder):
             if process.popen.poll() is None:
                 process.popen.send_signal(signal.SIGCONT)
                 process.popen.terminate()
@@ -448,7 +449,7 @@ class Flight:
                 found.append(sample)
         if not found or seconds(found[-1].stamp_ns) < until:
             return None
-        ticks = _ticks(np.array([seconds(one.stamp_ns) for one in found]), np.array([one.value for one in found]))
+        ticks = _ticks(np.array([seconds(sample.stamp_ns) for sample in found]), np.array([sample.value for sample in found]))
         return Ticks(*(column[ticks.mode == Mode.ENGAGED] for column in ticks))
 
     def actuator_positions(self, begin: float, end: float = float("inf")) -> tuple[FloatArray, FloatArray]:
@@ -467,9 +468,9 @@ class Flight:
     def _samples(self, topic: str, names: tuple[str, ...], begin: float, end: float) -> Iterator[tuple[float, StampedVector]]:
         """The samples of the flight's own nodes, and when they were received."""
         decoder = Decoder(names)
-        for one in self.probe.since(topic, begin, end):
-            if (sample := self._decode(decoder, one.message)) is not None:
-                yield one.at, sample
+        for arrival in self.probe.since(topic, begin, end):
+            if (sample := self._decode(decoder, arrival.message)) is not None:
+                yield arrival.at, sample
 
     def _decode(self, decoder: Decoder, data: bytes) -> StampedVector | None:
         """A message of the flight's own nodes; None for any other."""
@@ -478,7 +479,7 @@ class Flight:
 
     def pause(self, topic: str, begin: float, end: float) -> float:
         """The longest time without a message between two instants, s."""
-        times = [begin, *(one.at for one in self.probe.since(topic, begin, end)), end]
+        times = [begin, *(arrival.at for arrival in self.probe.since(topic, begin, end)), end]
         return float(np.diff(times).max())
 
     def host_delay(self, begin: float, end: float) -> float:
@@ -494,43 +495,43 @@ class Flight:
 
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
         """When a node first logged a line that matches the pattern."""
-        for one in self.probe.since("/rosout", begin):
-            if one.message.name == role and re.search(pattern, one.message.msg):
-                return one.at
+        for arrival in self.probe.since("/rosout", begin):
+            if arrival.message.name == role and re.search(pattern, arrival.message.msg):
+                return arrival.at
         return None
 
     def expect_in_log(self, case: str) -> None:
         """Keep what was received since the fault's begin, and from HISTORY before the end of a killed node on."""
         decoder = Decoder(())
-        killed_nodes = [one for one in self._killed if one.dead >= self.begin and one.role in PUBLISHED]
-        begin = min([self.begin, *(one.alive - HISTORY for one in killed_nodes)])
+        killed_nodes = [node for node in self._killed if node.dead >= self.begin and node.role in PUBLISHED]
+        begin = min([self.begin, *(node.alive - HISTORY for node in killed_nodes)])
         received = [
-            (one, sample.sender)
-            for one in self.probe.since("internals", begin)
-            if (sample := self._decode(decoder, one.message)) is not None
+            (arrival, sample.sender)
+            for arrival in self.probe.since("internals", begin)
+            if (sample := self._decode(decoder, arrival.message)) is not None
         ]
-        lines = [one for one in self.probe.since("/rosout", begin) if one.message.name in PUBLISHED]
+        lines = [line for line in self.probe.since("/rosout", begin) if line.message.name in PUBLISHED]
         last = []
         for killed in killed_nodes:
             # the delays of two processes add up: of the node and of the recorder
             since = killed.alive - NOT_RETRANSMITTED - 2.0 * self.host_delay(killed.alive - MAX_AGE, killed.dead)
-            last.append([one.message for one, sender in received if sender == killed.instance and one.sent > since])
-            lines = [one for one in lines if one.message.name != killed.role or not since < one.sent <= killed.dead]
+            last.append([arrival.message for arrival, sender in received if sender == killed.instance and arrival.sent > since])
+            lines = [line for line in lines if line.message.name != killed.role or not since < line.sent <= killed.dead]
         # A new recorder receives what the publishers still keep. On a busy host it may start later than that.
-        for killed in (one for one in self._killed if one.role == "recorder" and one.dead >= self.begin):
+        for killed in (node for node in self._killed if node.role == "recorder" and node.dead >= self.begin):
             joined = min(seconds(record.log_time) for topic, record in logged(self.runs[-1]) if topic == "/internals")
             kept = joined - seconds(HISTORY_NS) + self.host_delay(killed.alive, joined)
-            received = [(one, sender) for one, sender in received if not killed.alive - HISTORY < one.sent < kept]
-        internals = {one.message for one, _ in received}
-        logged_lines = {(one.message.name, one.message.msg) for one in lines}
+            received = [(arrival, sender) for arrival, sender in received if not killed.alive - HISTORY < arrival.sent < kept]
+        internals = {arrival.message for arrival, _ in received}
+        logged_lines = {(line.message.name, line.message.msg) for line in lines}
         self.expected_logs[case] = ExpectedLog(internals.difference(*last), logged_lines, last)
 
     def diagnostics(self, role: str, begin: float) -> list[tuple[float, str, dict[str, str]]]:
         """The 1 Hz diagnostics of a node: when received, the instance, and the values by key."""
         return [
-            (one.at, status.hardware_id, {value.key: value.value for value in status.values})
-            for one in self.probe.since("/diagnostics", begin)
-            for status in one.message.status
+            (arrival.at, status.hardware_id, {value.key: value.value for value in status.values})
+            for arrival in self.probe.since("/diagnostics", begin)
+            for status in arrival.message.status
             if status.name == f"/{role}"
         ]
 
@@ -543,7 +544,7 @@ class Flight:
     def first_message(self, topic: str, begin: float, instance: str = "") -> float | None:
         """When the first message of a topic was received, of any publisher or of one instance."""
         sender = f"{instance}\0".encode() if instance else b""
-        return next((one.at for one in self.probe.since(topic, begin) if sender in one.message), None)
+        return next((arrival.at for arrival in self.probe.since(topic, begin) if sender in arrival.message), None)
 
     def engaged_since(self, begin: float) -> float | None:
         """Since when the law has been engaged without a break until now; None where it is not."""

@@ -44,7 +44,7 @@ def matched_publisher(topic: str) -> Iterator[Publisher]:
     context = Context()
     rclpy.init(context=context)
     node = Node("foreign", context=context)
-    kind = {one.name: one for one in (Y, Y_M, U, U_M, TARGET)}[topic]
+    kind = {endpoint.name: endpoint for endpoint in (Y, Y_M, U, U_M, TARGET)}[topic]
     subscribers = SUBSCRIBERS - (kind is TARGET)  # the probe publishes it
     publisher = node.create_publisher(kind.type, kind.name, PUBLISH)
     report = time.monotonic() + REPORT_PERIOD
@@ -52,7 +52,7 @@ def matched_publisher(topic: str) -> Iterator[Publisher]:
         time.sleep(0.005)
         if time.monotonic() > report:
             report += REPORT_PERIOD
-            known = sorted(one.node_name for one in node.get_subscriptions_info_by_topic(topic))
+            known = sorted(subscription.node_name for subscription in node.get_subscriptions_info_by_topic(topic))
             print(f"{publisher.get_subscription_count()} of {subscribers} subscribers matched, known: {known}", flush=True)
     print(f"begins at {time.time():.6f}", flush=True)
     yield publisher

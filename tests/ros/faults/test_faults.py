@@ -115,7 +115,7 @@ def test_log_holds_every_received_message_of_each_fault(flights: Flights) -> Non
             assert expected.internals <= internals, case
             assert expected.lines <= lines, case
             for last in expected.last:
-                in_log = [one in internals for one in last]
+                in_log = [message in internals for message in last]
                 assert in_log == sorted(in_log, reverse=True), case
 
 
