@@ -344,15 +344,15 @@ def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], flo
     for run in runs:
         log, strong = read_run(run), dict[float, list[Engagement]]()
         end_ns = int(log.tape["y"].stamp_ns[-1])
-        for number, one in enumerate(log.engagements or []):
-            turbulence = wind_of(number, one)
-            about = {"run": run.name, "turbulence": turbulence, "reason": one.reason}
-            if seconds((one.stop_ns or end_ns) - one.start_ns) < EXCITED:
+        for number, engagement in enumerate(log.engagements or []):
+            turbulence = wind_of(number, engagement)
+            about = {"run": run.name, "turbulence": turbulence, "reason": engagement.reason}
+            if seconds((engagement.stop_ns or end_ns) - engagement.start_ns) < EXCITED:
                 ended.append(about)
                 continue
-            found.append(about | judged(channel_map, log.tape, [one]))
+            found.append(about | judged(channel_map, log.tape, [engagement]))
             if turbulence > MODERATE:
-                strong.setdefault(turbulence, []).append(one)
+                strong.setdefault(turbulence, []).append(engagement)
         for turbulence, some in strong.items():
             alike = {"run": run.name, "turbulence": turbulence, "count": len(some)}
             together.append(alike | judged(channel_map, log.tape, some))
@@ -392,7 +392,7 @@ def pose() -> dict[str, Any]:
         flown = plane.fly(EXAMPLE, plane.patient_map("ardupilot"), 60.0)
         flown.wait_for("DISENGAGED")
         plane.wander(flown)
-        return {name: one._asdict() for name, one in plane.compare().items()}
+        return {name: fit._asdict() for name, fit in plane.compare().items()}
 
 
 def releases() -> dict[str, Any]:

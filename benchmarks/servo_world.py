@@ -177,7 +177,7 @@ def score(scenario: Scenario) -> float:
     """Score of a flight: the sum over the channels of the rms true error in its unit."""
     error = sampling.true_error_of(simulate(scenario))
     unit = score_units(error.names, scenario.aircraft.channels().outputs)
-    return float(sum(error_metrics(error[name]).rms / one for name, one in zip(error.names, unit.tolist(), strict=True)))
+    return float(sum(error_metrics(error[name]).rms / scale for name, scale in zip(error.names, unit.tolist(), strict=True)))
 
 
 def delayed(scenario: Scenario, delay: float, rate: float = 1.0 / DELAY_STEP) -> Scenario:

@@ -91,7 +91,7 @@ class Peer:
 
     def __init__(self, node: Node) -> None:
         outputs = find_scenario(SCENARIO).controller.outputs
-        self._y, self._y_m = (node.create_publisher(one.type, one.name, PUBLISH) for one in (Y, Y_M))
+        self._y, self._y_m = (node.create_publisher(topic.type, topic.name, PUBLISH) for topic in (Y, Y_M))
         self._y_encoder, self._y_m_encoder = (Encoder(outputs, f"/peer/{name}") for name in ("y", "y_m"))
         self._u = PolledSubscription(node, U, RECORD, raw=True)
         self._internals = PolledSubscription(node, INTERNALS, RECORD, raw=True)
@@ -265,7 +265,7 @@ def tick_rows(seconds: float) -> Iterator[Row]:
             length = short if role == "timer" else seconds
             with Child(role, "--hz", "100", "--seconds", str(length), within=within) as child:
                 goals = [Goal("p99 (us)", 50.0)] if role == "ticker" else []
-                what, floor = (f"{one}, 100 Hz, FIFO {PRIORITY}, full load" for one in (name, "empty timer, single"))
+                what, floor = (f"{label}, 100 Hz, FIFO {PRIORITY}, full load" for label in (name, "empty timer, single"))
                 yield Row(what, _ticks(child, length), floor, goals)
 
 
@@ -291,9 +291,9 @@ def full_load() -> Iterator[None]:
     try:
         yield
     finally:
-        for one in busy:
-            one.kill()
-            one.wait()
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
@@ -311,7 +311,7 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
     ):
         time.sleep(max(flight.start_time - time.time(), 0.0) + WARM_UP)
         processes = flight.processes
-        for process, figures in zip(processes, _use([one.popen.pid for one in processes], seconds), strict=True):
+        for process, figures in zip(processes, _use([process.popen.pid for process in processes], seconds), strict=True):
             yield Row(process.node.executable, figures, "node that only spins")
 
 

@@ -83,7 +83,7 @@ def mcap(data: bytes, folder: Path) -> None:
     rejected(lambda: read_playback(file))
     rejected(lambda: _watch(file))
     rejected(lambda: _replay(file))
-    if not rejected(lambda: repair(run)) and any(one.damaged for one in repair(run).files):
+    if not rejected(lambda: repair(run)) and any(repaired.damaged for repaired in repair(run).files):
         raise AssertionError("the repaired log is damaged")
 
 

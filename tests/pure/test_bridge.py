@@ -128,7 +128,7 @@ def test_timeout_of_u_sends_neutral_then_release_values_then_nothing() -> None:
         receive_outputs(bridge, t + 1e-3)
         phases.append((bridge.step(at(t + 1e-3)), t, bridge.raw(), bridge.sends("joy", at(t))))
     expected = {Phase.ENGAGED: 0.0, Phase.NEUTRAL: 0.2, Phase.RELEASE: 0.5, Phase.DISENGAGED: 1.0}
-    starts = {phase: next(t for one, t, *_ in phases if one is phase) for phase in expected}
+    starts = {phase: next(t for reached, t, *_ in phases if reached is phase) for phase in expected}
     assert starts == pytest.approx(expected, abs=0.011)  # a tick
     for phase, _, raw, sent in phases:
         assert sent == (phase is not Phase.DISENGAGED)
@@ -459,7 +459,7 @@ def test_captured_output_is_zero_until_engagement_and_then_change() -> None:
     refresh(bridge, 0.1, offboard=14.0)  # V from 20 to 21 m/s
     samples.append(bridge.y(at(0.1)))
     place = bridge.outputs.index("V")
-    assert [None if one is None else one.value[place] for one in samples] == [0.0, 1.0]
+    assert [None if sample is None else sample.value[place] for sample in samples] == [0.0, 1.0]
 
 
 STICKS = {"elevator": 1400.0, "thrust": 1450.0, "aileron": 1520.0, "rudder": 1490.0}  # us

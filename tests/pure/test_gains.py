@@ -62,7 +62,10 @@ def selected(osprey: Study) -> selection.Selection:
 
 
 def names(conditions: tuple[Condition, ...], channels: tuple[str, ...]) -> list[str]:
-    return [one.name if one.channel is None else f"{one.name} of {channels[one.channel]}" for one in conditions]
+    return [
+        condition.name if condition.channel is None else f"{condition.name} of {channels[condition.channel]}"
+        for condition in conditions
+    ]
 
 
 def failing_in_loop(assessment: GainAssessment[Any]) -> list[str]:
@@ -91,7 +94,7 @@ def test_k_g_and_k_d_follow_steps_2_and_3_from_last_channel_up() -> None:
 def test_gains_of_theorem_1_meet_conditions() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
     assert not gain_conditions.failing(conditions)
-    assert [one.margin for one in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
+    assert [condition.margin for condition in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
     assert conditions[3].margin == pytest.approx(1.5)
     assert (conditions[4].found, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
 
@@ -117,7 +120,7 @@ def test_a_condition_that_fails_is_named(change: dict[str, FloatArray | float], 
 @pytest.mark.equation(40)
 def test_what_rests_on_gamma_2_marked_estimate() -> None:
     conditions = gain_conditions.check(gain_conditions.theorem_gains(HAND, np.ones(3)), HAND)
-    assert [one.estimate for one in conditions] == [True, True, True, False, False]
+    assert [condition.estimate for condition in conditions] == [True, True, True, False, False]
 
 
 @pytest.mark.equation(22)
@@ -259,7 +262,7 @@ def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
             assert getattr(read, key) == value, key
         elif isinstance(value, (float, tuple)):
             np.testing.assert_allclose(getattr(read, key), value, rtol=1e-5, err_msg=key)  # six digits
-    assert all(type(one) is float for one in section["k_d"])  # ROS takes lists of one type only
+    assert all(type(gain) is float for gain in section["k_d"])  # ROS takes lists of one type only
     again = selection.assess_gains(selected.study, read, SERVOS)
     assert names(again.failing, read.outputs) == names(selected.engineering.failing, read.outputs)
 
@@ -493,7 +496,7 @@ def test_y_that_is_slower_than_law_counts_as_delay_and_may_be_three_messages_old
         loop = ("--rate", "50", "--delay", "0.04", "--y-rate", rate)
         delays.append(json.loads(rise_di("gains", "osprey", "--samples", "2", "--json", *loop, "--write", str(path)).stdout))
         ages.append(yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]["max_age"])
-    found = [one["engineering"]["controller"]["delay"] for one in delays]
+    found = [design["engineering"]["controller"]["delay"] for design in delays]
     assert found == pytest.approx([0.161515, 0.04], abs=1e-6)
     assert ages == pytest.approx([3.0 / 9.9, find_scenario("osprey_servo").controller.max_age], abs=1e-5)
 
@@ -524,7 +527,7 @@ def test_smallest_eigenvalue_of_zero_is_no_decay() -> None:
 
 
 def test_the_command_lists_the_airframes() -> None:
-    listed = {one["name"]: one for one in json.loads(rise_di("airframes", "--json").stdout)}
+    listed = {airframe["name"]: airframe for airframe in json.loads(rise_di("airframes", "--json").stdout)}
     assert listed["osprey"]["D"] == [1, 1, 1, 1]
     assert listed["f16_lateral"]["for_D_I"] == "flip aileron, rudder"
     assert (listed["osprey"]["controllable"], listed["osprey"]["integrated"]) == (True, ["theta", "phi"])

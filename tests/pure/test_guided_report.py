@@ -59,9 +59,14 @@ def after(instant: float, value: float) -> FloatArray:
 def test_segment_ends_where_mode_command_or_leg_changes() -> None:
     lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
     found = segments(log(mode__lateral=lateral, leg=after(20.0, 1.0), target__altitude=after(30.0, 50.0)))
-    assert [(one.start, one.stop) for one in found] == [near(0.0, 10.0), near(10.0, 20.0), near(20.0, 30.0), near(30.0, 39.98)]
-    assert [one.leg for one in found] == [None, 0, 1, 1]
-    assert [one.lateral.quantity for one in found] == ["heading", "xtrack", "xtrack", "xtrack"]
+    assert [(segment.start, segment.stop) for segment in found] == [
+        near(0.0, 10.0),
+        near(10.0, 20.0),
+        near(20.0, 30.0),
+        near(30.0, 39.98),
+    ]
+    assert [segment.leg for segment in found] == [None, 0, 1, 1]
+    assert [segment.lateral.quantity for segment in found] == ["heading", "xtrack", "xtrack", "xtrack"]
 
 
 def test_commands_less_than_second_apart_begin_one_segment() -> None:
@@ -121,7 +126,7 @@ def test_the_drawn_route_lies_on_its_legs(side: float) -> None:
     for point in points:
         assert min(abs(path.error(leg, point).e) for leg in legs) < 1e-6
     # The fillet turns 90 deg, and never the long way round.
-    assert max(math.dist(one, (1000.0, side * 1000.0)) for one in points) < 1500.0
+    assert max(math.dist(point, (1000.0, side * 1000.0)) for point in points) < 1500.0
     assert math.dist(points[-1], (1000.0, side * 1000.0)) == pytest.approx(200.0)
 
 
@@ -131,7 +136,7 @@ def context_of(tape: Tape) -> Any:
 
 def curve(figure: Figure, name: str, row: int) -> FloatArray:
     axis = "y" if row == 1 else f"y{row}"
-    (trace,) = (one for one in drawn(figure).data if one.name == name and one.yaxis == axis)
+    (trace,) = (trace for trace in drawn(figure).data if trace.name == name and trace.yaxis == axis)
     return np.asarray(trace.y, dtype=float)
 
 

@@ -197,9 +197,9 @@ def test_close_spans_merged_and_short_ones_lengthened() -> None:
 def test_every_mode_but_engaged_is_interval_with_name() -> None:
     assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
     assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
-    modes = [one for one in Mode for _ in range(10)]
+    modes = [mode for mode in Mode for _ in range(10)]
     intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
-    assert {one.label: (round(one.start, 3), round(one.stop, 3)) for one in intervals} == {
+    assert {interval.label: (round(interval.start, 3), round(interval.stop, 3)) for interval in intervals} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
     }  # fmt: skip
 
@@ -413,8 +413,8 @@ def test_commands_are_the_edges_of_pulses(osprey_gust: Scenario) -> None:
 
 def test_live_commands_replace_those_of_the_scenario(osprey_gust: Scenario) -> None:
     live = signal([5000, 5500], q=[0.0, 0.1])
-    commands = [one for one in summary.transients(osprey_gust, flight(u_m=live)) if one.kind == "command"]
-    assert [one.start for one in commands] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
+    commands = [transient for transient in summary.transients(osprey_gust, flight(u_m=live)) if transient.kind == "command"]
+    assert [command.start for command in commands] == [2.0, 4.0, 5.5]  # the scenario has q at 2, 4, 6 and 8 s, and more
 
 
 def test_slowest_settling_marks_transient_after_which_error_did_not_settle() -> None:

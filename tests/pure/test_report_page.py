@@ -158,7 +158,7 @@ def test_dark_page_has_own_colours_and_follows_scheme(browser: Browser, page: Pa
     browser.wait_for(f"{DRAWN} === 2")
     light = browser.run(look)
     assert light[0] == "rgb(255, 255, 255)"
-    assert all(one != other for one, other in zip(dark, light, strict=True))
+    assert all(dark_color != light_color for dark_color, light_color in zip(dark, light, strict=True))
     assert browser.console == []
 
 

@@ -70,8 +70,8 @@ def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scen
 
     async def steps(desk: Desk) -> None:
         state = await desk.ask("state")
-        assert {one["name"]: tuple(one["values"]) for one in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
-        assert {one["name"]: one["ranges"] for one in state["gains"]}["k_g"] == [[0.5 * base.k_g, 2.0 * base.k_g]]  # type: ignore[attr-defined]
+        assert {gain["name"]: tuple(gain["values"]) for gain in state["gains"]}["beta"] == base.beta  # type: ignore[attr-defined]
+        assert {gain["name"]: gain["ranges"] for gain in state["gains"]}["k_g"] == [[0.5 * base.k_g, 2.0 * base.k_g]]  # type: ignore[attr-defined]
         assert state["digest"] == state["logged"] == f"{base.digest():012x}"
         changed = await desk.ask("gains", digest=state["digest"], values={"k_g": [1.2 * base.k_g], "softening": [2.0]})  # type: ignore[attr-defined]
         assert (changed["undo"], changed["logged"]) == (1, state["digest"])  # the log is that of before

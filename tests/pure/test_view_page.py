@@ -184,7 +184,7 @@ def test_flight_with_noise_has_dozen_curves_that_are_not_flat(browser: Browser, 
         finally:
             browser.call("Emulation.clearDeviceMetricsOverride")
         # A chart is 83 pixels high; its grid has 20 lines at most.
-        assert len([one for one in curves if one["count"] > 50 and one["high"] - one["low"] > 20.0]) >= 12
+        assert len([curve for curve in curves if curve["count"] > 50 and curve["high"] - curve["low"] > 20.0]) >= 12
         assert browser.run("document.getElementById('mode').textContent") == "ENGAGED"
         hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")
         assert hosts == [address.split("/")[2]]
@@ -642,6 +642,6 @@ def test_gains_are_pending_until_they_applied_and_can_be_undone(
         browser.run("void document.getElementById('control-gust').click()")
         browser.wait_for(said("gust begins"))
         assert nodes.values["aircraft"]["gusts.vertical.speed"] == 3.0
-        refused = [one for one in browser.console if "403" not in str(one)]  # the wrong key
+        refused = [entry for entry in browser.console if "403" not in str(entry)]  # the wrong key
         assert refused == []
     controls[0].close()

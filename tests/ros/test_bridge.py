@@ -476,14 +476,16 @@ def test_bag_of_autopilot_played_into_dry_run_gives_y_and_what_would_be_sent(
     bag = tmp_path / "bag"
     topics = ("/ap/twist/filtered", "/ap/airspeed")
     parameters = (f"directory:={bag}", f"topics:=[{', '.join(topics)}]", "rate:=50.0")
-    recorder = start("flight_recorder.main", "--ros-args", *(word for one in parameters for word in ("-p", one)))
+    recorder = start("flight_recorder.main", "--ros-args", *(word for parameter in parameters for word in ("-p", parameter)))
     recorder.wait_for("ready")
     begin = len(autopilot.lines)
     setup.peer.until(lambda: len(autopilot.lines) > begin + 150)  # 3 s
     recorder.interrupt().succeed()
     autopilot.popen.kill()
-    recorded = [deserialize_message(one.data, TwistStamped) for one in stored_messages(bag) if one.topic == topics[0]]
-    rates = {(-one.twist.angular.y, one.twist.angular.x, -one.twist.angular.z) for one in recorded}
+    recorded = [
+        deserialize_message(message.data, TwistStamped) for message in stored_messages(bag) if message.topic == topics[0]
+    ]
+    rates = {(-message.twist.angular.y, message.twist.angular.x, -message.twist.angular.z) for message in recorded}
     assert len(recorded) > 100  # of 150
 
     setup.bridge()
@@ -522,7 +524,7 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup,
     assert (summary["outcome"], summary["engagements"]) == ("completed", [])
     assert summary["notes"][0].startswith("never engaged")
     assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]
-    counts = Counter(one.topic for one in stored_messages(run))
+    counts = Counter(message.topic for message in stored_messages(run))
     assert counts["/ap/twist/filtered"] > 100  # of 450
     assert counts["/ap/joy"] == 0  # a dry run
     assert not setup.joys

@@ -137,7 +137,9 @@ def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(start_node: Start, o
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.TRIM)
     resumed = len(ticks(peer_node).number)
     messages = peer_node.received["internals"]
-    peer_node.until(lambda: sum(channel(one, "dt") > 0.0 for one in messages[resumed:]) >= 3, each=lambda: peer_node.send(y))
+    peer_node.until(
+        lambda: sum(channel(message, "dt") > 0.0 for message in messages[resumed:]) >= 3, each=lambda: peer_node.send(y)
+    )
     log = ticks(peer_node)
 
     # the failsafe begins with the first tick at which the last y or y_m is stale
@@ -247,8 +249,8 @@ def test_gains_change_in_flight_bumpless(start_node: Start, osprey_gust: Scenari
     wait_for_messages(peer_node, "internals", 5, each=send)
     # With e = y the law moves u by K Lambda e dt + beta dt in a tick; the new gains alone would have moved it by more than 2 e.
     log = ticks(peer_node)
-    assert len({channel(one, "parameters") for one in messages[since:]}) == 2  # those before and after
-    laws = [one.controller.law_params() for one in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
+    assert len({channel(message, "parameters") for message in messages[since:]}) == 2  # those before and after
+    laws = [scenario.controller.law_params() for scenario in (osprey_gust, osprey_gust.vary(controller=CHANGED))]
     rate = np.max([law.input_scale * (law.K * law.Lambda * y + law.beta) for law in laws], axis=0)
     moved = np.abs(np.diff(log.u[since:], axis=0))
     assert (moved <= np.outer(log.dt[since + 1 :], rate) + EXACT).all()

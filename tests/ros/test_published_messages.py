@@ -121,7 +121,11 @@ class Px4:
 
     def publish(self) -> None:
         """Publish y, the mode, and u: elevator 0.02 rad. Offboard is entered with a heartbeat alone."""
-        commands = [(one.param2, one.param3) for one in self.received["VehicleCommand"][-1:] if one.command == DO_SET_MODE]
+        commands = [
+            (command.param2, command.param3)
+            for command in self.received["VehicleCommand"][-1:]
+            if command.command == DO_SET_MODE
+        ]
         for main, sub, nav_state in self.MODES:
             if commands == [(main, sub)] and self.received["OffboardControlMode"]:
                 self._status.nav_state = nav_state

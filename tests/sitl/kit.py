@@ -112,10 +112,10 @@ class Autopilot:
         parents = [psutil.Process(pid) for pid in pids if psutil.pid_exists(pid)]
 
         def is_one(process: psutil.Process, program: str) -> bool:
-            return any(Path(word).name == program for one in (process, *process.children()) for word in one.cmdline())
+            return any(Path(word).name == program for member in (process, *process.children()) for word in member.cmdline())
 
-        chosen = [next(one for one in parents if is_one(one, program)) for program in programs]
-        again = [(["ip", "netns", "exec", self.namespace, *one.cmdline()], one.environ()) for one in chosen]
+        chosen = [next(parent for parent in parents if is_one(parent, program)) for program in programs]
+        again = [(["ip", "netns", "exec", self.namespace, *process.cmdline()], process.environ()) for process in chosen]
         for parent in chosen:
             for process in (*parent.children(), parent):
                 process.kill()
@@ -453,7 +453,7 @@ class Px4(Autopilot):
                 now = time.time()  # the client ends with the answer; most of its time goes by before the question
                 found = re.search(r"timestamp: \d+ \(([\d.]+) .*xyz: \[(.*?)\]", answer, re.DOTALL)
                 if found is not None:
-                    asked.append((now - float(found[1]), np.array([float(one) for one in found[2].split(",")])))
+                    asked.append((now - float(found[1]), np.array([float(coordinate) for coordinate in found[2].split(",")])))
 
         def truth() -> Signal:
             stamps = np.round(np.array([t for t, _ in asked]) * 1e9).astype(np.int64)

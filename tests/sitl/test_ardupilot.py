@@ -55,15 +55,15 @@ def test_dry_run_measures_what_autopilot_logs(plane: ArduPlane) -> None:
     t, equivalent = plane.log("VFR_HUD", "airspeed")
     inside = (t > t_y[0]) & (t < t_y[-1])
     # the last field of ardupilot_msgs/msg/Airspeed is true over equivalent airspeed
-    ratio = np.mean([struct.unpack("<f", one.data[-4:])[0] for one in messages if one.topic == "/ap/airspeed"])
+    ratio = np.mean([struct.unpack("<f", message.data[-4:])[0] for message in messages if message.topic == "/ap/airspeed"])
     row = load_map(channel_map).outputs["V"]
     airspeed = (np.interp(t[inside], t_y, tape["y"]["V"]).mean() - row.offset) / (equivalent[inside].mean() * ratio)
-    assert {name: one.slope for name, one in compared.items()} == pytest.approx(dict.fromkeys(compared, 1.0), abs=0.01)
+    assert {name: fit.slope for name, fit in compared.items()} == pytest.approx(dict.fromkeys(compared, 1.0), abs=0.01)
     assert max(abs(compared[name].offset) for name in ("p", "q", "r", "phi", "theta", "psi")) < 0.01  # rad/s, rad
     assert max(abs(compared[name].offset) for name in ("north", "east", "altitude")) < 2.0  # m: home and the estimator's origin
     assert row.captured or airspeed == pytest.approx(1.0, abs=0.05)  # a captured V is 0 in a dry run
     assert "sample refused" not in (plane.run / "log" / "bridge.log").read_text(encoding="utf-8")
-    assert "/ap/joy" not in {one.topic for one in messages}, "a dry run sends nothing"
+    assert "/ap/joy" not in {message.topic for message in messages}, "a dry run sends nothing"
 
 
 def test_an_engaged_flight_tracks_its_commands(plane: ArduPlane) -> None:
@@ -282,8 +282,8 @@ def test_overloaded_machine_leaves_aircraft_to_law_or_to_pilot(plane: ArduPlane)
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale; then a release acts at once."""
     with engaged(plane, 60.0) as flight:
         plane.say("stick", "4", str(MARK))
-        for one in burn(3.0):
-            one.wait()
+        for process in burn(3.0):
+            process.wait()
         plane.engage("--off").succeed()
         released = time.time()
         assert sticks_act(plane, released) - released <= RC_PERIOD + LATE

@@ -173,8 +173,8 @@ def test_lost_transmitter_releases_within_a_second(px4: Px4, record_testsuite_pr
 def test_overloaded_machine_leaves_airplane_to_law_or_to_px4(px4: Px4) -> None:
     """Four busy processes a core for 3 s: the bridge stays engaged, or says what was stale, and PX4 flies in Hold."""
     with engaged(px4, 60.0) as flight:
-        for one in burn(3.0):
-            one.wait()
+        for process in burn(3.0):
+            process.wait()
         px4.engage("--off").succeed()
         px4.until(lambda state: state["nav_state"] == HOLD, timeout=OWN_LAW + LATE)
         flight.interrupt()
