@@ -146,7 +146,8 @@ settle = settings(max_examples=10, deadline=None, derandomize=True)
 
 @settle
 @given(task=TASKS)
-def test_signs_of_omega_are_those_from_which_it_was_built(task: Task) -> None:
+def test_signs_of_omega_are_as_built(task: Task) -> None:
+    """The signs of Omega = C B are the D of the random factors S D U behind the aircraft."""
     assert (signs(task.aircraft.C @ task.aircraft.B) == task.D).all()
     assert abscissa(task.aircraft.A) < 0.0
 

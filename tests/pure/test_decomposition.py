@@ -118,7 +118,8 @@ def test_sign_change_of_input_changes_own_d_only(Omega: FloatArray, data: st.Dat
 
 
 @given(matrices(), st.data())
-def test_units_of_inputs_and_outputs_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
+def test_units_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
+    """D is independent of the units of inputs and outputs."""
     # Far from the limit of 1e-9, which holds for equilibrated units and changes by a factor with other units.
     D = decomposed(Omega).D
     assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
@@ -127,7 +128,8 @@ def test_units_of_inputs_and_outputs_do_not_change_d(Omega: FloatArray, data: st
 
 
 @given(matrices(), st.data())
-def test_coupling_depends_on_neither_units_nor_signs_of_inputs(Omega: FloatArray, data: st.DataObject) -> None:
+def test_coupling_is_independent_of_inputs(Omega: FloatArray, data: st.DataObject) -> None:
+    """Neither the units nor the signs of the inputs change the coupling."""
     decomposed(Omega)
     assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
     units = data.draw(arrays(np.float64, len(Omega), elements=st.sampled_from([-57.3, -1.0, 0.01, 1.0, 8.0])))
@@ -147,7 +149,8 @@ def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None
 
 
 @given(matrices())
-def test_search_changes_only_input_signs_where_omega_has_s_d_u(Omega: FloatArray) -> None:
+def test_search_changes_only_input_signs(Omega: FloatArray) -> None:
+    """An Omega with S D U keeps the order of inputs and outputs."""
     D = decomposed(Omega).D
     pairing = pairing_of(Omega)
     assert pairing.outputs == pairing.inputs == tuple(range(len(Omega)))
@@ -170,7 +173,8 @@ def test_positive_diagonal_does_not_make_d_one() -> None:
     np.testing.assert_array_equal(U, [[1.0, 4.0], [0.0, 1.0]])
 
 
-def test_nonsingular_omega_without_s_d_u_refused_with_number_of_minor() -> None:
+def test_omega_without_s_d_u_refused() -> None:
+    """A nonsingular Omega with a zero leading minor is refused with the number of the minor."""
     with pytest.raises(DecompositionError, match=r"^Omega: found leading minor 1 zero .*, expected .*") as caught:
         decompose(EXCHANGE)
     assert caught.value.minor == 1
@@ -189,7 +193,8 @@ def test_nonsingular_omega_without_s_d_u_refused_with_number_of_minor() -> None:
     ],
 )
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
-def test_minor_that_is_zero_up_to_rounding_refused_in_any_unit(Omega: list[list[float]], minor: int, unit: float) -> None:
+def test_minor_zero_by_rounding_refused(Omega: list[list[float]], minor: int, unit: float) -> None:
+    """A leading minor that is zero up to rounding is refused in any unit of inputs and outputs."""
     units = unit ** np.arange(len(Omega))
     with pytest.raises(DecompositionError) as caught:
         signs(units[:, None] * np.array(Omega) / units[::-1])
@@ -200,7 +205,8 @@ def test_minor_that_is_small_only_in_units_accepted() -> None:
     np.testing.assert_array_equal(signs(np.diag([1e-200, 1e200])), [1.0, 1.0])
 
 
-def test_minor_of_one_part_in_million_still_has_sign() -> None:
+def test_minor_of_1e_6_has_sign() -> None:
+    """A leading minor of a millionth of its entries is not taken as zero."""
     # Published derivatives have two to five digits: a difference in the sixth digit must be accepted.
     np.testing.assert_array_equal(signs(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])), [1.0, -1.0])
 
@@ -215,7 +221,7 @@ def test_minor_of_one_part_in_million_still_has_sign() -> None:
         (np.array([[1.0, 0.0], [0.0, math.inf]]), r"Omega: found .*inf.*, expected finite values"),
     ],
 )
-def test_matrix_that_is_not_square_or_not_finite_refused(Omega: FloatArray, sentence: str) -> None:
+def test_matrix_not_square_or_finite_refused(Omega: FloatArray, sentence: str) -> None:
     for function in (decompose, signs, leading_minors, unit_diagonal, coupling, search):
         with pytest.raises(DecompositionError, match=sentence):
             function(Omega)
@@ -237,7 +243,8 @@ def test_textbook_elevator_sign_flips_the_first_d() -> None:
     assert pairing_of(trailing_edge_down).signs == (-1, 1, 1, 1)
 
 
-def test_rudder_paired_with_roll_rate_flips_d_and_makes_u_large() -> None:
+def test_rudder_paired_with_roll_flips_d() -> None:
+    """The rudder paired with the roll rate flips D and makes an entry of U large."""
     _, D, U = decompose(SWAPPED)
     np.testing.assert_array_equal(D, [1.0, 1.0, -1.0, 1.0])
     # By hand, on the block [[-0.02, 1.5], [0.17, -0.09]]: W_12 = -75, L_21 = -8.5, U_12 = W_12 + L_21.
@@ -253,7 +260,8 @@ def test_search_keeps_bad_pairing_unless_u_limited() -> None:
     assert float(np.max(np.abs(re_paired.U - np.eye(4)))) == pytest.approx(0.058, abs=5e-4)
 
 
-def test_search_changes_pairing_where_sign_changes_do_not_suffice() -> None:
+def test_search_changes_pairing_beyond_signs() -> None:
+    """Where no change of input signs gives D = I, the search changes the pairing."""
     assert pairing_of(EXCHANGE)[:3] == ((0, 1), (1, 0), (1, 1))
 
 
@@ -269,13 +277,15 @@ def test_search_finds_nothing_for_a_singular_omega() -> None:
     assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
 
 
-def test_coupling_is_infinite_where_output_does_not_respond_to_own_input() -> None:
+def test_coupling_without_own_response_is_infinite() -> None:
+    """The coupling is infinite where an output does not respond to the paired input."""
     assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
     with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
         unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))
 
 
-def test_uncertainty_of_50_percent_per_entry_does_not_change_d_of_osprey() -> None:
+def test_uncertainty_keeps_d_of_osprey() -> None:
+    """Changes of 50 % in the entries of Omega leave D of the osprey unchanged."""
     generator = np.random.default_rng(20101)
     for _ in range(1000):  # also none in 5000; with 90 % 2 to 4 in 10 000
         np.testing.assert_array_equal(signs(OSPREY * generator.uniform(0.5, 1.5, (4, 4))), np.ones(4))

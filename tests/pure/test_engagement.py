@@ -157,7 +157,8 @@ def undisturbed() -> list[Tick]:
     return fly(lambda k: Conditions())
 
 
-def test_loop_of_these_tests_equals_simulation_to_last_bit() -> None:
+def test_loop_equals_simulation_to_last_bit() -> None:
+    """The loop of this file gives the bits of the simulation."""
     u = simulate(SERVO.vary(flight={"duration": 3.0}))["u"]
     assert np.array([tick.after.u for tick in undisturbed()[: len(u.values)]]).tobytes() == u.values.tobytes()
 

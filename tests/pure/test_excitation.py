@@ -54,7 +54,8 @@ def test_live_page_offers_no_gains_of_timetable() -> None:
     assert gains_of(controller()) == {}
 
 
-def test_only_one_input_excited_at_time_and_none_in_pause() -> None:
+def test_inputs_are_excited_in_turn() -> None:
+    """Not more than one input is excited at a time, and no input in a pause."""
     active = excited(controller()) != 0.0
     assert active.sum(axis=1).max() == 1
     assert not active[: round(1.5 / DT)].any()

@@ -56,7 +56,8 @@ def test_radius_too_small_for_wind_refused() -> None:
     assert flyable_legs(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
 
 
-def test_at_low_speed_stall_limits_bank_and_with_it_radius() -> None:
+def test_stall_limits_bank_and_radius() -> None:
+    """At low speed the stall limits the bank, and the bank the radius."""
     # V = 29: acos((27.5 / 29)^2) = 25.95 deg, below the 30 of the parameters, so 39^2 / (g tan(20.76 deg)) = 409.1.
     assert number(refusal(CORNER, radius=300.0, speed=29.0)) == 410.0
 
@@ -88,7 +89,8 @@ def test_altitude_beyond_climb_to_next_point_refused(altitude: float, side: str,
     )
 
 
-def test_of_routes_of_tutorial_one_flown_and_one_refused_with_sentence_shown(tmp_path: Path) -> None:
+def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
+    """The triangle of the tutorial is planned, the short route refused with the sentence on the page."""
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
     guidance = find_scenario("osprey_route").guidance
     assert guidance is not None
@@ -110,7 +112,8 @@ def test_route_file_replaces_program_of_targets() -> None:
     assert [waypoint.speed for waypoint in flown.waypoints()] == [25.0, 26.0]
 
 
-def test_leg_too_short_for_fillets_and_route_of_one_waypoint_refused() -> None:
+def test_too_short_routes_refused() -> None:
+    """A leg too short for the fillets is refused, and a route of one waypoint."""
     short = (*CORNER, Waypoint(3500, 3000, 1000))
     assert refusal(short) == "route[3]: found 500 m from the waypoint before, expected more than 580 m, for fillets of 580 m"
     assert refusal(CORNER[:1]) == "route: found 1 waypoints, expected two or more"

@@ -280,7 +280,8 @@ def test_model_without_hidden_states_or_gravity_accepted() -> None:
     assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
 
 
-def test_gains_command_writes_nominal_model_on_request_and_section_reads_back(tmp_path: Path) -> None:
+def test_gains_command_writes_nominal_model(tmp_path: Path) -> None:
+    """The command writes the section on request only, and the section reads back."""
     path, scenario = tmp_path / "gains.yaml", tmp_path / "short.yaml"
     scenario.write_text(SERVO.path.read_text(encoding="utf-8").replace("duration: 60.0", "duration: 3.0"), encoding="utf-8")
     arguments = ["gains", "osprey", "--scenario", str(scenario), "--samples", "1", "--write", str(path)]
@@ -300,7 +301,8 @@ def test_gains_command_writes_nominal_model_on_request_and_section_reads_back(tm
         with_feedforward(other, load_airframe("osprey"))
 
 
-def test_beta_has_to_exceed_only_slew_that_feedforward_leaves() -> None:
+def test_feedforward_lowers_needed_beta() -> None:
+    """The gain beta has to exceed only the slew of the ideal input left over by the feedforward."""
     # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30 % in calm air the mean
     # remainder is 20 %, 17 %, 20 % and 37 % of the slew of elevator, thrust, aileron and rudder; the test allows half.
     airframe = load_airframe("osprey")

@@ -52,9 +52,8 @@ PAIRS = [
 @given(value=VALUES)
 @example(value=(1, 2.0))
 @example(value=10**400)
-def test_field_takes_what_strict_pydantic_takes_and_holds_same(
-    kind: Kind, adapter: pydantic.TypeAdapter[Any], value: object
-) -> None:
+def test_field_agrees_with_strict_pydantic(kind: Kind, adapter: pydantic.TypeAdapter[Any], value: object) -> None:
+    """A field takes the values that strict pydantic takes, and holds the same."""
     problems = Problems()
     held = kind.read(value, "key", problems)
     try:
@@ -98,13 +97,14 @@ class Outer(Config):
         ({"inner": {"a": 2.0}, 3: 2}, "set: found the key 3, expected a name"),
     ],
 )
-def test_sentence_names_key_what_was_found_and_what_expected(values: dict[Any, Any], sentence: str) -> None:
+def test_sentence_names_key_value_and_expectation(values: dict[Any, Any], sentence: str) -> None:
     with pytest.raises(ParameterError) as refused:
         Outer.validate_mapping(values, "set")
     assert str(refused.value) == sentence
 
 
-def test_set_is_frozen_and_comes_back_from_dump_and_json() -> None:
+def test_set_is_frozen_and_reads_back() -> None:
+    """A set is equal after a dump, and after JSON."""
     made = Outer(inner=Inner(a=2.0, b={"c": (1, 2)}))
     with pytest.raises(AttributeError, match="found an assignment"):
         made.scale = 3.0  # type: ignore[misc]
@@ -119,7 +119,8 @@ def test_set_is_frozen_and_comes_back_from_dump_and_json() -> None:
 
 
 @pytest.mark.parametrize("annotation", [Annotated[str, Field(gt=0)], Annotated[float, Field(min_length=1)], list[int], complex])
-def test_rule_or_type_that_no_parameter_has_is_error_of_declaration(annotation: Any) -> None:
+def test_unknown_rule_or_type_raises(annotation: Any) -> None:
+    """A rule or a type that no parameter has is an error of the declaration."""
     with pytest.raises(TypeError):
         kind_of(annotation)
 

@@ -108,7 +108,7 @@ CALLS: dict[str, Callable[..., Any]] = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_report_that_dies_at_any_write_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """A full disk at the n-th write of a report: each file has the old or the new content, and the outcome survives."""
     write_report(run, "completed")
     (run / REPORT).write_text("an older page", encoding="utf-8")

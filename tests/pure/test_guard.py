@@ -49,7 +49,7 @@ def test_single_sample_held_for_one_period() -> None:
     assert align([sample(0, 7.0)], 11 * MS, 10 * MS) is None
 
 
-def test_noise_of_closely_spaced_reference_samples_is_not_amplified() -> None:
+def test_close_reference_samples_amplify_no_noise() -> None:
     # Two samples 1 us apart differ by 1: the line through them is wrong by 8000 after 8 ms. The slope is taken from samples
     # that are at least a twentieth of the extrapolation limit apart, here the first and the last; otherwise the value is held.
     close = [StampedVector(2 * MS, np.array([1.0])), StampedVector(2 * MS + 1000, np.array([2.0]))]
@@ -84,14 +84,16 @@ def run(
     return states[1:]
 
 
-def test_waits_until_both_signals_received_then_engages_with_zero_input() -> None:
+def test_engages_with_zero_input() -> None:
+    """The controller waits for y and y_m, then engages with u = 0."""
     both = (30, sample(30, 1.0), [sample(20), sample(30)])
     modes = run((0, None, []), (10, sample(10, 1.0), []), (20, None, [sample(20)]), both)
     assert [state.mode for state in modes] == [Mode.WAITING, Mode.WAITING, Mode.WAITING, Mode.ENGAGED]
     assert modes[-1].u.tolist() == [0.0] * 4
 
 
-def test_each_new_sample_is_one_step_of_law_with_measured_dt() -> None:
+def test_new_sample_is_step_of_law() -> None:
+    """A new y is one step of the law, with the measured dt."""
     first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))
     law_state = engage(np.full(4, 1.0), np.zeros(4))
     _, u = step(law_state, np.full(4, 1.1), np.zeros(4), np.array(0.012), PARAMS.law_params())
@@ -114,7 +116,8 @@ def test_a_repeated_sample_changes_nothing() -> None:
     assert states[2].law is states[1].law
 
 
-def test_failsafe_holds_then_ramps_to_trim_and_fresh_samples_re_engage_without_jump(osprey_gust: Scenario) -> None:
+def test_failsafe_holds_ramps_and_re_engages(osprey_gust: Scenario) -> None:
+    """The input holds, then ramps to trim, and fresh samples re-engage the law without a jump of u."""
     params = osprey_gust.vary(controller={"max_age": 0.1, "hold": 0.2, "ramp": 0.4}).controller
     y, y_m = sample(10, 1.1), [sample(10)]
     states = run(
@@ -159,7 +162,7 @@ def test_deactivation_holds_or_ramps_input_as_configured(policy: str, osprey_gus
     assert (states[5].u == states[4].u).all()  # bumpless re-engagement
 
 
-def test_inactive_controller_commands_trim_before_first_engagement_once_it_has_y_and_y_m() -> None:
+def test_inactive_controller_commands_trim() -> None:
     """A bridge engages only with a fresh u, and activates the controller after that."""
     state, inputs = tick(guard.initial_state(4), 0, None, [sample(0)], active=False)
     assert (state.mode, inputs) == (Mode.INACTIVE, None)
@@ -182,7 +185,8 @@ STATES = st.builds(LawState, PAIRS, PAIRS, PAIRS, PAIRS)
 
 @pytest.mark.parametrize("sign", list(Sign))
 @given(state=STATES, y=PAIRS)
-def test_anti_windup_without_saturation_leaves_law_to_last_bit(sign: Sign, state: LawState, y: FloatArray) -> None:
+def test_anti_windup_leaves_unsaturated_law(sign: Sign, state: LawState, y: FloatArray) -> None:
+    """Without saturation the law is the same to the last bit."""
     law = TWO._replace(sign=sign)
     zero, dt = np.zeros(2), np.array(0.01)
     after, u = step(state, y, zero, dt, law)
@@ -192,9 +196,7 @@ def test_anti_windup_without_saturation_leaves_law_to_last_bit(sign: Sign, state
 
 
 @given(u=PAIRS, before=PAIRS, bound=st.floats(0.1, 5), rate=st.floats(0.1, 100))
-def test_saturation_keeps_limits_and_leaves_input_inside_them_unchanged(
-    u: FloatArray, before: FloatArray, bound: float, rate: float
-) -> None:
+def test_saturation_leaves_input_inside_limits(u: FloatArray, before: FloatArray, bound: float, rate: float) -> None:
     limits = limits_of(bound, rate)
     before = np.clip(before, -bound, bound)
     limited = saturate(u, before, np.array(0.01), limits)
@@ -229,7 +231,8 @@ def test_integrals_stop_only_in_direction_that_worsens_saturation(
     assert (limited_state.Pi <= np.maximum(state.Pi, free.Pi) + 1e-9).all()
 
 
-def test_input_reaches_limit_however_large_tick_of_integrals_is() -> None:
+def test_large_integral_tick_reaches_limit() -> None:
+    """The input reaches the limit for any size of the increments of the integrals."""
     # A step of Pi changes u by 0.5 0.01 3 = 0.015. Without scaling, u could end anywhere within 0.015 of the limit.
     limits = Limits(np.full(2, -np.inf), np.full(2, 0.01), np.full(2, np.inf))
     zero, e = np.zeros(2), np.array([-0.2, 0.2])

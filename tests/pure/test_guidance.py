@@ -44,7 +44,8 @@ def loop_damping(gain: float, frequency: float, damping: float) -> float:
     return float(np.min(-np.real(poles) / np.abs(poles)))
 
 
-def test_quarter_of_bandwidth_gives_bank_loop_damping_of_0_74() -> None:
+def test_bank_loop_has_damping_0_74() -> None:
+    """The gain is a quarter of the bandwidth of p."""
     # Known values of the same cubic: 0.48 with k = 2, 0.31 with 3, unstable from 2 zeta w = 9 on (Hurwitz).
     assert loop_damping(5.0 / 4.0, 5.0, 0.9) == pytest.approx(0.74, abs=0.01)
     assert loop_damping(2.0, 5.0, 0.9) == pytest.approx(0.48, abs=0.01)
@@ -52,7 +53,7 @@ def test_quarter_of_bandwidth_gives_bank_loop_damping_of_0_74() -> None:
 
 
 @pytest.mark.parametrize("phi", [-0.9, 0.0, 0.5])
-def test_bank_that_held_gives_rates_of_level_turn(phi: float) -> None:
+def test_held_bank_gives_level_turn_rates(phi: float) -> None:
     turn = GRAVITY * math.tan(phi) / SPEED
     rates = body_rates(phi, 0.0, phi, 0.0, turn * math.cos(phi), 0.0, SPEED, HOLD)
     assert rates == pytest.approx((0.0, turn * math.sin(phi), turn * math.cos(phi)), abs=1e-15)
@@ -81,7 +82,8 @@ def test_sideslip_to_right_turns_nose_right() -> None:
     assert body_rates(0.0, 0.0, 0.0, 0.0, 0.0, 0.1, SPEED, HOLD._replace(k_beta=1.0)).r == pytest.approx(0.1)
 
 
-def test_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_acceleration() -> None:
+def test_climb_rate_is_smooth_and_brakes() -> None:
+    """The climb rate is continuous in value and slope, and falls by half the acceleration."""
     free = CLIMB._replace(climb=1e3, sink=1e3)
     near, step = 1.0 / (2.0 * 0.2**2), 1e-6
     assert climb_for(near - step, free) == pytest.approx(climb_for(near + step, free), abs=1e-6)
@@ -94,7 +96,8 @@ def test_climb_rate_is_continuous_in_value_and_slope_and_brakes_at_half_accelera
 
 
 @pytest.mark.parametrize("stall_speed", [20.0, 60.0, 121.9, 133.0])
-def test_altitude_loop_keeps_margin_where_flight_path_lags_pitch(stall_speed: float) -> None:
+def test_altitude_loop_keeps_margin(stall_speed: float) -> None:
+    """The altitude loop has a gain margin of 2.5 where the flight path lags the pitch."""
     # theta = gamma_c + low-pass of (theta - gamma), T_L gamma_dot = theta - gamma, h_dot = V gamma. JSBSim's f16 at 154 m/s and
     # 12 km, V_s = 121.9 m/s, fell into a limit cycle of 22 s with k_h = 0.2 and T = 2 s.
     frequencies = (4.0, 1.2, 5.0, 4.0)
@@ -105,7 +108,8 @@ def test_altitude_loop_keeps_margin_where_flight_path_lags_pitch(stall_speed: fl
     assert np.max(np.real(Polynomial([2.49 * loop.k_h, 1.0, time, lag * time]).roots())) < 0.0  # a gain margin of 2.5
 
 
-def test_without_stall_speed_altitude_loop_is_that_of_path_which_follows_within_two_seconds() -> None:
+def test_altitude_loop_without_stall_speed() -> None:
+    """The default holds for a flight path that follows the pitch within two seconds."""
     loop = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0).params().vertical
     assert (loop.k_h, loop.alpha_time) == (0.2, 2.0)
     given = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=154.0, altitude_gain=0.3, alpha_time=1.0)
@@ -121,7 +125,8 @@ def test_pitch_settles_where_angle_of_attack_estimated() -> None:
     assert slewed(1.0, 2.0, 0.5, 0.1) == pytest.approx(1.05)
 
 
-def test_course_approached_on_shorter_side_and_with_all_it_has_beyond_90_degrees() -> None:
+def test_course_approached_on_shorter_side() -> None:
+    """Beyond 90 degrees the turn is the largest turn."""
     assert course_acceleration(math.radians(-170.0), math.radians(170.0), SPEED, 0.4) > 0.0  # to the right, over south
     assert course_acceleration(math.radians(135.0), 0.0, SPEED, 0.4) == 0.4 * SPEED
     assert course_acceleration(math.radians(30.0), 0.0, SPEED, 0.4) == pytest.approx(0.2 * SPEED)
@@ -141,7 +146,7 @@ def cross_track(e_0: float, times: FloatArray) -> FloatArray:
     return np.asarray(solution.y[0])
 
 
-def test_near_line_error_is_that_of_second_order_system() -> None:
+def test_error_near_line_is_second_order() -> None:
     # e'' + 2 zeta w e' + w^2 e = 0, w = 2 pi / P, from rest: its closed solution. 0.1 m is 1/6000 of v_g P zeta.
     times, zeta, w = np.linspace(0.0, 40.0, 81), 0.75, 2.0 * math.pi / 20.0
     damped = w * math.sqrt(1.0 - zeta**2)
@@ -158,14 +163,16 @@ def test_line_captured_from_far_at_capture_angle() -> None:
 
 
 @pytest.mark.parametrize("away", [180.0, 179.9, -179.0, 170.0])
-def test_on_course_opposite_to_line_aircraft_turns_with_all_it_has(away: float) -> None:
+def test_opposite_course_gives_largest_turn(away: float) -> None:
+    """An aircraft on the course opposite to a line turns with the largest acceleration."""
     full = 4.0 * math.pi * FOLLOW.damping / FOLLOW.period * SPEED
     turn = path_acceleration(PathError(0.0, 0.0, 0.0), math.radians(away), SPEED, FOLLOW)
     assert turn == pytest.approx(math.copysign(full, -away), rel=1e-9)  # a sine would leave 0.2 % of it at 179.9 deg
 
 
 @pytest.mark.parametrize("radius", [300.0, -300.0])
-def test_on_circle_acceleration_is_centripetal_and_drives_offset_back(radius: float) -> None:
+def test_acceleration_on_circle_is_centripetal(radius: float) -> None:
+    """On a circle the acceleration is centripetal, and drives an offset back."""
     orbit = Arc((0.0, 0.0), radius)
     on = path.error(orbit, (300.0, 0.0))  # to the north of the centre: east on a right turn, west on a left one
     assert on == pytest.approx((0.0, math.copysign(math.pi / 2.0, radius), 1.0 / radius))
@@ -198,12 +205,14 @@ def test_aircraft_that_slips_flies_on_circle() -> None:
     assert abs(offset_from_a_circle(estimated=True)) < 0.01  # m, of the integration in steps of 50 ms
 
 
-def test_roll_in_which_turn_lags_bank_is_no_sideslip() -> None:
+def test_roll_is_no_sideslip() -> None:
+    """In a roll the turn lags the bank; the estimate of the sideslip stays."""
     assert slip_estimate(0.5, 4.0, 0.0, 0.2, 0.02, 2.0) == 0.5
     assert slip_estimate(0.5, 4.0, 0.0, 0.1, 0.02, 2.0) == pytest.approx(0.5 + 0.5 * 3.5 * (1.0 - math.exp(-0.01)), rel=1e-12)
 
 
-def test_gyro_with_bias_is_no_sideslip_of_straight_flight() -> None:
+def test_gyro_bias_is_no_sideslip() -> None:
+    """In straight flight a bias of the gyro of r gives no sideslip."""
     # r reads 1 mrad/s too much at 154 m/s: unbounded, 0.15 m/s^2 would hold the aircraft 6.5 m beside a leg.
     slip = 0.0
     for _ in range(1000):
@@ -246,14 +255,14 @@ def test_a_fillet_touches_both_legs(side: float) -> None:
         ([(0.0, 0.0), (900.0, 0.0), (900.0, 300.0), (0.0, 300.0)], 200.0, r"route\[2\]: found 300 m .* more than 400 m"),
     ],
 )
-def test_route_that_cannot_be_flown_refused_with_what_would_do(
-    waypoints: list[tuple[float, float]], radius: float, sentence: str
-) -> None:
+def test_infeasible_route_refused_with_mend(waypoints: list[tuple[float, float]], radius: float, sentence: str) -> None:
+    """The sentence names a value that would do."""
     with pytest.raises(ParameterError, match=sentence):
         path.route(waypoints, radius, 100.0)
 
 
-def test_waypoints_on_straight_line_have_no_fillet_by_rounding() -> None:
+def test_straight_waypoints_have_no_fillet() -> None:
+    """Rounding makes no fillet of waypoints on a straight line."""
     waypoints = [(0.0, 0.0), (141.4213562373095, 989.9494936611666), (424.26406871192864, 2969.848480983499)]  # k (0.1, 0.7)
     first, second = (path.course_of(*leg) for leg in pairwise(waypoints))
     assert 0.0 < abs(second - first) < 1e-15  # the arc of such a turn has no length to draw: it divided by zero

@@ -77,7 +77,8 @@ def test_heading_altitude_and_airspeed_reached_and_held() -> None:
     assert np.degrees(np.abs(phi).max()) < 32.0  # the limit of 30 deg, and 2
 
 
-def test_short_route_flown_leg_by_leg_and_ends_in_orbit() -> None:
+def test_route_flown_and_ends_in_orbit() -> None:
+    """A short route is flown leg by leg."""
     points = {"north": [0.0, 400.0, 400.0], "east": [0.0, 0.0, 400.0], "altitude": [0.0, 0.0, 10.0]}
     tape = simulate(calm(60.0, route=points))
     leg, xtrack, altitude = channels(tape["guidance"], "leg", "xtrack", "pose.altitude")
@@ -87,7 +88,8 @@ def test_short_route_flown_leg_by_leg_and_ends_in_orbit() -> None:
     assert altitude[-1] == pytest.approx(10.0, abs=1.0)
 
 
-def test_corner_of_half_degree_flown_with_bank_of_half_degree() -> None:
+def test_small_corner_flown_with_small_bank() -> None:
+    """A corner of half a degree takes a bank of about a degree."""
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the osprey banked by 17 deg.
     points = {"north": [0.0, 400.0, 900.0], "east": [0.0, 0.0, 5.0], "altitude": [0.0, 0.0, 0.0]}
     phi, xtrack = channels(simulate(calm(22.0, route=points))["guidance"], "pose.phi", "xtrack")
@@ -136,7 +138,8 @@ def run(made: Guidance, first: int, last: int, rates: FloatArray | None = None) 
 
 
 @pytest.mark.parametrize("y_too", [False, True], ids=["pose alone", "then y too"])
-def test_stale_pose_levels_wings_by_dead_reckoning_then_stops_all_rates(y_too: bool) -> None:
+def test_stale_pose_levels_wings(y_too: bool) -> None:
+    """Dead reckoning levels the wings; later all rates are 0."""
     made = flying(hold=4.0)
     signal = run(made, 1, 300)
     mode, phi = signal["mode"], signal["state.phi"]
@@ -171,7 +174,8 @@ def test_shorter_route_replaces_one_on_later_leg(command: dict[str, float]) -> N
     assert signal["to_go"][0] == (0.0 if command else pytest.approx(900.0, abs=2.0))  # of the first leg
 
 
-def test_route_replaces_altitude_and_airspeed_that_were_commanded_before_engagement() -> None:
+def test_route_replaces_commands_before_engagement() -> None:
+    """The altitude and the airspeed of the route replace the commands given before engagement."""
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
     made.pause(paused=True, forget=False)
     made.take_target({"altitude": 500.0, "V": 21.0})
@@ -200,7 +204,8 @@ def test_new_route_voids_legs_of_program() -> None:
     assert signal["target.V"][-1] == 26.0
 
 
-def test_new_route_leaves_airspeed_of_program_step_with_leg() -> None:
+def test_new_route_leaves_program_airspeed() -> None:
+    """A new route voids the leg of a step of the program, not the airspeed."""
     route = {"north": [0.0, 900.0, 1800.0], "east": [0.0] * 3, "altitude": [100.0] * 3}
     steps = {"leg": {"start": [0.05], "value": [2.0]}, "V": {"start": [0.05], "value": [26.0]}}
     made, section = flying(route=route, program=steps), GuidanceConfig.validate_mapping(SECTION, "guidance")
@@ -211,7 +216,8 @@ def test_new_route_leaves_airspeed_of_program_step_with_leg() -> None:
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
-def test_route_that_sent_while_guidance_is_off_flown_from_engagement(by: str) -> None:
+def test_route_waits_for_engagement(by: str) -> None:
+    """A route sent while guidance is off is flown from the engagement on."""
     made, section = flying(), GuidanceConfig.validate_mapping(SECTION, "guidance")
 
     def switch(*, on: bool) -> None:
@@ -235,7 +241,8 @@ def test_route_that_sent_while_guidance_is_off_flown_from_engagement(by: str) ->
 
 
 @pytest.mark.parametrize("by", ["controller INACTIVE", "guidance/engage"])
-def test_commands_of_time_in_which_another_flew_are_not_flown(by: str) -> None:
+def test_commands_while_disengaged_are_void(by: str) -> None:
+    """Commands given while guidance did not fly are not flown afterwards."""
     made = flying(program={"heading": {"start": [0.05], "value": [2.0]}})
     made.take_target({"altitude": 300.0})
     if by == "guidance/engage":
@@ -270,7 +277,8 @@ def test_skip_on_last_leg_refused_and_leaves_commands() -> None:
     assert run(made, 4, 5)["target.altitude"][0] == 180.0
 
 
-def test_without_fresh_y_there_is_no_command_and_frozen_pose_refused() -> None:
+def test_stale_y_gives_no_command() -> None:
+    """Without a fresh y there is no u_m; a frozen pose is refused."""
     made = flying()
     assert made.step(400 * MS, 400 * MS) is None
     with pytest.raises(ChannelError, match="sample: stamp 0 s before the last one"):
@@ -281,7 +289,8 @@ def test_without_fresh_y_there_is_no_command_and_frozen_pose_refused() -> None:
 
 
 @pytest.mark.parametrize(("gap", "continues"), [(5, True), (50, False)])
-def test_after_short_pause_commands_go_on_from_last_ones(gap: int, continues: bool) -> None:
+def test_commands_continue_after_short_pause(gap: int, continues: bool) -> None:
+    """u_m goes on from the last u_m after a short pause, and starts again after a long pause."""
     made = flying()
     made.take_target({"phi": 0.5})
     before = run(made, 1, 9, np.zeros(4))
@@ -299,7 +308,8 @@ def test_after_short_pause_commands_go_on_from_last_ones(gap: int, continues: bo
     )  # a step of the slew limit; otherwise it starts from zero
 
 
-def test_new_command_continues_climb_rate_and_bounds_slew_of_u_m() -> None:
+def test_new_command_bounds_slew() -> None:
+    """The commanded climb rate continues, and the slew of u_m is bounded."""
     made = flying()
     made.take_target({"phi": 0.5, "climb": 2.0})
     signal = run(made, 1, 100, np.zeros(4))
@@ -324,7 +334,8 @@ def test_new_command_continues_climb_rate_and_bounds_slew_of_u_m() -> None:
         ({"leg": 0.0}, "target.leg: found no route, expected one"),
     ],
 )
-def test_command_that_cannot_be_flown_refused_and_changes_nothing(values: dict[str, float], sentence: str) -> None:
+def test_refused_command_changes_nothing(values: dict[str, float], sentence: str) -> None:
+    """A command that cannot be flown is refused."""
     made = flying()
     with pytest.raises(ChannelError, match=sentence):
         made.take_target(values)
@@ -355,7 +366,8 @@ def test_parameters_that_cannot_be_flown_are_refused(section: dict[str, Any], se
         GuidanceConfig.validate_mapping(SECTION | section, "guidance")
 
 
-def test_numbers_that_left_out_follow_from_other_sections() -> None:
+def test_omitted_numbers_follow_from_sections() -> None:
+    """Numbers left out follow from the remaining sections."""
     section = ROUTE.guidance
     assert section is not None
     assert (section.speed, section.natural_frequency) == (25.0, (4.0, 1.2, 5.0, 4.0))
@@ -389,7 +401,8 @@ def test_sections_that_do_not_fit_guidance_refused(changes: dict[str, Any], sent
         ROUTE.vary(**changes)
 
 
-def test_commands_beyond_bounds_of_reference_model_refused_and_flight_goes_on() -> None:
+def test_commands_beyond_reference_bounds_refused() -> None:
+    """Commands beyond the bounds of the reference model are refused, and the flight goes on."""
     turn = calm(6.0, program=program(heading=2.0)).vary(reference_model={"live": {"speed": 25.0, "bounds": {"p": 0.1}}})
     tape = simulate(turn)
     assert tape.outcome == "completed"
@@ -419,7 +432,8 @@ def test_scenario_with_guidance_restored_from_parameters(tmp_path: Path) -> None
     assert find_scenario("osprey_gust").guidance is None
 
 
-def test_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: Path) -> None:
+def test_empty_section_gives_guidance_by_rule(tmp_path: Path) -> None:
+    """Without the section there is no guidance."""
     before, route, after = ROUTE.path.read_text(encoding="utf-8").partition("/**/guidance:")
     path = tmp_path / "empty.yaml"
     rest = after[after.index("\n/**/") :]
@@ -431,13 +445,15 @@ def test_empty_section_is_guidance_by_rule_and_no_section_is_none(tmp_path: Path
     assert load_scenario(path).guidance is None
 
 
-def test_every_step_of_guided_flight_has_command_from_t_0_on() -> None:
+def test_guided_flight_commands_every_step() -> None:
+    """Every step from t = 0 on has a u_m."""
     tape = simulate(calm(1.0))
     assert tape["u_m"].stamp_ns.tolist() == [nanoseconds(0.02 * k) for k in range(51)]
     assert tape["u_m"].names == ("q", "V", "p", "r", "phi", "theta")
 
 
-def test_replay_computes_every_step_again_and_names_first_difference() -> None:
+def test_replay_names_first_different_step() -> None:
+    """Replay computes every step of guidance again."""
     scenario = calm(4.0, program=program(heading=0.5))
     tape = simulate(scenario)
     result = replay_guidance(tape, scenario.guidance)
@@ -488,7 +504,8 @@ def path_message(*points: tuple[float, float, float]) -> bytes:
     return bytes(typestore().serialize_cdr(types[PATH](header, poses), PATH))
 
 
-def test_route_that_arrives_in_flight_read_from_log_replayed_and_drawn(tmp_path: Path) -> None:
+def test_route_received_in_flight_is_logged(tmp_path: Path) -> None:
+    """A route received in flight is read from the log, replayed and drawn."""
     scenario = calm(3.0)
     section = scenario.guidance
     assert section is not None
@@ -547,7 +564,8 @@ def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: 
     assert sentence in str(result.exception)
 
 
-def test_climb_that_throttle_cannot_sustain_slows_and_leaves_airspeed() -> None:
+def test_steep_climb_slows_and_keeps_airspeed() -> None:
+    """A climb beyond the throttle becomes slower, and the airspeed stays."""
     # An engine that has lost most of its power gives 0.3 m/s^2 in place of 3.
     weak = calm(40.0, program=program(climb=2.5)).vary(aircraft={"actuators": {"upper": [0.5, 0.05, 0.5, 0.5]}})
     tape = simulate(weak)
@@ -563,5 +581,6 @@ def test_climb_that_throttle_cannot_sustain_slows_and_leaves_airspeed() -> None:
 @pytest.mark.parametrize(
     ("shortfall", "expected"), [(0.0, (-3, 2)), (1.96, (-3, 2)), (2.94, (-3, 1)), (9, (-3, 0)), (-9.0, (0, 2))]
 )
-def test_climb_and_sink_fall_with_departure_of_airspeed_from_command(shortfall: float, expected: tuple[float, float]) -> None:
+def test_airspeed_error_limits_climb_and_sink(shortfall: float, expected: tuple[float, float]) -> None:
+    """The limits of climb and sink fall with the error of the airspeed."""
     assert climb_range(2.0, 3.0, shortfall, 25.0) == pytest.approx(expected, abs=5e-3)  # d = 9.81 x 2 / (0.4 x 25) = 1.96

@@ -54,14 +54,15 @@ def test_implicit_sign_applies_saturated_sign_in_same_tick() -> None:
 
 
 @pytest.mark.equation(21)
-def test_implicit_sign_takes_value_that_makes_predicted_error_zero() -> None:
+def test_implicit_sign_zeroes_predicted_error() -> None:
     # From rest, e = 0.01: integral 0.0005, e_hat = 0.01 + 0.01 - 0.2 (0.01 + 3 0.0005) = 0.0177
     # s = 0.0177 / 0.04 = 0.4425, Pi = 0.1 4 0.4425 = 0.177, v = -(2 (0.01 + 0.0015) + 0.177) = -0.2
     assert respond(one_channel(Sign.IMPLICIT, D=1.0), [0.0, 0.01]) == pytest.approx([-0.1], abs=1e-15)
 
 
 @pytest.mark.equation(21)
-def test_softened_sign_is_proportional_inside_width_and_one_outside() -> None:
+def test_softened_sign_is_saturated_line() -> None:
+    """The softened sign is proportional inside the width and +-1 outside."""
     # e = 0.05, eps = 0.1: s = 0.5, Pi = 0.1 4 0.5 = 0.2, integral 0.0025: v = 2 (0.05 + 3 0.0025) + 0.2 = 0.315
     assert respond(one_channel(Sign.SOFT), [0.0, 0.05]) == pytest.approx([0.1575], abs=1e-15)
     # e = 1.2 from 1: s = 1, as with the implicit sign

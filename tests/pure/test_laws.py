@@ -191,7 +191,8 @@ def test_limits_that_are_not_reached_change_no_bit(name: str, bound: float) -> N
 
 
 @EVERY_LAW
-def test_limits_of_magnitude_and_rate_kept_for_any_error(name: str) -> None:
+def test_limits_hold_for_any_error(name: str) -> None:
+    """The limits of magnitude and rate hold for any error."""
     parameters = controller(name, lower=[-0.02] * 4, upper=[0.01] * 4, slew=[0.05] * 4)
     # u_o of lqg is 0.6 of the limits within 0.1 s: 0.09 /s
     generator, state, us = np.random.default_rng(1), guard.initial_state(4), [np.zeros(4)]
@@ -249,7 +250,8 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
     np.testing.assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
 
 
-def test_integral_of_pi_keeps_value_and_e_0_takes_difference() -> None:
+def test_retuned_pi_keeps_integral() -> None:
+    """A retuned PI law keeps the integral; e_0 takes the difference of u."""
     old, new = (controller("pi", K=[K] * 4, Lambda=[2.0] * 4).tuned_law() for K in (10.0, 4.0))
     state, _ = random_flight(old, 0.1)
     after = old.control_law.retune(state, old.params, new.params)
@@ -263,7 +265,8 @@ def test_integral_of_pi_keeps_value_and_e_0_takes_difference() -> None:
 
 
 @EVERY_LAW
-def test_every_law_flies_and_replay_equals_flight_in_every_bit(name: str) -> None:
+def test_every_law_flies_and_replays(name: str) -> None:
+    """Replay equals the flight to the last bit."""
     scenario = flight(name)
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
@@ -284,7 +287,8 @@ def test_layout_shows_integrals_that_law_has(name: str, groups: set[str]) -> Non
     assert {group for group in ("integral_e", "Pi") if f"{group}.q" in text} == groups
 
 
-def test_gains_change_in_flight_but_neither_law_nor_observer() -> None:
+def test_only_gains_change_in_flight() -> None:
+    """Neither the law nor the observer changes in flight."""
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
         assert not controller(name).tunable() & {"law", "observer", "feedforward", "outputs", "D", "rate"}
@@ -301,7 +305,8 @@ def test_a_replay_equals_a_flight_through_failsafes(name: str) -> None:
 
 @EVERY_LAW
 @pytest.mark.parametrize("dropout", [0.0, 0.3])
-def test_replay_behind_gap_of_log_continues_from_recorded_state(name: str, dropout: float) -> None:
+def test_replay_continues_behind_gap(name: str, dropout: float) -> None:
+    """Behind a gap of the log replay continues from the recorded state."""
     scenario = flight(name, {"sensors": {"dropout": dropout, "seed": 3}}, max_age=0.3)
     tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
     result = replay(tape, scenario.controller)
@@ -391,7 +396,8 @@ def test_a_state_is_restored_from_its_fields(name: str) -> None:
 
 
 @EVERY_LAW
-def test_law_is_same_under_numpy_and_jax_and_over_many_aircraft(name: str) -> None:
+def test_law_is_same_under_jax(name: str) -> None:
+    """A law gives the same under NumPy and JAX, and over many aircraft."""
     law = controller(name).tuned_law()
 
     def column(value: Any) -> Any:
@@ -461,7 +467,8 @@ def lqg_with_observer() -> ControlLaw:
     return controller("lqg, observer").tuned_law().control_law
 
 
-def test_correction_and_prediction_are_same_for_many_aircraft_with_own_matrices() -> None:
+def test_observer_is_same_for_many_aircraft() -> None:
+    """Correction and prediction are the same for many aircraft with different matrices."""
     generator = np.random.default_rng(1)
     s, m, N = 6, 2, 5
     limits = Limits(-np.full((m, 1), 0.5), np.full((m, 1), 0.5), np.full((m, 1), 20.0))
@@ -482,7 +489,8 @@ def test_correction_and_prediction_are_same_for_many_aircraft_with_own_matrices(
 
 
 @pytest.mark.parametrize(("periods", "predictions"), [(1, 0), (1.4, 0), (2, 1), (5, 4)])
-def test_n_periods_without_y_are_n_less_one_predictions(periods: float, predictions: int) -> None:
+def test_missed_periods_are_predicted(periods: float, predictions: int) -> None:
+    """Over n periods without a y there are n - 1 predictions."""
     parameters = controller("lqg, observer", feedforward=sections()["lqg, observer"]["feedforward"], max_age=0.5)
     Phi, Gamma, H, L, F = matrices(parameters)
     y = 1e-3 * np.array([1.0, -2.0, 3.0, -4.0])
@@ -581,7 +589,8 @@ def test_page_names_every_registered_law_and_parameters() -> None:
             assert f"`{word}`" in page, word
 
 
-def test_law_that_is_not_registered_refused_with_those_that_are() -> None:
+def test_unregistered_law_refused() -> None:
+    """The sentence lists the registered laws."""
     registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
     refused(f"controller.law: found 'adrc', expected a registered law: {registered}", COMMON | {"law": "adrc"})
     refused(f"controller.law: found 3, expected a registered law: {registered}", COMMON | {"law": 3})
@@ -704,7 +713,8 @@ def test_an_invalid_observer_is_refused(name: str) -> None:
     refused("controller.observer.part: found 1.5, expected less than or equal to 1", observed(part=1.5))
 
 
-def test_feedforward_with_other_signs_or_zero_in_right_half_plane_refused() -> None:
+def test_unfit_feedforward_refused() -> None:
+    """A nominal model with a different D is refused, and a model with a zero in the right half plane."""
     values = sections()["pi, observer"]
     B = np.reshape(values["feedforward"]["B"], (-1, 4))
     negative = values | {"feedforward": values["feedforward"] | {"B": (-B).ravel().tolist()}}
@@ -716,7 +726,8 @@ def test_feedforward_with_other_signs_or_zero_in_right_half_plane_refused() -> N
     refused("controller.feedforward.A: found zero dynamics with an eigenvalue at ", growing)
 
 
-def test_digest_knows_law_and_logs_without_law_keep_theirs() -> None:
+def test_digest_depends_on_law() -> None:
+    """Logs of versions without the key law keep the digest."""
     digests = {name: controller(name).digest() for name in (*NAMES, *OBSERVED)}
     assert len(set(digests.values())) == len(digests)
     named = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")

@@ -87,7 +87,7 @@ def test_step_of_aircraft_model_is_motion_of_equations() -> None:
     np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
 
 
-def test_step_of_extended_state_model_is_motion_of_equations() -> None:
+def test_extended_state_step_solves_equations() -> None:
     model, decay = osprey(), np.array([7.3, 5.8, 2.8, 4.6])
     sampled = observer_design.extended_state_model(model, NAMES, decay)
     generator = np.random.default_rng(3)
@@ -105,7 +105,8 @@ def one_of(design: ObserverDesign, k: int) -> ObserverDesign:
     return design._replace(Phi=design.Phi[k], Gamma=design.Gamma[k], L=design.L[k], F=design.F[k])
 
 
-def test_many_aircraft_and_weights_side_by_side_are_designs_of_each() -> None:
+def test_batched_designs_equal_single_designs() -> None:
+    """Designs for many aircraft and weights at once equal the single designs."""
     models, sets = uncertain(3), weights(3)
     many = observer_design.aircraft_observer(models, NAMES, sets)
     for k in range(3):

@@ -241,13 +241,15 @@ def close(a: FloatArray | float, b: FloatArray | float, tolerance: float) -> boo
 
 
 @pytest.mark.equation(4)
-def test_e_dot_and_so_r_of_4_are_derivative_of_3(loop: Loop) -> None:
+def test_r_of_4_differentiates_3(loop: Loop) -> None:
+    """e_dot of the simulation, and so r of (4), is the derivative of (3)."""
     for t in INSTANTS:
         assert close(loop.e_dot(t), differenced(loop.e, t), DIFFERENCED)
 
 
 @pytest.mark.equation(10, 11)
-def test_r_of_10_in_terms_of_plant_is_r_of_4(loop: Loop) -> None:
+def test_r_of_10_is_r_of_4(loop: Loop) -> None:
+    """(10) writes r of (4) in terms of the plant."""
     p = loop.p
     for t in INSTANTS:
         x, x_m, _, _ = loop.unpack(t)
@@ -271,13 +273,15 @@ def test_r_dot_of_12_is_derivative_of_r(loop: Loop) -> None:
 
 
 @pytest.mark.equation(13, 14, 15)
-def test_13_to_15_put_input_into_form_D_U_u_dot(loop: Loop) -> None:
+def test_13_to_15_give_input_form(loop: Loop) -> None:
+    """(13) to (15) put the input into the form D U u_dot."""
     for t in INSTANTS:
         assert close(loop.M @ loop.r_dot(t), loop.N(t) - loop.e(t) + loop.p.D * (loop.p.U @ loop.u_dot(t)), EXACT)
 
 
 @pytest.mark.equation(16, 17, 18)
-def test_16_to_18_N_is_N_d_plus_N_tilde(loop: Loop) -> None:
+def test_16_to_18_split_N(loop: Loop) -> None:
+    """N = N_d + N_tilde."""
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
         assert close(N_d + N_tilde + term, loop.N(t), EXACT)
@@ -308,7 +312,8 @@ def test_25_and_26_give_Phi_without_last_entry(loop: Loop) -> None:
 
 
 @pytest.mark.equation(27)
-def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
+def test_27_bounds_Phi() -> None:
+    """(27) holds where zeta_U bounds every entry of U."""
     # abs(Phi_i) <= zeta_U sum_(j>i) k_j abs(r_j); with a zeta_U below 0.9 max abs(U_ij), r along that j violates it.
     p = random_problem(4)
     above = np.triu(p.U, 1)
@@ -322,7 +327,8 @@ def test_27_bounds_Phi_where_zeta_U_bounds_every_entry_of_U() -> None:
 
 
 @pytest.mark.equation(32)
-def test_V1_dot_of_32_has_gain_22_as_three_squares(loop: Loop) -> None:
+def test_V1_dot_of_32_has_gain_22(loop: Loop) -> None:
+    """The gain (22) gives three squares in V1_dot of (32)."""
     k_g, k_d = 1.0, np.array([3.0, 1.5, 0.0])
     for t in INSTANTS:
         N_d, N_tilde, term = loop.split(t)
@@ -334,7 +340,8 @@ def test_V1_dot_of_32_has_gain_22_as_three_squares(loop: Loop) -> None:
 
 
 @pytest.mark.equation(24, 32, 46, 48)
-def test_V2_dot_is_quadratic_form_without_beta_and_without_N_d(loop: Loop) -> None:
+def test_V2_dot_is_quadratic_form(loop: Loop) -> None:
+    """V2_dot is a quadratic form without beta and N_d."""
     # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
     Q = decay_matrix(loop.p.plant(), loop.p.law())
     for t in INSTANTS:
@@ -368,7 +375,8 @@ def at_rest() -> Loop:
 
 
 @pytest.mark.equation(16, 17, 18)
-def test_at_rest_N_d_is_minus_D_U_times_slew_of_ideal_input() -> None:
+def test_N_d_at_rest_is_ideal_slew() -> None:
+    """At rest N_d = -D U times the slew of the ideal input."""
     # u* = Omega^-1 (y_m_dot - C A x - C f) keeps e = 0; beta has to exceed its slew along the flight.
     loop = at_rest()
     p = loop.p
@@ -391,7 +399,8 @@ def test_at_rest_N_d_is_minus_D_U_times_slew_of_ideal_input() -> None:
 
 
 @pytest.mark.equation(19)
-def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -> None:
+def test_N_tilde_of_18_contradicts_19() -> None:
+    """N_tilde as in (18) does not vanish with z, so (19) is false."""
     loop = at_rest()
     assert np.linalg.norm(loop.z(0.0)) < 1e-12
     _, N_tilde, term = loop.split(0.0)
@@ -399,7 +408,8 @@ def test_N_tilde_as_written_in_18_does_not_vanish_with_z_so_that_19_is_false() -
 
 
 @pytest.mark.equation(19)
-def test_N_tilde_vanishes_with_z_once_reference_term_moved_to_N_d(loop: Loop) -> None:
+def test_moved_reference_term_restores_19(loop: Loop) -> None:
+    """N_tilde vanishes with z once the term of the reference is part of N_d."""
     _, N_tilde, _ = at_rest().split(0.0)
     assert np.linalg.norm(N_tilde) < 1e-12
     p = loop.p  # for z != 0 it is linear in z, so (19) holds with a constant rho
@@ -412,7 +422,8 @@ def test_N_tilde_vanishes_with_z_once_reference_term_moved_to_N_d(loop: Loop) ->
 
 
 @pytest.mark.equation(30)
-def test_bound_in_30_has_two_indices_for_each_row_sums_own_entries_of_U() -> None:
+def test_bound_30_sums_row_of_U() -> None:
+    """The bound in (30) has two indices: row i sums the entries of row i of U."""
     # Psi = (D U D - I) beta Sgn(e): over all signs the maximum of its i-th entry is sum_(j>i) abs(U_ij) beta_j.
     p = random_problem(4)
     DUD = p.D[:, None] * p.U * p.D
@@ -434,7 +445,8 @@ def coupled_flight(beta: FloatArray) -> float:
 
 
 @pytest.mark.equation(30)
-def test_beta_that_counts_row_j_of_U_in_place_of_entry_ij_does_not_track() -> None:
+def test_beta_from_row_j_fails() -> None:
+    """A beta with row j of U in place of entry ij does not track."""
     # The last row of U has only its diagonal entry, so with this index the condition is beta_1 >= zeta_Nd,1 only.
     assert coupled_flight(np.array([2.1, 2.1])) > 5e-3  # measured 1.3e-2 for any period
 
@@ -454,14 +466,16 @@ def lemma_1_ratio(T: float) -> float:
 
 
 @pytest.mark.equation(40)
-def test_40_fails_for_bounded_e_that_tends_to_zero_with_bounded_derivative() -> None:
+def test_40_has_counterexample() -> None:
+    """(40) fails for a bounded e with a bounded derivative that tends to zero."""
     # (40) keeps the ratio below gamma_2 + (gamma_1 + sup abs(e)) / integral abs(e), which falls with T. For e = sin(t^2)/t,
     # abs(e_dot) <= 3, the ratio grows like T / log T, so no gamma_1, gamma_2 exist.
     assert [lemma_1_ratio(T) for T in (10.0, 100.0, 1000.0)] == pytest.approx([7.3, 41.8, 283.8], rel=0.01)
 
 
 @pytest.mark.equation(40)
-def test_gamma_2_of_sampled_law_with_literal_sign_grows_as_period_falls() -> None:
+def test_gamma_2_grows_as_period_falls() -> None:
+    """gamma_2 of the sampled law with the literal sign is not bounded over the period."""
     # Chatter decreases with dt, its slope more slowly: (29) with this gamma_2 requires a beta that grows without bound.
     ratios = []
     for dt in (0.02, 0.01, 0.005, 0.0025):
@@ -493,7 +507,8 @@ def replayed(cycle: counterexample.Cycle, e_dot_0: float, dt: float = 2e-4, acts
 
 
 @pytest.mark.equation(29)
-def test_for_every_beta_some_f_within_same_bounds_keeps_error_from_zero() -> None:
+def test_no_beta_serves_every_f() -> None:
+    """For every beta some f within the same bounds keeps the error from zero."""
     # K = 10, Lambda = 1, so Q = diag(1, 9) > 0, and abs(f_dot) <= 1. The formula is the limit of a large beta: 2.6 % at 2.
     for beta, tolerance in ((2.0, 0.03), (1000.0, 1e-3)):
         cycle = counterexample.limit_cycle(beta)
@@ -504,14 +519,16 @@ def test_for_every_beta_some_f_within_same_bounds_keeps_error_from_zero() -> Non
         assert np.all(cycle.multipliers < 1.0)
 
 
-def test_recorded_f_as_function_of_time_has_same_limit_under_sampled_law() -> None:
+def test_recorded_f_has_same_limit() -> None:
+    """The recorded f as a function of time leads the sampled law to the same limit."""
     # From 10 % beside the cycle. Measured 2.9 % below it at 0.2 ms and 0.3 % at 0.05 ms.
     cycle = counterexample.limit_cycle(2.0)
     assert replayed(cycle, 1.1 * cycle.e_dot[0]) == pytest.approx(np.max(cycle.e), rel=0.05)
     assert replayed(cycle, 1.1 * cycle.e_dot[0], acts=0.0) < 1e-9
 
 
-def test_same_f_lets_error_vanish_from_rest_or_at_longer_period() -> None:
+def test_same_f_allows_convergence() -> None:
+    """The same f lets the error vanish from rest, and at a longer period."""
     # beta exceeds abs(f_dot), so e = 0 solves the loop too. The theorem claims convergence from every start. At beta = 20 the
     # cycle attracts so weakly that the sampling of 0.2 ms takes the law off it.
     cycle, weak = counterexample.limit_cycle(2.0), counterexample.limit_cycle(20.0)
@@ -520,7 +537,8 @@ def test_same_f_lets_error_vanish_from_rest_or_at_longer_period() -> None:
 
 
 @pytest.mark.equation(47)
-def test_with_U_identity_classical_condition_keeps_P_positive_without_lemma_1() -> None:
+def test_classical_condition_replaces_lemma_1() -> None:
+    """With U = I the classical condition keeps P positive."""
     # beta_i > sup abs(N_d,i) + sup abs(N_d,i_dot) / Lambda_i and zeta_b = sum beta_i abs(e_i(0)) - e(0)' N_d(0).
     case = example(0.005, 15.0)
     S, D = decompose(case.plant.C @ case.plant.B)[:2]
@@ -535,7 +553,8 @@ def test_with_U_identity_classical_condition_keeps_P_positive_without_lemma_1() 
     assert np.min(zeta_b + signals.P) > 0.0
 
 
-def test_matrix_without_leading_minor_has_no_decomposition_though_it_can_be_inverted() -> None:
+def test_invertible_matrix_may_lack_decomposition() -> None:
+    """A matrix with a leading minor of zero has no decomposition."""
     # (S D U)_11 = S_11 d_1 is never zero, so no choice of S, D, U gives [[0, 1], [1, 0]].
     with pytest.raises(DecompositionError, match="leading minor 1"):
         decompose(np.array([[0.0, 1.0], [1.0, 0.0]]))
@@ -585,7 +604,8 @@ def behind_a_servo(T_eps: float) -> float:
     return float(np.max(np.abs(flight.x[-2000:, 0])) / eps)
 
 
-def test_softened_sign_settles_behind_servo_within_limit_of_routh() -> None:
+def test_softened_sign_settles_within_routh_limit() -> None:
+    """The loop with a servo settles inside the limit of Routh."""
     # Lambda + 1/T_eps < 1/tau, so T_eps > 20.4 ms at Lambda = 1, and somewhat more for the lag of sampling, 0.75 ms.
     assert behind_a_servo(0.8 * 0.0204) > 0.5  # measured 1.5: a limit cycle, because s saturates
     assert behind_a_servo(1.2 * 0.0204) < 0.01  # measured 8e-4 and falling
@@ -608,19 +628,22 @@ def gravity_slope(q: float) -> float:
 
 
 @pytest.mark.equation("Assumption 2")
-def test_f_dot_of_gravity_grows_with_pitch_rate_so_that_assumption_2_presumes_bounded_flight() -> None:
+def test_f_dot_grows_with_pitch_rate() -> None:
+    """f_dot of gravity grows with q, so Assumption 2 presumes a bounded flight."""
     assert [gravity_slope(q) for q in (1.0, 10.0, 100.0)] == pytest.approx([-GRAVITY, -10.0 * GRAVITY, -100.0 * GRAVITY])
 
 
 @pytest.mark.equation("Assumption 2")
-def test_f_dot_of_gravity_bounded_by_z_once_part_with_q_minus_q_m_is_in_N_tilde() -> None:
+def test_f_dot_is_bounded_by_z() -> None:
+    """f_dot of gravity is bounded by z once the part with q - q_m is in N_tilde."""
     q_m = 0.1
     for e_q in (-10.0, -0.1, 0.1, 10.0):
         assert abs(gravity_slope(q_m + e_q) - gravity_slope(q_m)) <= GRAVITY * abs(e_q) * (1.0 + 1e-6)
 
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
-def test_bound_7_cannot_hold_at_every_instant_for_alpha_leaves_trim_in_gust_while_e_is_zero() -> None:
+def test_bound_7_fails_in_gust() -> None:
+    """In a gust alpha leaves trim while e is zero, so (7) cannot hold at every instant."""
     # The ideal input keeps the outputs at trim, x_m = 0: z = 0, but alpha rises to 21.1 deg, so x_u <= c1 norm(z) is false.
     aircraft = osprey(gust=10.12)
     C, B = aircraft.C, aircraft.B
@@ -643,14 +666,16 @@ def largest_y_m_ddot(model: Model, rise: float) -> float:
     return float(np.max(np.abs(np.diff(y_m, 2, axis=0)))) / dt**2
 
 
-def test_step_command_through_first_order_model_makes_N_d_unbounded() -> None:
+def test_first_order_model_unbounds_N_d() -> None:
+    """A step command through a model of first order makes N_d unbounded."""
     # y_m_ddot contains C B_m u_m_dot = 4 / rise: a tenth of the rise needs ten times the beta, and no beta suffices for a step.
     first_order = Model(np.array([[-4.0]]), np.array([[4.0]]), np.array([[1.0]]))
     peaks = [largest_y_m_ddot(first_order, rise) for rise in (0.1, 0.01, 0.001)]
     assert peaks == pytest.approx([40.0, 400.0, 4000.0], rel=0.1)  # measured 37, 396, 3997
 
 
-def test_second_order_model_keeps_N_d_bounded_whatever_step() -> None:
+def test_second_order_model_bounds_N_d() -> None:
+    """N_d stays bounded for any step."""
     # C B_m = 0, and y_m_ddot <= omega^2 = 16.
     model = second_order(np.array([4.0]), np.array([0.9]))
     assert all(largest_y_m_ddot(model, rise) < 16.1 for rise in (0.1, 0.01, 0.001))

@@ -198,7 +198,8 @@ def test_name_too_long_for_file_is_unknown_name(name: str) -> None:
             find(name)
 
 
-def test_airframe_file_with_invalid_yaml_or_duplicate_key_is_one_sentence(tmp_path: Path) -> None:
+def test_bad_airframe_file_is_one_sentence(tmp_path: Path) -> None:
+    """Invalid YAML and a duplicate key are refused in one sentence."""
     bad = tmp_path / "bad.yaml"
     whole = (LIBRARY / "osprey.yaml").read_text(encoding="utf-8")
     for text, what in (

@@ -26,7 +26,8 @@ def locked(*senders: tuple[str, int]) -> PublisherLock:
     return lock
 
 
-def test_samples_of_conflicting_publisher_ignored_until_first_one_times_out() -> None:
+def test_conflicting_publisher_ignored_until_timeout() -> None:
+    """Samples of a second publisher are ignored until the first publisher times out."""
     lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
     for other in ("/aircraft#2", "/foreign", ""):
         sentence = f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
@@ -36,7 +37,8 @@ def test_samples_of_conflicting_publisher_ignored_until_first_one_times_out() ->
     lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time
 
 
-def test_restarted_node_takes_over_after_age_limit_and_another_node_later() -> None:
+def test_restarted_node_takes_over_earlier() -> None:
+    """A restarted node takes over after the age limit, a different node later."""
     lock = locked(("/aircraft#1", 0))
     lock.check("/aircraft#2", MAX_AGE + 1, MAX_AGE, TAKEOVER)
     with pytest.raises(ChannelError):

@@ -193,7 +193,8 @@ def test_filtered_difference_of_ramp_converges_to_slope() -> None:
     assert state.e_dot.item() == pytest.approx(0.3 * (1.0 - np.exp(-12.6 * 3.0)), rel=1e-9)
 
 
-def test_predictor_of_l1_estimates_constant_disturbance_in_one_tick() -> None:
+def test_l1_estimates_disturbance_in_one_tick() -> None:
+    """The predictor of L1 estimates a constant disturbance."""
     model = integrator()
     flight = fly(*law_of("l1", model, K=3.0, bandwidth=20.0), 3, 0.1, 0.7, model)
     x = l1.ADAPTATION_POLE * DT
@@ -260,7 +261,8 @@ def reaching(e_0: float) -> float:
     return float((np.flatnonzero(np.abs(flight.y) > 1e-4 * e_0)[-1] + 1) * model.period)
 
 
-def test_reaching_time_of_super_twisting_is_proportional_to_root_of_initial_error() -> None:
+def test_super_twisting_reaching_time() -> None:
+    """The reaching time is proportional to the root of the initial error."""
     # e(t) = c E(t / sqrt(c)) solves it for any c where E does: an exponential would take as long from anywhere.
     # 1 %: with steps of 0.2 ms the sliding is within 1e-7, the arrival within some ten steps of 1 s
     assert reaching(4.0) == pytest.approx(2.0 * reaching(1.0), rel=0.01)
@@ -285,7 +287,8 @@ def test_pi_is_the_law_without_its_sign(osprey: NominalModel) -> None:
     np.testing.assert_allclose(u, -osprey.input_scale[:, None] * K * (5.0 + Lambda * 12.5 * DT) * e, rtol=1e-12)
 
 
-def test_observer_converges_to_states_wind_and_disturbance_of_model(osprey: NominalModel) -> None:
+def test_observer_converges(osprey: NominalModel) -> None:
+    """The estimates converge to states, wind and disturbance of the model."""
     values = initial_gains(LAWS["lqg"], osprey) | {"wind_time": np.full((3, 1), 0.6)}  # s: faster than the 30 s below
     _, params = law_of("lqg", osprey, **values)
     Phi, Gamma, H, correction = params.Phi[..., 0], params.Gamma, params.H, params.L[..., 0]
@@ -318,7 +321,8 @@ def test_contribution_of_observer_bounded_for_any_measurement() -> None:
     assert np.abs(np.diff([0.0, *added])).max() == pytest.approx(part * DT / observed.WITHIN, rel=1e-9)
 
 
-def test_with_zero_observer_gain_law_is_one_with_feedforward(osprey: NominalModel) -> None:
+def test_zero_observer_gain_leaves_feedforward(osprey: NominalModel) -> None:
+    """With an observer gain of 0 the law equals the law with feedforward alone."""
     control_law, params = law_of("rise_observer", osprey)
     params = params._replace(F=0.0 * params.F)
     rng, laws_ = np.random.default_rng(1), (control_law, LAWS["rise_ff"].control_law(osprey))
@@ -330,7 +334,8 @@ def test_with_zero_observer_gain_law_is_one_with_feedforward(osprey: NominalMode
         assert np.array_equal(u, without)  # to the last bit
 
 
-def test_anti_windup_stops_integral_in_saturation_and_releases_it_on_way_back() -> None:
+def test_anti_windup_stops_and_releases_integral() -> None:
+    """The integral stops in saturation, and moves on the way back."""
     integral = conditional_integration(np.zeros(3), np.ones(3), np.ones(3), np.array([0.5, -0.5, 0.0]))
     assert integral.tolist() == [0.0, 1.0, 1.0]
 
@@ -345,7 +350,8 @@ def test_every_law_keeps_limits_and_recovers_from_saturation(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(LAWS))
-def test_every_law_is_same_under_numpy_and_jax_and_over_fleet(name: str, osprey: NominalModel) -> None:
+def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
+    """A law gives the same under NumPy and JAX, and over a fleet."""
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
     shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
     looks = [Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes)) for _ in range(4)]

@@ -49,7 +49,8 @@ KML_POINTS = "".join(
 
 @pytest.mark.parametrize("latitude", [-89.0, -33.9, 0.0, 47.4, 78.2])
 @pytest.mark.parametrize("longitude", [-179.999, 8.5, 179.999])  # beside the date line
-def test_north_and_east_are_those_of_plane_that_touches_ellipsoid(latitude: float, longitude: float) -> None:
+def test_north_and_east_of_tangent_plane(latitude: float, longitude: float) -> None:
+    """North and east belong to the plane tangent to the ellipsoid at the origin."""
     for north, east in ((0.0, 0.0), (1e3, -2e3), (-5e4, 5e4)):
         lat, lon, up = pymap3d.enu2geodetic(east, north, 0.0, latitude, longitude, 0.0)
         expected = pymap3d.geodetic2enu(lat, lon, 0.0, latitude, longitude, 0.0)
@@ -59,7 +60,8 @@ def test_north_and_east_are_those_of_plane_that_touches_ellipsoid(latitude: floa
         assert local(lat, lon, Origin(latitude, longitude)) == pytest.approx((north * share, east * share), abs=0.5)
 
 
-def test_at_largest_distance_plane_is_4_m_short_of_ground() -> None:
+def test_plane_errs_by_4_m() -> None:
+    """At the largest distance the plane is 4 m short of the ground."""
     lat, lon = 47.4, 8.5 + math.degrees(MAX_DISTANCE / (SEMI_MAJOR * math.cos(math.radians(47.4))))
     on_ground, _ = vdist(47.4, 8.5, lat, lon)
     assert on_ground - math.hypot(*local(lat, lon, ZURICH)) == pytest.approx(4.1, abs=0.1)
@@ -96,7 +98,8 @@ def test_speed_read_where_format_has_one(tmp_path: Path) -> None:
     assert [waypoint.speed for waypoint in read_route(path, ZURICH)] == [None, 31.5]
 
 
-def test_points_beside_line_are_no_part_of_route_and_may_be_anything(tmp_path: Path) -> None:
+def test_points_beside_line_ignored(tmp_path: Path) -> None:
+    """Points beside a LineString are no part of the route, and may hold anything."""
     line_alone, both = tmp_path / "r.geojson", tmp_path / "both.geojson"
     line_alone.write_text(json.dumps(line()), encoding="utf-8")
     both.write_text(json.dumps({"features": [point([8.5, 47.4]), line()]}), encoding="utf-8")  # a place without an altitude

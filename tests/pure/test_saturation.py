@@ -109,7 +109,8 @@ def test_anti_windup_loses_bank_that_saturated_ailerons_missed() -> None:
 GUST = GUSTS["vertical"] | {"start": 2.0}
 
 
-def test_anti_windup_leaves_third_of_pitch_rate_error_after_gust() -> None:
+def test_anti_windup_shrinks_error_after_gust() -> None:
+    """A third of the pitch rate error is left after a gust."""
     # Measured 0.0373 rad/s guarded, 0.121 unguarded. The prototype: 0.037 and 0.121.
     largest = {}
     for guarded in (True, False):
@@ -153,7 +154,8 @@ def test_rate_limit_above_demand_changes_nothing() -> None:
     assert error(rudder_flight(60.0)).values.tobytes() == error(rudder_flight(300.0)).values.tobytes()
 
 
-def test_rudder_of_40_deg_per_s_settles_and_one_of_30_has_limit_cycle() -> None:
+def test_slow_rudder_has_limit_cycle() -> None:
+    """A rudder of 40 deg/s settles, a rudder of 30 deg/s does not."""
     # Measured at the end: 3e-4 rad/s at 40 deg/s, 0.42 at 30. beta is 40 deg/s of rudder; in the prototype
     # the limit cycle starts at 40. Both rudders reach their rate limit and keep it.
     for rate_deg in (40.0, 30.0):
@@ -162,7 +164,8 @@ def test_rudder_of_40_deg_per_s_settles_and_one_of_30_has_limit_cycle() -> None:
     assert end_of_r(rudder_flight(30.0)) > 0.3
 
 
-def test_with_literal_sign_rudder_of_40_deg_per_s_has_limit_cycle() -> None:
+def test_literal_sign_has_limit_cycle() -> None:
+    """With the literal sign a rudder of 40 deg/s has a limit cycle."""
     # Measured at the end: 0.45 rad/s at 40 deg/s; 0.03 at 60, which is the chatter of the literal sign with a servo.
     assert end_of_r(rudder_flight(40.0, sign="literal")) > 0.3
     assert end_of_r(rudder_flight(60.0, sign="literal")) < 0.05
@@ -187,7 +190,8 @@ def signals(tape: Tape) -> Mapping[str, bytes]:
     }
 
 
-def test_anti_windup_without_saturation_leaves_flight_to_last_bit() -> None:
+def test_anti_windup_leaves_unsaturated_flight() -> None:
+    """Without saturation the flight is the same to the last bit."""
     # The whole scenario, gusts and commands, with every limit of the actuators as a limit of the controller: none is reached.
     pulses = find_scenario("osprey_servo").reference_model.model_dump()["pulses"]
     whole = SERVO.vary(aircraft={"gusts": GUSTS}, reference_model={"pulses": pulses})

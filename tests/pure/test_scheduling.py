@@ -53,7 +53,7 @@ print([(one / "sched").read_text() for one in THREADS.iterdir()])
     [(("--fifo", "50"), 48), (("--rr", "50"), 48), (("--fifo", "2"), 1), (("--other", "0"), 0)],
     ids=["FIFO", "round robin", "no lower one", "default policy"],
 )
-def test_lowered_real_time_priority_is_that_of_threads_that_follow(policy: tuple[str, str], priority: int) -> None:
+def test_later_threads_inherit_lowered_priority(policy: tuple[str, str], priority: int) -> None:
     code = """
 import os, threading
 from flight_core.scheduling import lower_real_time_priority
@@ -68,7 +68,8 @@ thread.join()
 
 
 @pytest.mark.parametrize("policy", [("--fifo", "50"), ("--batch", "0")], ids=["FIFO", "no real-time priority"])
-def test_command_leaves_real_time_priority_with_all_of_threads_and_no_other_policy(policy: tuple[str, str]) -> None:
+def test_command_leaves_real_time_priority(policy: tuple[str, str]) -> None:
+    """Every thread leaves the real-time priority; a different policy stays."""
     code = """
 import os, threading
 from flight_core.scheduling import *

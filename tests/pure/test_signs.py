@@ -48,14 +48,16 @@ def first(t: FloatArray, values: FloatArray, bound: float) -> float:
 
 
 @pytest.mark.parametrize("scenario", [pytest.param(CALM_SERVO, id="servos"), pytest.param(UNLIMITED, id="no limits")])
-def test_elevator_with_trailing_edge_down_positive_tracks_with_right_d(scenario: Scenario, tmp_path: Path) -> None:
+def test_flipped_elevator_tracks_with_right_d(scenario: Scenario, tmp_path: Path) -> None:
+    """The trailing edge down is positive."""
     # D = (-1, 1, 1, 1). Measured rms of q: 1.97 mrad/s through servos, 1.95 without limits; the prototype: 2.0 and 2.2.
     right = trailing_edge_down(scenario, tmp_path).vary(controller={"D": [-1, 1, 1, 1]}, flight={"duration": 30.0})
     sixty_seconds = error_metrics(error(simulate(right))["q"]).rms * math.sqrt(30.0 / 60.0)  # no events for q after 30 s
     assert sixty_seconds <= 0.0022
 
 
-def test_sign_change_in_airframe_and_in_d_gives_same_flight_to_last_bit(tmp_path: Path) -> None:
+def test_sign_in_airframe_and_d_cancels(tmp_path: Path) -> None:
+    """A sign change in the airframe and in D gives the same flight to the last bit."""
     original = CALM_SERVO.vary(flight={"duration": 4.0})
     changed = trailing_edge_down(original, tmp_path).vary(controller={"D": [-1, 1, 1, 1]})
     nose_up, nose_down = simulate(original), simulate(changed)
@@ -64,7 +66,8 @@ def test_sign_change_in_airframe_and_in_d_gives_same_flight_to_last_bit(tmp_path
     assert np.abs(nose_up["u"]["elevator"]).max() > 0.0
 
 
-def test_elevator_with_trailing_edge_down_positive_diverges_with_identity_d_at_first_command(tmp_path: Path) -> None:
+def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
+    """With the trailing edge down positive the flight diverges at the first command."""
     # Diverged: abs(e_q) above 1 rad/s, ten times the command. Measured at 2.38 s, 0.38 s after it; the prototype: 2.38 s.
     # It grows further, by a factor of e each 0.08 s, to more than 1e5 rad/s 1.4 s after the command.
     tape = simulate(trailing_edge_down(UNLIMITED, tmp_path).vary(flight={"duration": 3.4}))
@@ -110,7 +113,8 @@ def swapped_law(aircraft: Aircraft, D: list[float], factor: float) -> LawParams:
     return law_params([18.0, 2.0, 18.0 * factor, 9.0], [5.0, 0.5, 5.0, 3.0], [29.4, 7.8, 22.5, 10.2], D, input_scale=scale)
 
 
-def test_rudder_before_aileron_with_right_d_is_poor_and_improves_with_k_p(swapped: Aircraft, manoeuvre: FloatArray) -> None:
+def test_rudder_first_is_poor(swapped: Aircraft, manoeuvre: FloatArray) -> None:
+    """Rudder before aileron with the right D tracks poorly, and better with a larger K of p."""
     # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
     # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
     rms = {}
@@ -127,9 +131,8 @@ def test_rudder_before_aileron_with_right_d_is_poor_and_improves_with_k_p(swappe
 
 
 @pytest.mark.parametrize("factor", [1.0, 5.0, 25.0])
-def test_rudder_before_aileron_with_identity_d_diverges_at_first_roll(
-    swapped: Aircraft, manoeuvre: FloatArray, factor: float
-) -> None:
+def test_rudder_first_diverges_with_identity_d(swapped: Aircraft, manoeuvre: FloatArray, factor: float) -> None:
+    """Rudder before aileron diverges at the first roll."""
     # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, for each K_3. The prototype: at 12 s, its first
     # command of p; with the same commands this loop diverges at 12.03 s.
     errors = fly(swapped, swapped_law(swapped, [1.0, 1.0, 1.0, 1.0], factor), manoeuvre, FAST, bound=1.0)
@@ -155,19 +158,22 @@ def fly_small(D: list[float], K: list[float]) -> FloatArray:
 
 
 @pytest.mark.parametrize("K", [[1.0, 1.0], [2.0, 2.0], [5.0, 5.0], [20.0, 5.0], [5.0, 20.0], [50.0, 20.0]], ids=str)
-def test_negative_determinant_with_identity_d_diverges_for_every_k(K: list[float]) -> None:
+def test_negative_determinant_diverges_with_identity_d(K: list[float]) -> None:
+    """A negative determinant with D = I diverges for every K."""
     # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the prototype: 0.66 to 1.6 s.
     assert len(fly_small([1.0, 1.0], K)) * 0.01 < 4.0
 
 
-def test_negative_determinant_with_right_d_converges_where_k_has_order_of_22() -> None:
+def test_negative_determinant_converges_with_22() -> None:
+    """A negative determinant with the right D converges where K has the order of (22)."""
     # Measured in the last 3 s: 1.3e-3, a hundredth of the reference.
     errors = fly_small([1.0, -1.0], [20.0, 5.0])
     assert len(errors) == len(SINES)
     assert np.abs(errors[-300:]).max() < 0.002
 
 
-def test_negative_determinant_with_right_d_diverges_where_k_lacks_order_of_22() -> None:
+def test_negative_determinant_diverges_without_22() -> None:
+    """A negative determinant with the right D diverges where K lacks the order of (22)."""
     # K = (5, 5) is not of the form (22), which has the larger gain first: trace(Omega D K) = 5 - 5 leaves the damping to A.
     # Measured slow divergence at 7.4 s; the prototype: at 7.5 s.
     assert 6.0 < len(fly_small([1.0, -1.0], [5.0, 5.0])) * 0.01 < 9.0

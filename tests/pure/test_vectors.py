@@ -43,7 +43,7 @@ def test_invalid_sample_rejected_with_reason(names: list[str], values: list[floa
     assert rejected.value.reason == reason
 
 
-def test_channel_that_is_not_wanted_may_have_any_value() -> None:
+def test_unwanted_channel_may_have_any_value() -> None:
     assert select(["q"], ["q", "T"], [1.0, math.nan]).tolist() == [1.0]
 
 
@@ -52,7 +52,8 @@ def test_array_namespace_is_that_of_library_of_array() -> None:
     assert array_namespace(jnp.zeros(2)) is jnp
 
 
-def test_functions_of_python_float_are_those_of_array_at_that_value() -> None:
+def test_float_functions_equal_array_functions() -> None:
+    """The functions of a Python float give the values of the array functions."""
     xp = array_namespace(0.5)
     for name in ("acos", "asin", "atan", "sin", "cos", "tan", "sqrt"):
         assert getattr(xp, name)(0.5) == pytest.approx(float(getattr(jnp, name)(0.5)), rel=1e-6), name  # JAX in 32 bit
@@ -67,7 +68,8 @@ def test_the_namespace_of_numpy_1_has_concat() -> None:
     assert xp.sin is np.sin
 
 
-def test_stamps_out_of_order_or_ahead_of_clock_rejected() -> None:
+def test_stamps_misordered_or_ahead_rejected() -> None:
+    """Stamps out of order are rejected, and stamps ahead of the clock."""
     require_newer(1, 0)
     require_not_future(12, 10, 2)
     with pytest.raises(ChannelError, match="V: stamp 1 s before the last one") as rejected:

@@ -99,7 +99,7 @@ def test_page_gets_ticks_of_flight_to_value(recorded: Path, tape: Tape) -> None:
 
 
 @pytest.mark.parametrize("piece", [1009, 30_000])
-def test_flight_that_followed_equals_one_that_replayed(piece: int, recorded: Path, tmp_path: Path) -> None:
+def test_followed_flight_equals_replayed_flight(piece: int, recorded: Path, tmp_path: Path) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     live, late = Flight(tmp_path), Flight(recorded)
     late.update()
@@ -116,7 +116,8 @@ def test_flight_that_followed_equals_one_that_replayed(piece: int, recorded: Pat
     assert (live.state(), late.state()) == ("ended", "ended")
 
 
-def test_description_has_units_limits_gusts_and_commands_of_scenario(recorded: Path) -> None:
+def test_description_holds_scenario(recorded: Path) -> None:
+    """The description has the units, limits, gusts and commands of the scenario."""
     flight = Flight(recorded)
     flight.update()
     shown = flight.description
@@ -149,9 +150,8 @@ def test_state_tells_slow_recorder_from_killed_one(recorded: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(("backlog", "state"), [(0, "reading"), (10**9, "recording")])
-def test_long_logs_read_in_slices_and_short_backlog_is_live(
-    backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_logs_read_in_slices(backlog: int, state: str, recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A short backlog counts as live."""
     monkeypatch.setattr(followed_flight, "LIVE_BACKLOG", backlog)
     flight, slices = Flight(recorded), 0
     while flight.update(budget=0.0):
@@ -176,7 +176,8 @@ def test_samples_beyond_limit_become_coarser_and_keep_peaks() -> None:
     assert samples.stamp_ns[[0, -1]].tolist() == [0, 999]
 
 
-def test_row_of_recovered_overrun_kept_in_order_and_one_of_another_time_refused() -> None:
+def test_late_row_kept_and_old_row_refused() -> None:
+    """A row of a recovered overrun is kept in order, a row of a different time refused."""
     samples = Series(("a",))
     for stamps in ([0, 50_000_000], [47_000_000, 60_000_000], [-3_000_000_000, 70_000_000]):
         samples.append(np.array(stamps, dtype=np.int64), np.ones((2, 1)))
@@ -184,7 +185,8 @@ def test_row_of_recovered_overrun_kept_in_order_and_one_of_another_time_refused(
     assert samples.refused == 1
 
 
-def test_flight_of_any_length_becomes_coarser_without_large_temporary_arrays() -> None:
+def test_long_flight_becomes_coarser_in_place() -> None:
+    """A flight of any length needs no large temporary arrays."""
     rows, channels = 20_000, 30
     samples, values = (
         Series(tuple(map(str, range(channels))), max_rows=rows),
@@ -214,7 +216,8 @@ def test_browser_gets_thinned_samples_again_from_start(recorded: Path) -> None:
     assert topics["internals"] == 0
 
 
-def test_page_that_shows_another_run_gets_description_of_this_one(recorded: Path) -> None:
+def test_page_of_earlier_run_gets_description(recorded: Path) -> None:
+    """A page that shows a different run gets the description of the present run."""
     flight = Flight(recorded)
     flight.update()
     head, _ = decoded(answer(flight, {"epoch": "of the run before", "described": str(flight.described)}))
@@ -252,7 +255,8 @@ def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
-def test_pose_shown_with_all_channels_that_came_and_one_with_fewer_left_out(tmp_path: Path) -> None:
+def test_pose_shown_with_all_channels(tmp_path: Path) -> None:
+    """A pose with fewer channels than an earlier pose is left out."""
     names = ["phi", "theta", "psi", "north", "east"]
     with BagWriter(tmp_path / "run") as bag:
         pose = bag.add_topic("/pose", JOINT_STATE, "")
@@ -288,7 +292,7 @@ def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
     assert sorted(event[1:] for event in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
 
 
-def test_route_that_given_in_flight_replaces_that_of_scenario(tmp_path: Path) -> None:
+def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
     scenario = find_scenario("osprey_route")
     store, given = typestore(), [(0.0, 0.0, 50.0), (0.0, 600.0, 55.0), (400.0, 600.0, 55.0)]  # east, north, altitude
     made = {name: store.types[name] for name in (ROUTE_TYPE, *map("geometry_msgs/msg/{}".format, ("PoseStamped", "Pose")))}
@@ -361,7 +365,9 @@ async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN
     )
 
 
-def test_page_served_with_token_alone_and_asks_no_other_host(recorded: Path) -> None:
+def test_page_served_with_token_alone(recorded: Path) -> None:
+    """The page asks no other host."""
+
     async def client(server: Server) -> None:
         login = await get(server, f"/?token={TOKEN}", token="")
         assert (login.code, login.headers["Location"]) == (303, "/")
@@ -429,7 +435,9 @@ def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
     against(recorded)(client)
 
 
-def test_connections_beyond_limit_closed_and_free_ones_serve_again(recorded: Path) -> None:
+def test_connections_beyond_limit_closed(recorded: Path) -> None:
+    """A freed connection serves again."""
+
     async def client(server: Server) -> None:
         idle = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(http.MAX_CONNECTIONS)]
         for _ in range(1000):
@@ -456,7 +464,7 @@ async def rest_of(reader: asyncio.StreamReader) -> bytes:
         return b""
 
 
-def test_request_that_arrives_slowly_or_is_too_long_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slow_or_long_request_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
 
     async def client(server: Server) -> None:
@@ -479,9 +487,8 @@ def test_request_that_arrives_slowly_or_is_too_long_closed(recorded: Path, monke
     against(recorded)(client)
 
 
-def test_browser_that_knows_all_waits_for_news_and_gets_next_samples(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_browser_waits_for_next_samples(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A browser that knows all rows gets the next samples as the answer."""
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     path.write_bytes(content[: len(content) // 2])
 
@@ -517,7 +524,9 @@ UPGRADE = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Key":
 UPGRADE |= {"Sec-WebSocket-Version": "13"}  # RFC 6455, 4.1
 
 
-def test_websocket_answers_each_message_as_request_and_waits_for_news(recorded: Path) -> None:
+def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
+    """A message is answered as a request by HTTP."""
+
     async def client(server: Server) -> None:
         socket = await stream(server)
         await socket.write_message("")
@@ -552,9 +561,9 @@ def test_websocket_answers_each_message_as_request_and_waits_for_news(recorded: 
         ("/news/2", TOKEN, {}, 404),
     ],
 )
-def test_websocket_of_another_page_host_user_or_flight_refused(
-    path: str, token: str, headers: dict[str, str], expected: int, recorded: Path
-) -> None:
+def test_foreign_websocket_refused(path: str, token: str, headers: dict[str, str], expected: int, recorded: Path) -> None:
+    """A WebSocket of a foreign page, host or user is refused, and of an unknown flight."""
+
     async def client(server: Server) -> None:
         given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
         assert (await get(server, path, token=token, **{name: text for name, text in given.items() if text})).code == expected
@@ -580,7 +589,9 @@ def test_websocket_whose_message_is_no_request_closed(message: str, code: int, r
     against(recorded)(client)
 
 
-def test_websockets_that_ask_nothing_and_those_beyond_limit_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """WebSockets without a request are closed, and WebSockets beyond the limit."""
+
     async def client(server: Server) -> None:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
         assert (await get(server, "/news/0", **UPGRADE)).code == 503
@@ -596,7 +607,7 @@ def test_websockets_that_ask_nothing_and_those_beyond_limit_closed(recorded: Pat
     against(recorded)(client)
 
 
-def test_websocket_has_one_request_at_time(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_websocket_has_single_pending_request(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[str] = []
 
     def parsed(message: str, **_: object) -> list[tuple[str, str]]:
@@ -617,9 +628,10 @@ def test_websocket_has_one_request_at_time(recorded: Path, monkeypatch: pytest.M
     against(recorded)(client)
 
 
-def test_websocket_that_asks_and_reads_no_answer_makes_few_of_them_and_server_ends_quietly(
+def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A WebSocket asks and reads no answer: the server makes few answers, and ends quietly."""
     made: list[bytes] = []
 
     def big(*_: object, **__: object) -> bytes:
@@ -661,7 +673,8 @@ def test_the_server_listens_on_this_host_alone(recorded: Path) -> None:
 # Which run
 
 
-def test_run_that_recorded_is_chosen_else_last_one(recorded: Path, tmp_path: Path) -> None:
+def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
+    """Without a run in recording the last run is chosen."""
     for name in ("20260101T000000Z-a", "20260102T000000Z-b", "20260103T000000Z-c"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "run_0.mcap").write_bytes(b"")
@@ -687,7 +700,8 @@ def command(*words: object) -> list[str]:
 
 
 @pytest.mark.parametrize("ignored", [False, True], ids=["in front", "in the background, with SIGINT ignored"])
-def test_watch_prints_address_and_ends_quietly_with_ctrl_c(recorded: Path, ignored: bool) -> None:
+def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> None:
+    """The command ends quietly with Ctrl-C."""
     before = ["/bin/sh", "-c", 'trap "" INT; exec "$@"', "sh"] if ignored else []
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*before, *command("watch", recorded, "--port", 0)], **pipes) as process:  # type: ignore[call-overload]
@@ -719,7 +733,8 @@ def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
         assert (ended.returncode, ended.stderr) == (2, expected)
 
 
-def test_flight_with_page_prints_address_and_leaves_no_server(tmp_path: Path) -> None:
+def test_flight_page_ends_with_flight(tmp_path: Path) -> None:
+    """A flight with a page prints the address, and leaves no server."""
     words = ("fly", "osprey_gust", "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
     ended = subprocess.run(command(*words), capture_output=True, text=True, check=True)
     assert json.loads(ended.stdout)["outcome"] == "completed"

@@ -87,7 +87,8 @@ def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scen
 
 
 @pytest.mark.parametrize("state", ["ended", "interrupted"])
-def test_page_whose_flight_is_over_commands_no_later_one(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page_of_ended_flight_commands_nothing(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page of a flight that is over commands no later flight."""
     monkeypatch.setattr(desk.flight, "state", lambda: state)
     sentence = "the flight of this page is over: rise-di watch --control shows a later one"
 
@@ -113,7 +114,9 @@ def test_gains_may_be_set_before_first_tick(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_set_on_top_of_change_of_another_program_refused(desk: Desk) -> None:
+def test_set_after_foreign_change_refused(desk: Desk) -> None:
+    """A set after a change by a different program is refused."""
+
     async def steps(desk: Desk) -> None:
         digest = (await desk.ask("state"))["digest"]
         desk.nodes.values["controller"]["k_g"] *= 1.1
@@ -124,7 +127,8 @@ def test_set_on_top_of_change_of_another_program_refused(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_gain_beyond_range_of_no_such_name_or_no_number_refused(desk: Desk, osprey_gust: Scenario) -> None:
+def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
+    """A gain beyond the range is refused, an unknown name, and a value that is no number."""
     k_g = gains_of(osprey_gust.controller)["k_g"]
 
     async def steps(desk: Desk) -> None:
@@ -145,7 +149,8 @@ def test_gain_beyond_range_of_no_such_name_or_no_number_refused(desk: Desk, ospr
     with_desk(desk, steps)
 
 
-def test_margins_of_pending_gains_are_those_of_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
+def test_margins_equal_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
+    """The margins of pending gains equal the margins of the gain check."""
     airframe, _ = osprey_gust.aircraft.load()
     found = check_gains(osprey_gust, study_airframe(airframe, manoeuvre(osprey_gust, airframe), 0.0, 1))
 
@@ -186,7 +191,9 @@ def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_more_than_five_requests_second_refused(desk: Desk) -> None:
+def test_requests_beyond_rate_refused(desk: Desk) -> None:
+    """More than five requests a second are refused."""
+
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         for _ in range(int(BURST) - 1):
@@ -199,7 +206,9 @@ def test_more_than_five_requests_second_refused(desk: Desk) -> None:
     with_desk(desk, steps)
 
 
-def test_targets_routes_and_services_reach_guidance_and_refusals_come_back(desk: Desk) -> None:
+def test_commands_reach_guidance(desk: Desk) -> None:
+    """Targets, routes and services reach guidance, and refusals come back."""
+
     async def steps(desk: Desk) -> None:
         await desk.ask("target", values={"heading": 1.5, "altitude": 60})
         await desk.ask("route", points=[[0, 0, 50], [500, 0, 60.5]])
@@ -258,7 +267,9 @@ def test_gains_of_bridge_that_sends_need_further_option(recorded: Path, osprey_g
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller", dry_run=False, real=True), allowed)
 
 
-def test_bridge_engages_by_name_of_map_and_disengages_while_it_waits(recorded: Path, osprey_gust: Scenario) -> None:
+def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> None:
+    """The bridge disengages while a request to engage waits."""
+
     async def steps(desk: Desk) -> None:
         await desk.ask("state")
         assert (await desk.refused("engage", map="copter"))[0] == 400
@@ -283,7 +294,7 @@ def test_controller_under_bridge_deactivated_by_bridge_alone(recorded: Path, osp
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
-def test_margins_that_computed_do_not_delay_deactivation(desk: Desk) -> None:
+def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
     begun, end = threading.Event(), threading.Event()
 
     def assess(scenario: Scenario, params: ControllerConfig) -> dict[str, Any]:

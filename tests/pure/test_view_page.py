@@ -172,7 +172,8 @@ CURVES = """(() => {
 })()"""
 
 
-def test_flight_with_noise_has_dozen_curves_that_are_not_flat(browser: Browser, tmp_path: Path) -> None:
+def test_noisy_flight_has_curves(browser: Browser, tmp_path: Path) -> None:
+    """A flight with noise has a dozen curves that are not flat."""
     run = flown(find_scenario("osprey_servo").vary(flight={"duration": 2.0}), tmp_path / "run")
     with shown(browser, run) as address:
         browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=4000, deviceScaleFactor=1, mobile=False)
@@ -191,7 +192,8 @@ def test_flight_with_noise_has_dozen_curves_that_are_not_flat(browser: Browser, 
         assert browser.console == []
 
 
-def test_keys_step_single_ticks_jump_to_events_and_play(browser: Browser, recorded: Path, tape: Tape) -> None:
+def test_keys_step_ticks_and_play(browser: Browser, recorded: Path, tape: Tape) -> None:
+    """Keys step single ticks, jump to events, and play."""
     with shown(browser, recorded):
         assert browser.run(TIME) == 0.0
         for expected in (0.01, 0.02, 0.03):  # 100 Hz
@@ -212,9 +214,9 @@ def test_keys_step_single_ticks_jump_to_events_and_play(browser: Browser, record
         assert browser.console == []
 
 
-def test_keys_step_seconds_jump_to_command_and_choose_window_and_camera(
-    browser: Browser, osprey_gust: Scenario, tmp_path: Path
-) -> None:
+def test_keys_step_seconds_and_choose_view(browser: Browser, osprey_gust: Scenario, tmp_path: Path) -> None:
+    """Keys step seconds, jump to a command, and choose the window and the camera."""
+
     def chosen(selector: str) -> str:
         return f"[...document.querySelectorAll('{selector}')].find(one => one.ariaPressed === 'true').textContent"
 
@@ -238,7 +240,8 @@ def test_keys_step_seconds_jump_to_command_and_choose_window_and_camera(
         assert browser.console == []
 
 
-def test_at_tenth_of_speed_flight_takes_ten_times_as_long(browser: Browser, recorded: Path) -> None:
+def test_slow_playback_takes_longer(browser: Browser, recorded: Path) -> None:
+    """At a tenth of the speed a flight takes ten times as long."""
     with shown(browser, recorded):
         for _ in range(9):
             press(browser, "-")
@@ -250,7 +253,7 @@ def test_at_tenth_of_speed_flight_takes_ten_times_as_long(browser: Browser, reco
         assert browser.run("performance.now()") - begun > 1900.0
 
 
-def test_flight_that_recorded_followed_to_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
+def test_recording_flight_followed_to_end(browser: Browser, recorded: Path, tmp_path: Path) -> None:
     content, path = (recorded / "run_0.mcap").read_bytes(), tmp_path / "run_0.mcap"
     with serving(tmp_path) as address:
         browser.open(address)
@@ -283,9 +286,8 @@ ASKS = """(() => {
 })()"""
 
 
-def test_server_that_hangs_is_no_server_until_it_answers_again(
-    browser: Browser, recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hanging_server_is_no_server(browser: Browser, recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A server that hangs counts as absent until the next answer."""
     runs, update = threading.Event(), Flight.update
     runs.set()
     monkeypatch.setattr(Flight, "update", lambda *given: runs.wait() and update(*given))
@@ -357,7 +359,8 @@ def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> 
         assert browser.console == []
 
 
-def test_phone_has_one_column_and_dark_scheme_own_colours(browser: Browser, recorded: Path) -> None:
+def test_phone_has_one_column(browser: Browser, recorded: Path) -> None:
+    """The dark scheme has different colours."""
     with shown(browser, recorded):
         browser.call("Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=2, mobile=True)
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
@@ -448,7 +451,9 @@ def test_surface_drawn_in_sense_that_aircraft_gives_input(
     assert {name: np.sign(angle) for name, angle in found.items()} == senses
 
 
-def test_horizon_falls_when_nose_rises_and_turns_left_in_roll_to_right(page: Browser) -> None:
+def test_horizon_moves_against_aircraft(page: Browser) -> None:
+    """The horizon falls when the nose rises, and turns left in a roll to the right."""
+
     def sky(pose: str, x: float, y: float) -> bool:
         """Whether a point of the instrument shows the sky; x and y in fractions of its radius from its centre."""
         script = f"""import('./scene.js').then(m => {{
@@ -585,7 +590,8 @@ def test_desk_has_parts_of_nodes_that_run(browser: Browser, recorded: Path, ospr
     controls[0].close()
 
 
-def test_desk_starts_from_faults_of_aircraft_and_keeps_them(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+def test_desk_starts_from_aircraft_faults(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+    """The desk keeps the faults of the aircraft."""
     nodes, controls = NodesInMemory(osprey_gust, "aircraft"), list[Control]()
     nodes.values["aircraft"] |= {"actuators.stuck_at": [math.inf, 3.5, math.inf, math.inf], "sensors.dropout": 0.25}
 
@@ -605,9 +611,8 @@ def test_desk_starts_from_faults_of_aircraft_and_keeps_them(browser: Browser, re
     controls[0].close()
 
 
-def test_gains_are_pending_until_they_applied_and_can_be_undone(
-    browser: Browser, recorded: Path, osprey_gust: Scenario
-) -> None:
+def test_gains_are_pending_until_applied(browser: Browser, recorded: Path, osprey_gust: Scenario) -> None:
+    """Applied gains can be undone."""
     nodes = NodesInMemory(osprey_gust, "aircraft", "controller", "guidance")
     controls: list[Control] = []
     before = nodes.values["controller"]["k_g"]
