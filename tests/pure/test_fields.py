@@ -36,7 +36,8 @@ ANNOTATIONS: list[Callable[[Any], Any]] = [
     lambda rule: Annotated[dict[str, float | None], rule(min_length=1)],
 ]
 NUMBERS = st.sampled_from([-1, 0, 1, 2, 3, 2**70, -1.0, -0.0, 0.0, 0.5, 1.0, 2.0, 1e308, math.inf, -math.inf, math.nan])
-TEXTS = st.sampled_from(["", "a", "ab", "abc!", "ab\n", "1", "1.5", "yes"])
+# Printable: pydantic takes other texts too, a parameter set does not (test_text.py).
+TEXTS = st.sampled_from(["", "a", "ab", "abc!", "1", "1.5", "yes"])
 VALUES = st.recursive(
     st.none() | st.booleans() | NUMBERS | st.integers() | st.floats() | TEXTS,
     lambda inner: st.lists(inner, max_size=3).map(tuple) | st.dictionaries(st.sampled_from(["a", "b", 1]), inner, max_size=2),
