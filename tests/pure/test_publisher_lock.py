@@ -29,10 +29,10 @@ def locked(*senders: tuple[str, int]) -> PublisherLock:
 def test_conflicting_publisher_ignored_until_timeout() -> None:
     """Samples of a second publisher are ignored until the first publisher times out."""
     lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
-    for other in ("/aircraft#2", "/foreign", ""):
-        sentence = f"conflicting publisher {other} ignored: already receiving from /aircraft#1"
+    for publisher in ("/aircraft#2", "/foreign", ""):
+        sentence = f"conflicting publisher {publisher} ignored: already receiving from /aircraft#1"
         with pytest.raises(ChannelError, match=sentence) as ignored:
-            lock.check(other, 190, MAX_AGE, TAKEOVER)
+            lock.check(publisher, 190, MAX_AGE, TAKEOVER)
         assert ignored.value.reason == "sender"
     lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time
 

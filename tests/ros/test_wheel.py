@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 from tests.ros.peer import HANG
 
 PACKAGES = sorted(path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml"))
-DECOY = "raise RuntimeError(f'{__name__} of a stranger')\n"
+DECOY = "raise RuntimeError(f'{__name__} of a foreign package')\n"
 
 Run = Callable[..., str]
 
@@ -30,7 +30,7 @@ def write_package(folder: Path, name: str) -> None:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that holds the installed wheel, and a stranger named as the package guidance of PyPI."""
+    """The folder that holds the installed wheel, and a foreign package of the name guidance, as on PyPI."""
     built, target = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("installed")
     build = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(built))
     subprocess.run(build, cwd=REPOSITORY, check=True, capture_output=True, timeout=HANG)
