@@ -52,7 +52,6 @@ def loop_variables(tree: list[ast.AST]) -> list[str]:
     return [name for name in names if name in LOOP_VARIABLES]
 
 
-@pytest.mark.xfail(strict=True, reason="6 % of the words of docstrings are pronouns")
 def test_docstrings_have_few_pronouns() -> None:
     words = {name: docstring_words(tree) for name, tree in nodes("ros_ws/src").items()}
     pronouns = {name: Counter(word for word in of_file if word in PRONOUNS) for name, of_file in words.items()}
