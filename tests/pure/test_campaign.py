@@ -26,6 +26,7 @@ from tests.closed_loop import error
 from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
 
+from flight_analysis.closed_loop.margins import linear_loop
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
@@ -33,12 +34,13 @@ from flight_analysis.report.run_folder import REPORT
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
-from flight_campaign.campaign_report import write_page
+from flight_campaign.campaign_report import overview, write_page
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.laws import AnyLaw
+from rise_di_controller.margins import loop_margins
 
 pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
 
@@ -167,7 +169,9 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
 def test_report_of_missions_says_what_score_counts(mission: Definition, tmp_path: Path) -> None:
     campaign = Campaign.begin(tmp_path, mission)
     tally = Tally.of(*fly_chunk_figures(mission.model_dump_json(), (0, 0)))
-    write_page(tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}])
+    write_page(
+        tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}], [None]
+    )
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "the largest cross-track error on the route in 12.5 m" in page
     assert "max xtrack (m)" in page
@@ -273,9 +277,33 @@ def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
         definition(20, 20, sweep)
 
 
+def test_sweep_of_registered_law() -> None:
+    l1 = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["l1"], "controller"))
+    swept = define(l1, 3, 0.3, 77, 3, sweep=Sweep(parameter="bandwidth", factors=(0.5, 1.0)))
+    half, own = (swept.scenario(case).controller.model_dump()["bandwidth"] for case in range(2))
+    assert half == pytest.approx([0.5 * value for value in own])
+
+
+def test_results_have_margins_beside_score(tmp_path: Path) -> None:
+    campaign = fly_campaign(tmp_path / "swept", definition(6, 6, Sweep(parameter="softening", factors=(1.0, 4.0))))
+    found = [campaign.margins(case) for case in range(2)]
+    tallies = [campaign.tally(case) for case in range(2)]
+    rows = {name: cells for name, *cells in overview(campaign.definition, tallies, found).rows}
+    narrow, wide = (float(cell.split()[0]) for cell in rows["phase margin, deg"])
+    assert narrow < wide  # a wider sign integrates more slowly
+    assert rows["score, mean"] == [f"{tally.figures['score'].mean:.3g}" for tally in tallies]
+    flown = [campaign.definition.aircraft_scenario(number, 1) for number in range(6)]
+    airframes = [scenario.aircraft.sampled_airframe() for scenario in flown]
+    loops = [linear_loop(flown[0].controller, frame, frame.matrix_a()[None], frame.matrix_b()[None]) for frame in airframes]
+    phases = [loop_margins(loop.nominal, loop.law, loop.loop).phase.min() for loop in loops]
+    assert found[1] is not None
+    assert found[1].worst is not None
+    assert found[1].worst.phase.min() == pytest.approx(min(phases), rel=1e-6)
+
+
 def test_sweep_of_law_without_that_parameter_refused() -> None:
     pi = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["pi"], "controller"))
-    with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: Lambda, input_scale$"):
+    with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: K, Lambda, input_scale$"):
         define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
 
 

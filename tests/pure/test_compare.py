@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.closed_loop import error
+from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
 
 from aircraft_sim.turbulence import MODERATE
@@ -17,12 +18,13 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, law_comparison, tuned_gains, tuning
+from flight_campaign import fleet, law_comparison, registered_laws, tuned_gains, tuning
 from flight_campaign.fleet import FleetResult
 from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
+from rise_di_controller.laws import AnyLaw
 
 pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
 
@@ -268,6 +270,54 @@ def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tm
         assert (row["cost"], row["spread"]) == (7.25, 0.125)
         assert "7.25 +0.12" in result.stdout
         assert set(row["slew"]) == {"elevator", "thrust", "aileron", "rudder"}
+
+
+def test_registered_law_flies_as_that_of_catalogue(short: Benchmark) -> None:
+    # RISE-DI as a registered law, with the gains of the catalogue's: K = 1 + k_g + k_d is rounded once more
+    gains = initial_gains(LAWS["rise"], short.model)
+    K, Lambda, beta, softening = (gain[:, 0].tolist() for gain in gains.values())
+    own = {"Lambda": Lambda, "beta": beta, "softening": softening[0], "k_g": K[-1] - 1.0, "k_d": [k - K[-1] for k in K[:-1]]}
+    scale = short.model.input_scale.tolist()
+    scenario = short.scenario.vary(controller={**own, "input_scale": scale, "sign": "soft"})
+    controllers = registered_laws.find_laws(["rise", "rise_di"], scenario, {})
+    laws = registered_laws.entries(controllers)
+    tuned = {"rise": {"gust": as_tuned(gains)}, "rise_di": {"gust": registered_laws.as_tuned(scenario.controller)}}
+    catalogue, registered = law_comparison.compare(short, tuned, 2, [0.3], 1, delays=(), laws=laws)
+    assert registered.costs == []
+    assert registered.scores == pytest.approx(catalogue.scores, rel=1e-6)
+    assert registered.levels[0].scores[GUST] == pytest.approx(catalogue.levels[0].scores[GUST], rel=1e-6)
+
+
+def test_registered_law_is_tuned_from_its_gains(short: Benchmark) -> None:
+    l1 = AnyLaw.validate_mapping(SECTIONS["l1"] | {"K": [1.0, 1.0, 1.0, 1.0]}, "controller")
+    law = registered_laws.registered_law(l1, "l1")
+    assert law.tuned == ("K", "bandwidth")  # Omega has entries below 0: no gain
+    begin = tuning.tune(law, OBJECTIVES["gust"], short, (1,), generations=1)
+    found = tuning.tune(law, OBJECTIVES["gust"], short, (1,), generations=4)
+    assert found.cost < begin.cost
+    assert set(found.gains) == {"K", "bandwidth"}
+
+
+def test_law_without_gains_is_named(brief_file: Path, tmp_path: Path) -> None:
+    scenario = find_scenario(str(brief_file))
+    with pytest.raises(ParameterError, match=r"^--laws: found 'excitation', expected laws among .*, or the path of a scenario"):
+        registered_laws.find_laws(["excitation"], scenario, {})
+    fast = scenario.vary(controller={"rate": 50.0})
+    with pytest.raises(ParameterError, match=r"^--laws: fast: rate: found 50.0, expected 100.0, as in brief$"):
+        registered_laws.find_laws(["fast"], scenario, {"fast": fast})
+
+
+def test_compare_takes_scenario_in_place_of_law(brief_file: Path, gains_file: Path, tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text(brief_file.read_text(encoding="utf-8").replace("k_g: 1.0 ", "k_g: 0.9 "), encoding="utf-8")
+    path = tmp_path / "compared.json"
+    options = ["--aircraft", "1", "--uncertainty", "0.3", "--tuning", "gust", "--gains", str(gains_file), "--json", str(path)]
+    result = CliRunner().invoke(app, ["compare", str(brief_file), "--laws", f"rise,{own}", *options])
+    assert result.exit_code == 0, result.output
+    assert "own gains" in result.stdout
+    rise, of_scenario = json.loads(path.read_text(encoding="utf-8"))["laws"]
+    assert (rise["law"], of_scenario["law"]) == ("rise", "own")
+    assert of_scenario["cost"] is None
 
 
 def test_interrupted_tuning_resumes_with_missing_laws(

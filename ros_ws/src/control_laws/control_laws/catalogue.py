@@ -58,10 +58,13 @@ class Law(NamedTuple):
     params: Callable[[Gains, NominalModel], Any]
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
+    initial: Gains | None = None  # of a search; None: by the lag of the loop and the constants above
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
     """Initial gains of the search, shapes (m, 1) and (1, 1)."""
+    if law.initial is not None:
+        return law.initial
     K = INITIAL_CROSSOVER_LAG_PRODUCT / model.total_lag[:, None]
     gains = {"K": K, "Lambda": K / 4.0}
     gains |= {name: np.full(K.shape, value) for name, value in INITIAL_CHANNEL_GAINS.items()}

@@ -14,6 +14,7 @@ import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matrices
+from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
@@ -23,14 +24,14 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import Config, ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
+from rise_di_controller.params import ControllerConfig
 
 if TYPE_CHECKING:
     from flight_campaign.fleet import Vehicle
     from flight_campaign.missions import Mission
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
-SWEPT = ("k_g", "k_d", "Lambda", "beta", "input_scale", "omega", "softening")
-"""Parameters of the controller that a sweep may multiply."""
+MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
 
 
 class Sweep(Config):
@@ -85,6 +86,13 @@ class Definition(Config):
         return ((case, chunk) for case in range(self.cases) for chunk in range(chunks))
 
 
+def swept_parameters(controller: ControllerConfig) -> list[str]:
+    """Parameters that a sweep may multiply: the numbers of the law itself, and input_scale."""
+    own = [name for name in type(controller).model_fields if name not in ControllerConfig.model_fields]
+    values = ((name, np.atleast_1d(getattr(controller, name))) for name in own)
+    return [*(name for name, value in values if value.dtype == np.float64), "input_scale"]
+
+
 def define(
     scenario: Scenario,
     aircraft: int,
@@ -99,9 +107,8 @@ def define(
     Raises ParameterError if a campaign cannot fly it.
     """
     if sweep is not None:
-        swept = [name for name in SWEPT if hasattr(scenario.controller, name)]
-        names = ", ".join(swept) or f"a law with one of {', '.join(SWEPT)}"
-        require(sweep.parameter in swept, "--sweep", sweep.parameter, f"a parameter of the controller: {names}")
+        swept = swept_parameters(scenario.controller)
+        require(sweep.parameter in swept, "--sweep", sweep.parameter, f"a parameter of the controller: {', '.join(swept)}")
         require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
@@ -227,6 +234,14 @@ class Campaign:
             if job[0] == case and self._path(job).exists():
                 total += self._read(job)
         return total
+
+    def margins(self, case: int) -> LoopMargins | None:
+        """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
+        of, scenario = self.definition, self.definition.scenario(case)
+        try:
+            return margins(scenario, min(of.aircraft, MARGIN_AIRCRAFT), of.uncertainty, of.seed)
+        except ParameterError:
+            return None
 
     def _read(self, job: Job) -> Tally:
         path, size = self._path(job), self.definition.size(job)

@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from aircraft_sim.uncertainty import WindEffect
+from flight_analysis.closed_loop.margins import LoopMargins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report import plotting
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
+from flight_analysis.report.margins import LEAST_MARGINS, least_margins
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units
 from flight_analysis.report.tables import Table
-from flight_campaign.campaign import Definition
+from flight_campaign.campaign import MARGIN_AIRCRAFT, Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.files import write_file
 from flight_core.vectors import FloatArray
@@ -28,8 +30,20 @@ SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 
 
-def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cases: Sequence[Mapping[str, Any]]) -> None:
-    """Write the report of a campaign: one tally and the figures of the summary for each case."""
+OVERVIEW_LEGEND = (
+    "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay margin: of all inputs at once."
+    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer"
+)
+
+
+def write_page(
+    path: Path,
+    definition: Definition,
+    tallies: Sequence[Tally],
+    cases: Sequence[Mapping[str, Any]],
+    margins: Sequence[LoopMargins | None],
+) -> None:
+    """Write the report of a campaign: for each case a tally, the figures of the summary, and the margins of the loop."""
     scenario = definition.scenario()
     units = QUANTITY_UNITS | display_units(scenario)
     labels = _labels(definition)
@@ -40,7 +54,8 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
         f" effect of wind on x_dot {WIND_EFFECTS[definition.wind]}; true errors at the controller's ticks."
         f" Score: {score_meaning(scenario)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
-    tables = [_ends(labels, cases), *(_figures(label, one, units) for label, one in zip(labels, tallies, strict=True))]
+    tables = [overview(definition, tallies, margins), _ends(labels, cases)]
+    tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
     tables.append(_worst(labels, cases))
     sections = [
         Section("Score", "share of the aircraft by score", _spread(labels, tallies, ["score"], {}), over_time=False),
@@ -54,6 +69,18 @@ def write_page(path: Path, definition: Definition, tallies: Sequence[Tally], cas
     ]
     page = Page(title, [Line(text)], [TableGroup(tables)], sections, SampleStore())
     write_file(path, page_html(page))
+
+
+def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]) -> Table:
+    """Scores, lost aircraft and margins, a column for each case."""
+    columns = []
+    for tally, of_loop in zip(tallies, margins, strict=True):
+        score, lost = tally.figures.get("score", Figure()), tally.lost + tally.diverged
+        worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
+        columns.append([f"{score.mean:.3g}", worst, f"{100.0 * lost / max(tally.flights, 1):.3g}", *least_margins(of_loop)])
+    names = ("score, mean", "score, worst", "lost or diverged, %", *LEAST_MARGINS)
+    rows = [[name, *cells] for name, *cells in zip(names, *columns, strict=True)]
+    return Table("Score and margins", [Column("", label) for label in _labels(definition)], rows, OVERVIEW_LEGEND)
 
 
 def score_meaning(scenario: Scenario) -> str:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.uncertainty import nominal_and_sampled
-from control_laws.catalogue import LAWS
+from control_laws.catalogue import LAWS, Law
 from flight_campaign import fleet
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_campaign.tuned_gains import TuningResult
@@ -41,7 +41,7 @@ class LawResult(NamedTuple):
 
     law: str
     objective: str  # what it was tuned on
-    costs: list[float]  # of the seeds of its tuning
+    costs: list[float]  # of the seeds of its tuning; empty for gains of a scenario
     scores: dict[str, float]  # on the nominal aircraft, by wind
     levels: tuple[Level, ...]
     lost_late: dict[float, float]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
@@ -56,6 +56,7 @@ def compare(
     levels: Sequence[float],
     seed: int,
     delays: Sequence[int] = DELAY_TICKS,
+    laws: Mapping[str, Law] = LAWS,
 ) -> Iterator[LawResult]:
     """Simulate the laws with their gain sets on the same flights; a thread flies a law.
 
@@ -75,7 +76,7 @@ def compare(
     }
 
     def results(name: str) -> list[LawResult]:
-        law = LAWS[name]
+        law = laws[name]
         control_law = law.control_law(benchmark.model)  # one for all gain sets: it is compiled once
         found = []
         for objective, gains in tuned[name].items():

@@ -58,7 +58,7 @@ def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
 
 
 def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Sequence[str], command: str) -> None:
-    """Write tuned gains, costs and the tuning command; laws as in the catalogue, objectives as given.
+    """Write tuned gains, costs and the tuning command; laws as in the catalogue first, objectives as given.
 
     Raises ParameterError where the file cannot be written.
     """
@@ -68,7 +68,8 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
         "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
         f"# Made by: {command} --tuning {','.join(objectives)}\n"
     )
-    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in LAWS if law in tuned}
+    names = [*(law for law in LAWS if law in tuned), *(law for law in tuned if law not in LAWS)]
+    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in names}
     text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
     with writing("", path, "a file of tuned gains that can"):
         path.parent.mkdir(parents=True, exist_ok=True)

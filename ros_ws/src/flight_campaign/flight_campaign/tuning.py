@@ -14,7 +14,7 @@ import numpy as np
 from aircraft_sim.plant import PlantParams
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
-from control_laws.catalogue import AIRCRAFT, INTEGRATORS, LAWS, NONE, Gains, Law, initial_gains
+from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
@@ -26,7 +26,6 @@ from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.fleet import Fleet, FleetResult, Vehicle
 from flight_campaign.statistics import score_units
 from flight_campaign.tuned_gains import TuningResult
-from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.linear_loop import Loop
 
@@ -80,6 +79,7 @@ class Benchmark(NamedTuple):
     activity_unit: FloatArray  # (m,) of the mean abs(u_dot) in a cost
     plant: PlantParams
     vehicle: Vehicle
+    scenarios: dict[str, Scenario]  # by wind
     courses: dict[str, dict[str, Course]]  # by wind and by the model of the feedforward
     delay: int  # ticks, delay of u in the late flights of a cost
 
@@ -122,6 +122,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
         scenario.aircraft.plant(),
         fleet.vehicle(scenario),
+        {GUST: with_model, TURBULENCE: turbulent},
         {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
         DELAY_TICKS if any(controller.lag) else 1,
     )
@@ -269,9 +270,3 @@ def tune(
 def as_gains(tuned: TuningResult) -> Gains:
     """Gains of shape (m, 1) and (1, 1)."""
     return {name: np.array(values)[:, None] for name, values in tuned.gains.items()}
-
-
-def require_laws(names: Iterable[str]) -> None:
-    """Raise ParameterError for the name of an unknown law."""
-    for name in names:
-        require(name in LAWS, "--laws", f"{name!r}", f"laws among {', '.join(LAWS)}")

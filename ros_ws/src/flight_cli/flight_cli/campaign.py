@@ -15,12 +15,20 @@ from rich.console import Console
 
 from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_analysis.report.margins import margins_as_json
 from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
-from flight_analysis.report.summary import QUANTITY_UNITS, display_units
+from flight_analysis.report.summary import QUANTITY_UNITS, display_units, finite_or_null
+from flight_analysis.report.tables import Table
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, write_page
+from flight_campaign.campaign_report import (
+    FIGURE_HEADINGS,
+    WIND_EFFECTS,
+    figure_rows,
+    overview,
+    write_page,
+)
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -98,13 +106,18 @@ def campaign(
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
     with writing("", monte_carlo.folder, "a folder and a disk that can"):
-        figures = _write_results(monte_carlo)
+        figures, results = _write_results(monte_carlo)
     if as_json:
         print_json(figures)
         return
     console = Console()
     for case in range(monte_carlo.definition.cases):
         _show(console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case])
+    table = new_table(f"\n{results.caption}", ("figure", *(column.head for column in results.columns)), left=("figure",))
+    for row in results.rows:
+        table.add_row(*row)
+    console.print(table)
+    console.print(results.legend, style="dim", highlight=False, soft_wrap=True)
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
     print(f"folder:  {display_path(monte_carlo.folder)}\nreport:  {display_path(monte_carlo.folder / REPORT)}")
@@ -142,13 +155,15 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     return done * seconds / (time.monotonic() - begin)
 
 
-def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
-    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary."""
+def _write_results(monte_carlo: Campaign) -> tuple[dict[str, Any], Table]:
+    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary and the overview."""
     definition = monte_carlo.definition
     tallies = [monte_carlo.tally(case) for case in range(definition.cases)]
+    margins = [monte_carlo.margins(case) for case in range(definition.cases)]
     cases = [
         {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(monte_carlo, case, tally)}
-        for case, tally in enumerate(tallies)
+        | {"margins": None if of_loop is None else margins_as_json(of_loop)}
+        for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
     ]
     figures = {
         "scenario": definition.name,
@@ -159,9 +174,10 @@ def _write_results(monte_carlo: Campaign) -> dict[str, Any]:
         "sweep": None if definition.sweep is None else definition.sweep.parameter,
         "cases": cases,
     }
+    figures = finite_or_null(figures)
     write_file(monte_carlo.folder / SUMMARY, json.dumps(figures, indent=1))
-    write_page(monte_carlo.folder / REPORT, definition, tallies, cases)
-    return figures
+    write_page(monte_carlo.folder / REPORT, definition, tallies, cases, margins)
+    return figures, overview(definition, tallies, margins)
 
 
 def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:

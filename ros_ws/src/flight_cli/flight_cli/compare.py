@@ -3,7 +3,7 @@
 """`rise-di compare`: RISE-DI and further control laws on the same aircraft, tuned by the same procedure."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,17 +14,18 @@ from rich.table import Table
 
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import WindEffect
-from control_laws.catalogue import LAWS
+from control_laws.catalogue import LAWS, Law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.summary import display_units, finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import law_comparison, tuned_gains
+from flight_campaign import law_comparison, registered_laws, tuned_gains
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
 from flight_core.parameters import require
+from rise_di_controller.params import ControllerConfig
 
 SEEDS = (1, 2, 3)
 NOTES = """
@@ -53,7 +54,12 @@ def compare(
         WindEffect | None,
         typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
     ] = None,
-    laws: Annotated[str | None, typer.Option(help="Laws to compare, by name: rise,pi,l1; all by default.")] = None,
+    laws: Annotated[
+        str | None,
+        typer.Option(
+            help="Laws to compare, by name: rise,pi,l1; all by default. A scenario file in place of a name: its controller."
+        ),
+    ] = None,
     tuning: Annotated[
         str,
         typer.Option(help=f"What the gains were tuned on: {', '.join(gain_tuning.OBJECTIVES)}."),
@@ -72,7 +78,6 @@ def compare(
     Exit status: 0, or 2 bad input.
     """
     names = list(LAWS) if laws is None else laws.split(",")
-    gain_tuning.require_laws(names)
     aims = tuning.split(",")
     for aim in aims:
         require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
@@ -86,54 +91,69 @@ def compare(
         chosen = chosen.vary(aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}})
         command += f" --wind {wind}"
     effect = chosen.aircraft.uncertainty.wind
+    others = {Path(name).stem: find_scenario(name) for name in names if name.endswith(".yaml")}
+    names = [Path(name).stem if name.endswith(".yaml") else name for name in names]
+    controllers = registered_laws.find_laws(names, chosen, others)
+    entries = registered_laws.entries(controllers)
     path = gains or tuned_gains.tuned_file(chosen)
     wanted = [(name, aim) for name in names for aim in aims if aim not in tuned_gains.load(path).get(name, {})]
     results = []
     with progress_bar(*COUNT_COLUMNS) as bar:
         if tune:
-            _tune(wanted, chosen, path, command, bar)
+            _tune(wanted, entries, chosen, path, command, bar, controllers)
         known = tuned_gains.load(path)
-        tuned = {name: {aim: known[name][aim] for aim in aims if aim in known[name]} for name in names if name in known}
+        tuned = {name: {aim: known[name][aim] for aim in aims if aim in known.get(name, {})} for name in names}
+        own = {name: registered_laws.as_tuned(controller) for name, controller in controllers.items() if controller is not None}
+        tuned |= {name: {aim: tuned[name].get(aim, gains_) for aim in aims} for name, gains_ in own.items()}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
-        benchmark = gain_tuning.build_benchmark(chosen, turbulence_seed)
+        benchmark = registered_laws.with_courses(gain_tuning.build_benchmark(chosen, turbulence_seed), controllers)
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
-        for result in law_comparison.compare(benchmark, tuned, aircraft, levels, seed):
+        for result in law_comparison.compare(benchmark, tuned, aircraft, levels, seed, laws=entries):
             results.append(result)
             bar.advance(task)
     console = Console()
     console.width = max(console.width, WIDTH)
     for aim in aims:
         if found := [result for result in results if result.objective == aim]:
-            console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, chosen))
-    notes = _notes(chosen, benchmark, tuned, aims)
+            console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, entries, chosen))
+    notes = _notes(chosen, benchmark, {name: entries[name] for name in tuned if tuned[name]}, aims)
     flown = f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
     turbulence = f"turbulence of seed {turbulence_seed}, that of the tuning {tuning_seed}"
     console.print(f"{notes}\n{flown}; {turbulence}", style="dim", highlight=False)
-    if wanted and not tune:
-        missing = ", ".join(f"{name} ({aim})" for name, aim in wanted)
+    lacking = [(name, aim) for name, aim in wanted if controllers[name] is None]
+    if lacking and not tune:
+        missing = ", ".join(f"{name} ({aim})" for name, aim in lacking)
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if to_json is not None:
-        rows = [_as_json(result, chosen) for result in results]
+        rows = [_as_json(result, entries[result.law], chosen) for result in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
         write_text("--json", to_json, json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1) + "\n")
 
 
-def _tune(wanted: Iterable[tuple[str, str]], chosen: Scenario, path: Path, command: str, bar: Progress) -> None:
+def _tune(
+    wanted: Iterable[tuple[str, str]],
+    entries: Mapping[str, Law],
+    chosen: Scenario,
+    path: Path,
+    command: str,
+    bar: Progress,
+    controllers: Mapping[str, ControllerConfig | None],
+) -> None:
     """Tune laws for an objective per law. The file is written after every law."""
-    benchmark = gain_tuning.build_benchmark(chosen)
+    benchmark = registered_laws.with_courses(gain_tuning.build_benchmark(chosen), controllers)
     for name, aim in wanted:
-        task = bar.add_task("", total=gain_tuning.generation_count(LAWS[name], benchmark))
+        task = bar.add_task("", total=gain_tuning.generation_count(entries[name], benchmark))
 
         def show_cost(generation: int, least: float, task: Any = task, shown: str = f"tuning {name}, {aim}") -> None:
             bar.update(task, completed=generation, description=f"{shown}: cost {least:.3f}")
 
-        result = gain_tuning.tune(LAWS[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
+        result = gain_tuning.tune(entries[name], gain_tuning.OBJECTIVES[aim], benchmark, SEEDS, progress=show_cost)
         known = tuned_gains.load(path)
         known.setdefault(name, {})[aim] = result
         tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), command)
 
 
-def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Table:
+def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario) -> Table:
     units, of = display_units(scenario), " / ".join
     levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels))
     delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *found[0].lost_late))
@@ -146,19 +166,20 @@ def _table(tuned_on: str, found: Sequence[LawResult], scenario: Scenario) -> Tab
     )
     table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees", "knows"))
     for result in found:
+        law = entries[result.law]
         lost = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
         slew = zip(scenario.controller.inputs, result.slew.tolist(), strict=True)
         table.add_row(
-            *(result.law, LAWS[result.law].measurements, LAWS[result.law].model_data),
+            *(result.law, law.measurements, law.model_data),
             *law_comparison.score_cells(result),
             "/".join(f"{100.0 * share:.3g}" for share in lost),
             of(f"{value * units[name].factor:.0f}" for name, value in slew),
-            f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}",
+            f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}" if result.costs else "own gains",
         )
     return table
 
 
-def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: Iterable[str]) -> str:
+def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]) -> str:
     """What the words of the table mean."""
     units, controller = display_units(scenario), scenario.controller
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
@@ -171,7 +192,7 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: 
         whose = "all of them" if objective.all_late else "the nominal one"
         costs.append(f"{aim}: {winds}; u late by {objective.delay * delay:g} ms on {whose}")
     return NOTES.strip().format(
-        titles="\n".join(f"{name}: {LAWS[name].title}" for name in laws),
+        titles="\n".join(f"{name}: {law.title}" for name, law in laws.items()),
         unit=", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in errors),
         slew=", ".join(f"{one * units[name].factor:g} {units[name].unit}/s of {name}" for name, one in slews),
         costs="\n".join(f"  {cost}" for cost in costs),
@@ -182,17 +203,17 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Iterable[str], aims: 
     )
 
 
-def _as_json(one: LawResult, scenario: Scenario) -> dict[str, Any]:
-    """Figures of a law for JSON: SI, null for an infinite figure."""
-    controller, law = scenario.controller, LAWS[one.law]
+def _as_json(one: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
+    """Figures of a law for JSON: SI, null for an infinite figure, and for the cost of gains that no search found."""
+    controller = scenario.controller
     levels = [
         {"uncertainty": level.uncertainty} | {wind: scores._asdict() for wind, scores in level.scores.items()}
         for level in one.levels
     ]
     row = {"law": one.law, "sees": law.measurements, "knows": law.model_data, "tuned_on": one.objective}
     return row | {
-        "cost": min(one.costs),
-        "spread": max(one.costs) - min(one.costs),
+        "cost": min(one.costs, default=None),
+        "spread": max(one.costs) - min(one.costs) if one.costs else None,
         "score": finite_or_null(one.scores),
         "levels": finite_or_null(levels),
         "late": [{"delay": delay, "lost": lost} for delay, lost in one.lost_late.items()],

@@ -134,8 +134,8 @@ def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> Non
     console.print(_gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft))
     for name, answer in answers.items():
         if answer.margins is not None and answer.margins.nominal.stable:
-            headings = [f"{column.group}\n{column.head}" for column in MARGIN_COLUMNS]
-            table = new_table(f"\nMargins, {name}: nominal (worst sample)", ("input", *headings), left=("input",))
+            heads = ("input", *(f"{column.group}\n{column.head}" for column in MARGIN_COLUMNS))
+            table = new_table(f"\nMargins, {name}: nominal (worst sample)", heads, left=("input",))
             for row in margin_rows(answer.margins):
                 table.add_row(*row)
             console.print(table)

@@ -79,6 +79,34 @@ def _cell(value: float, worst: float | None, form: str) -> str:
     return text(value) if worst is None or alone else f"{text(value)} ({text(worst)})"
 
 
+LEAST_MARGINS = {
+    "phase margin, deg": ".0f",
+    "gain margin, dB": ".2g",
+    "largest sensitivity": ".2f",
+    "disk margin, all inputs": ".2f",
+    "damping of slow modes": ".2f",
+    "delay margin, ms": ".0f",
+}
+"""The least margins of a loop, each with its format: of the worst input, or of all inputs at once."""
+
+
+def least_margins(of: LoopMargins | None) -> list[str]:
+    """The values of LEAST_MARGINS: nominal (worst uncertain aircraft)."""
+    if of is None:
+        return [NO_VALUE] * len(LEAST_MARGINS)
+    nominal, worst = _least(of.nominal, of.delay), None if of.worst is None else _least(of.worst, of.worst_delay or 0.0)
+    formats = LEAST_MARGINS.values()
+    beside = [None] * len(nominal) if worst is None else worst
+    return [_cell(*values) for values in zip(nominal, beside, formats, strict=True)]
+
+
+def _least(margins: Margins, delay: float) -> list[float]:
+    """LEAST_MARGINS of a set of margins, in the units of the names."""
+    phase, gain = np.degrees(margins.phase.min()), decibels(margins.gain.min())
+    values = (phase, gain, margins.sensitivity.max(), margins.disk_all, margins.damping, 1e3 * delay)
+    return [float(value) for value in values]
+
+
 def modes_text(of: LoopMargins) -> str:
     """The slow modes with little damping as a sentence."""
     shown = [(w, zeta) for w, zeta in zip(*of.modes, strict=True) if zeta < SHOWN_DAMPING]
