@@ -30,6 +30,7 @@ from flight_cli.airframes import airframes
 from flight_cli.gains import gains as gains_command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from rise_di.gain_design import select_gains
 from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
 from rise_di_controller.laws import AnyLaw
@@ -543,3 +544,21 @@ def test_manoeuvre_leaves_out_what_airframe_does_not_have(osprey_gust: Scenario)
     assert set(manoeuvre.reference.outputs) == {"q", "V"}
     assert manoeuvre.reference.coordinated_turn is None
     assert not manoeuvre.gusts
+
+
+def test_limits_are_end_stops_of_own_aircraft() -> None:
+    # Airframe's order elevator, thrust, aileron, rudder; law's order elevator, aileron, rudder, thrust
+    stops = {"lower": [-0.35, -0.3, -0.4, -0.35], "upper": [0.35, 0.3, 0.4, 0.6]}
+    servo = find_scenario("osprey_servo")
+    actuators = servo.aircraft.actuators.model_dump() | stops
+    scenario = servo.vary(aircraft={"actuators": actuators})
+    chosen = select_gains("osprey", scenario, samples=2).engineering.controller
+    assert chosen.inputs == ("elevator", "aileron", "rudder", "thrust")
+    assert chosen.lower == (-0.35, -0.4, -0.35, -0.3)
+    assert chosen.upper == (0.35, 0.4, 0.523599, 0.3)  # the limit of the rudder in the scenario is the tighter
+
+
+def test_no_limits_of_another_aircraft() -> None:
+    foreign = AIRFRAME.model_copy(update={"name": "unlike the osprey"})
+    chosen = select_gains(foreign, "osprey_servo", samples=2).engineering.controller
+    assert (chosen.lower, chosen.upper, chosen.slew) == (None, None, None)

@@ -71,7 +71,7 @@ def select_gains(
     """
     chosen, frame = _scenario(scenario), _airframe(airframe)
     chosen.rise_di()
-    setting = _loop(chosen, frame, rate, y_rate, lag, delay)._replace(
+    setting = _with_limits(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame)._replace(
         inputs=tuple(inputs.split(",")) if isinstance(inputs, str) and inputs else tuple(inputs),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
@@ -150,6 +150,21 @@ def _loop(
             base=loop.base.model_copy(update={"max_age": age}),
         )
     return loop
+
+
+def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
+    """The loop with limits of u within the end stops of the scenario's actuators; without limits for another aircraft."""
+    aircraft = scenario.aircraft
+    if aircraft.is_jsbsim or load_airframe(aircraft.airframe).name != airframe.name:
+        return loop._replace(base=loop.base.model_copy(update=dict.fromkeys(gain_selection.INPUT_LIMITS)))
+    limits = {}
+    for key, tighter in (("lower", max), ("upper", min)):
+        stops = getattr(aircraft.actuators, key)
+        if stops:
+            by_input = dict(zip(aircraft.channels().inputs, stops, strict=True))
+            own = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
+            limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(own, loop.base.inputs, strict=True))
+    return loop._replace(base=loop.base.model_copy(update=limits))
 
 
 def _lags(lag: float | Sequence[float], airframe: Airframe) -> dict[str, float]:
