@@ -49,7 +49,8 @@ from rise_di_controller.rise_di import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
 """Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
-the crossover. Yaw has a margin for the dutch roll, speed for the engine."""
+the crossover. Yaw has a margin for the dutch roll, speed for the engine. The softened sign, 2.75 lags wide, is an integral and
+costs a further 27 to 43 degrees: `GainAssessment.margins` has the phase margin."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
 
