@@ -56,6 +56,7 @@ class Measurement(NamedTuple):
 
 SPEED = {
     "law": (10.0, "10 s"),
+    "receiver": (10.0, "10 s"),
     "node": (10.0, "1 min"),
     "latency": (10.0, "4 min"),
     "ticks": (60.0, "8 min"),

@@ -39,6 +39,7 @@ TOPICS = (
         "Speed",
         {
             "speed-law": "one step of the law",
+            "speed-receiver": "a message that a receiver refuses compared with a right one",
             "speed-node": "the controller's tick compared with an echo's callback",
             "speed-latency": "from y sent to u received, over DDS",
             "speed-ticks": "lateness of ticks",

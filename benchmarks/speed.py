@@ -6,7 +6,7 @@
 
 Ratios carry over to other hosts, the figures do not. Neither is valid on a host that is busy with other work.
 The baselines (`floor`): one NumPy operation, a subscription of rclpy whose callback publishes the message again (an echo), an
-empty timer of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags.
+empty timer of rclpy, a loop that only sleeps, a node of rclpy that only spins, the writer of rosbags, a right message.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks import law, lockstep, recorder
+from benchmarks import law, lockstep, receiver, recorder
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.nodes import open_node, ticks
 from benchmarks.processes import PRIORITY, RISE_DI, Child, delay_monitors, real_time, threads_ns
@@ -179,6 +179,13 @@ def law_rows() -> Iterator[Row]:
     """One step of the law, one inside its limits, one whole tick."""
     for name, (median, high, most) in law.measure().items():
         yield Row(name, {"p50 (us)": median, "p99.9 (us)": high, "max (us)": most}, law.FLOOR)
+
+
+def receiver_rows() -> Iterator[Row]:
+    """A message of y that has arrived: a right one, and refused ones of any size."""
+    for name, times in receiver.measure().items():
+        goals = () if name == receiver.RIGHT else (Goal("p50 (us)", 2.0, of_floor=True),)
+        yield Row(name, us(times), receiver.RIGHT, goals)
 
 
 def node_rows(seconds: float, folder: Path) -> Iterator[Row]:
@@ -384,6 +391,7 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
 Group = Callable[[float, Path], Iterator[Row]]
 GROUPS: dict[str, Group] = {
     "law": lambda seconds, folder: law_rows(),
+    "receiver": lambda seconds, folder: receiver_rows(),
     "node": node_rows,
     "latency": latency_rows,
     "ticks": lambda seconds, folder: tick_rows(seconds),

@@ -41,7 +41,10 @@ def receive_outputs(bridge: Bridge, t: float, names: tuple[str, ...] = OUTPUTS, 
 
 
 def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controller") -> None:
+    """As the receiver of the node."""
+    bridge.u_lock.check(sender, at(t))
     bridge.take_u(StampedVector(at(t), np.full(4, u), sender), at(t))
+    bridge.u_lock.refresh(sender, at(t))
 
 
 def unlimited(name: str) -> ChannelMap:

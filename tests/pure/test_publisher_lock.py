@@ -19,9 +19,9 @@ MAX_AGE, TAKEOVER = 100, 1000
 
 def locked(*senders: tuple[str, int]) -> PublisherLock:
     """A lock after samples of these publishers at these instants."""
-    lock = PublisherLock()
+    lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
     for sender, now_ns in senders:
-        lock.check(sender, now_ns, MAX_AGE, TAKEOVER)
+        lock.check(sender, now_ns)
         lock.refresh(sender, now_ns)
     return lock
 
@@ -32,18 +32,18 @@ def test_conflicting_publisher_ignored_until_timeout() -> None:
     for publisher in ("/aircraft#2", "/foreign", ""):
         sentence = f"conflicting publisher {publisher} ignored: already receiving from /aircraft#1"
         with pytest.raises(ChannelError, match=sentence) as ignored:
-            lock.check(publisher, 190, MAX_AGE, TAKEOVER)
+            lock.check(publisher, 190)
         assert ignored.value.reason == "sender"
-    lock.check("/aircraft#1", 10_000, MAX_AGE, TAKEOVER)  # the locked publisher itself, after any time
+    lock.check("/aircraft#1", 10_000)  # the locked publisher itself, after any time
 
 
 def test_restarted_node_takes_over_earlier() -> None:
     """A restarted node takes over after the age limit, a different node later."""
     lock = locked(("/aircraft#1", 0))
-    lock.check("/aircraft#2", MAX_AGE + 1, MAX_AGE, TAKEOVER)
+    lock.check("/aircraft#2", MAX_AGE + 1)
     with pytest.raises(ChannelError):
-        lock.check("/foreign", TAKEOVER, MAX_AGE, TAKEOVER)
-    lock.check("/foreign", TAKEOVER + 1, MAX_AGE, TAKEOVER)
+        lock.check("/foreign", TAKEOVER)
+    lock.check("/foreign", TAKEOVER + 1)
     assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
     assert not lock.timed_out(MAX_AGE, MAX_AGE)
 
@@ -53,15 +53,15 @@ def test_overrun_of_receiver_is_no_silence_of_publisher() -> None:
     lock.overran(5000)
     now_ns = 5000 + TAKEOVER
     with pytest.raises(ChannelError, match="already receiving from /aircraft#1"):
-        lock.check("/foreign", now_ns, MAX_AGE, TAKEOVER)
-    lock.check("/foreign", now_ns + 1, MAX_AGE, TAKEOVER)
+        lock.check("/foreign", now_ns)
+    lock.check("/foreign", now_ns + 1)
     assert lock.timed_out(now_ns, MAX_AGE)  # its sample is old, whatever the reason
     lock.refresh("/aircraft#1", now_ns)
-    lock.check("/foreign", now_ns + TAKEOVER + 1, MAX_AGE, TAKEOVER)  # an overrun counts once
+    lock.check("/foreign", now_ns + TAKEOVER + 1)  # an overrun counts once
 
 
 def test_a_change_of_publisher_is_returned_once() -> None:
-    lock = PublisherLock()
+    lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
     assert lock.timed_out(0, MAX_AGE)
     assert lock.refresh("/aircraft#1", 0)
     assert not lock.refresh("/aircraft#1", 1)

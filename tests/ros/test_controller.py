@@ -18,7 +18,7 @@ from rcl_interfaces.srv import GetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float64MultiArray, Header
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
 
@@ -211,9 +211,9 @@ def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, p
 @pytest.mark.parametrize(
     ("name", "message", "reason"),
     [
-        ("not a number", to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "bad"), "y: finite"),
-        ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "bad"), "y: name"),
-        ("wrong length", JointState(name=list(OUTPUTS), position=[1.0]), "y: length"),
+        ("not a number", to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "peer"), "y: finite"),
+        ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "peer"), "y: name"),
+        ("wrong length", JointState(header=Header(frame_id="peer"), name=list(OUTPUTS), position=[1.0]), "y: length"),
         ("old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "peer"), "y: order"),
         ("future stamp", to_message(time.time_ns() + 3600 * 10**9, OUTPUTS, np.full(4, 99.0), "peer"), "y: future"),
     ],

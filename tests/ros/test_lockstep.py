@@ -103,7 +103,7 @@ def nodes(start: Start, scenario: Path) -> dict[str, Process]:
         "reference_model": ("reference_model", []),
         "aircraft": ("aircraft_sim", ["-p", "control_rate:=100.0", "-p", "recorded:=true"]),
     }
-    shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true", "-p", "control_rate:=100.0")
+    shared = ("--ros-args", "--params-file", str(scenario), "-p", "lockstep:=true")
     return {role: start(f"{package}.main", *shared, *words) for role, (package, words) in overrides.items()}
 
 

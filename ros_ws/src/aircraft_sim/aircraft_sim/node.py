@@ -34,10 +34,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         super().__init__("aircraft", AircraftConfig)
         self._simulator = Simulator(self.parameters)
         self._u = np.zeros(len(self._simulator.inputs))
-        (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
+        self._publisher_lock = PublisherLock(self._timeouts_ns)
         self._u_stamp_ns = 0  # of the last u
         self._timeout_logged = False
-        self._u_subscription, self._decoder = self.subscribe(U), Decoder(self._simulator.inputs)
+        self._u_receiver = self.receive(U, Decoder(self._simulator.inputs).decode, self._accept_u, lock=self._publisher_lock)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
         self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(channels.POSE)
         self._y_encoder = self.encoder(self._simulator.outputs)
@@ -113,24 +113,29 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return self._number * self.period_ns() >= self._recorded_ns + WINDOW * self.period_ns()
 
     def awaited_topic(self) -> str:
-        return self._u_subscription.name if not self._u_received else self._recorded_subscription.name
+        return self._u_receiver.name if not self._u_received else self._recorded_subscription.name
 
     def _take_u(self, now_ns: int) -> bool:
-        received_any = False
-        limit = 1 if self.parameters.lockstep else None  # in lockstep there is one u for each y
-        for received in self._u_subscription.take(limit):
-            try:
-                if (sample := self._decoder.decode(received.message)) is not None:
-                    self._accept(sample, now_ns)
-                received_any = True  # without a sample the controller has no output at this instant of a lockstep flight
-            except ChannelError as error:
-                self.reject(self._u_subscription, error.reason, str(error))
+        """Take the received u. Returns whether there was a valid message.
+
+        A message without channels is valid: the controller has no output at this instant of a lockstep flight.
+        """
+        before = self._publisher_lock.publisher
+        valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
+        if self._publisher_lock.publisher != before:
+            self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")
         if self._timed_out(now_ns):
-            self.warn_no_publisher(self._u_subscription)
+            self.warn_no_publisher(self._u_receiver.subscription)
             if self._publisher_lock.publisher is not None and not self._timeout_logged:
                 self._timeout_logged = True
                 self.get_logger().error(self._failsafe_message)
-        return received_any
+        return any(valid)
+
+    def _accept_u(self, sample: StampedVector, now_ns: int) -> None:
+        """Take a u. Raises ChannelError where its stamp is bad."""
+        if not self.parameters.lockstep:
+            self._require_timely(sample, now_ns)
+        self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
 
     def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
         """Raise ChannelError where a u is stamped in the future, or before the last u, by more than the age limit.
@@ -144,23 +149,13 @@ class AircraftNode(FlightNode[AircraftConfig]):
         elif (behind_ns := self._u_stamp_ns - sample.stamp_ns) > self._max_age_ns:
             raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
 
-    def _accept(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a u. Raises ChannelError where its stamp is bad or it is from a conflicting publisher."""
-        self._publisher_lock.check(sample.sender, now_ns, self._max_age_ns, self._takeover_ns)
-        if not self.parameters.lockstep:
-            self._require_timely(sample, now_ns)
-        self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
-        if self._publisher_lock.refresh(sample.sender, now_ns):
-            self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")
-
     @property
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
-    @property
-    def _takeover_ns(self) -> int:
-        """Age of u from which another node may take over: u has reached trim."""
-        return self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
+    def _timeouts_ns(self) -> tuple[int, int]:
+        """Timeouts of the publisher of u. Another node may take over once u has reached trim."""
+        return self._max_age_ns, self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
 
     def _timed_out(self, now_ns: int) -> bool:
         return self._publisher_lock.timed_out(now_ns, self._max_age_ns)

@@ -70,7 +70,7 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
-        self.u_lock = PublisherLock()
+        self.u_lock = PublisherLock(self._u_timeouts_ns)
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
         self._overrides_at_engagement: dict[str, float] = {}
@@ -102,26 +102,24 @@ class Bridge:
                 value = last.value - math.expm1(-seconds(stamp_ns - last.stamp_ns) / row.low_pass) * (value - last.value)
         self._readings[name] = Reading(stamp_ns, value)
 
-    def require_sender(self, sender: str, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a u of a conflicting publisher.
+    def _u_timeouts_ns(self) -> tuple[int, int]:
+        """Timeouts of the publisher of u.
 
-        While engaged every other publisher conflicts, also after a timeout: its u would jump. The timeout ends the engagement.
+        While engaged every second publisher conflicts, also after a timeout: its u would jump. The timeout ends the engagement.
         """
         takeover_ns = sys.maxsize if self.phase is Phase.ENGAGED else self._max_age_ns
-        self.u_lock.check(sender, now_ns, takeover_ns, takeover_ns)
+        return takeover_ns, takeover_ns
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
-        """Take u, shape (m,) in the map's order. Raises ChannelError as `require_sender` does, and where its stamp is bad.
+        """Take u, shape (m,) in the map's order, of the publisher of `u_lock`. Raises ChannelError where its stamp is bad.
 
         A stamp is bad ahead of the clock by more than the age limit. After a timeout it is also bad behind it by more than
         this and the age limit of y, whose stamp u has: a played log does not begin to fly the autopilot.
         """
-        self.require_sender(sample.sender, now_ns)
         require_not_future(sample.stamp_ns, now_ns, self._max_age_ns)
         if self.u_timed_out(now_ns):
             require_not_old(sample.stamp_ns, now_ns, self._max_age_ns + self._max_y_age_ns)
         self._u = sample.value
-        self.u_lock.refresh(sample.sender, now_ns)
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a condition. A condition that is lost ends an engagement at the next step."""

@@ -60,7 +60,6 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._map = load_map(self.parameters.map)
         dry_run = self._map.dry_run if self.parameters.dry_run is None else self.parameters.dry_run
         self._bridge = Bridge(self._map, dry_run=dry_run)
-        self.publisher_locks = (self._bridge.u_lock,)
         self._logged = self._bridge.phase, self._bridge.reason
         self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
         self._began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
@@ -81,7 +80,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 _require_field(kind(), name, row)
             self._readers.append((self.subscribe(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
-        self._u_subscription, self._decoder = self.subscribe(U), Decoder(self._bridge.inputs)
+        self._u = self.receive(U, Decoder(self._bridge.inputs).decode, self._bridge.take_u, lock=self._bridge.u_lock)
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None
@@ -143,7 +142,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             if names not in self._pose_encoders:
                 self._pose_encoders[names] = self.encoder(names)
             self._publish_pose(self._pose_encoders[names].encode(pose.stamp_ns, pose.value))
-        if self._take_u(now_ns):
+        if any(self._u.poll(now_ns)):
             self._publish_would_send(self._would_send_encoder.encode(now_ns, self._bridge.raw_u()))
         self._bridge.step(now_ns)
         self._check_activation(now_ns)
@@ -172,7 +171,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         try:
             message = deserialize_message(raw, subscription.topic.type)
         except DeserializationError as error:
-            self.reject(subscription, "malformed", " ".join(str(error).split()))
+            self.refusals.add(subscription, "malformed", " ".join(str(error).split()))
             return
         for name, row in rows:
             try:
@@ -186,21 +185,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
                     stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
                 self._bridge.take_output(name, read_raw(message, row.field, row.function), stamp_ns - step_ns, now_ns)
             except ChannelError as error:
-                self.reject(subscription, error.reason, str(error))
-
-    def _take_u(self, now_ns: int) -> bool:
-        """Take the received u; whether there was a valid one."""
-        accepted = False
-        for received in self._u_subscription.take():
-            try:
-                sample = self._decoder.decode(received.message)
-                if sample is not None:
-                    self._bridge.require_sender(sample.sender, now_ns)
-                    self._bridge.take_u(sample, now_ns)
-                    accepted = True
-            except ChannelError as error:
-                self.reject(self._u_subscription, error.reason, str(error))
-        return accepted
+                self.refusals.add(subscription, error.reason, str(error))
 
     def _send(self, now_ns: int, slack_ns: int) -> None:
         for name, outgoing in self._outgoing.items():
@@ -292,7 +277,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             if any(name in stale for name, row in rows if isinstance(row, MeasuredRow)):
                 self.warn_no_publisher(subscription)
         if self._bridge.u_timed_out(now_ns):
-            self.warn_no_publisher(self._u_subscription)
+            self.warn_no_publisher(self._u.subscription)
 
     def _require_first_y(self, now_ns: int) -> None:
         """Raise FlightEnded with the reasons where y does not become complete in time."""
@@ -316,7 +301,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             return f"no publisher. The autopilot's agent needs the same DDS profile, {transport.PROFILE_VARIABLE}={profile}"
         kind = type_name(subscription.topic.type)
         faults = (mismatch(subscription.name, one, kind, subscription.qos) for one in publishers)
-        refused = (what for what in self.rejected if what.startswith(f"{subscription.topic.name}: "))
+        refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
         return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
 
     def graph_checks(self) -> list[Callable[[], None]]:
@@ -324,7 +309,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
         A topic with another publisher ends the engagement.
         """
-        outgoing = (partial(self.check_subscribers, one.publisher) for one in self._outgoing.values())
+        outgoing = (partial(self.endpoints.check_subscribers, one.publisher) for one in self._outgoing.values())
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:

@@ -5,6 +5,8 @@
 A message names the publisher in `frame_id`.
 """
 
+from collections.abc import Callable
+
 from flight_core.vectors import ChannelError
 
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
@@ -21,9 +23,13 @@ class PublisherLock:
 
     A restarted node, of the same name, may take over earlier than a different node. Overruns of the receiving node do not
     count: the first sample after an overrun may come from a different publisher.
+
+    `timeouts_ns` returns two ages of the last sample, above which a publisher has timed out: for the same node in a new
+    process, and for a different node.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, timeouts_ns: Callable[[], tuple[int, int]]) -> None:
+        self._timeouts_ns = timeouts_ns
         self.publisher: str | None = None
         self._received_ns = 0
         self._overrun_ns = 0  # since the last sample
@@ -40,13 +46,11 @@ class PublisherLock:
         """Leave a time out of the publisher's silence: the node itself did not run."""
         self._overrun_ns += duration_ns
 
-    def check(self, sender: str, now_ns: int, max_age_ns: int, takeover_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked publisher times out.
-
-        The timeout is `max_age_ns` for the same node in a new process, `takeover_ns` for a different node.
-        """
+    def check(self, sender: str, now_ns: int) -> None:
+        """Raise ChannelError, reason "sender", for a sample of a second publisher before the locked publisher times out."""
         if sender == self.publisher:
             return
+        max_age_ns, takeover_ns = self._timeouts_ns()
         restarted = self.publisher is not None and sender.partition("#")[0] == self.publisher.partition("#")[0]
         if not self.timed_out(now_ns - self._overrun_ns, max_age_ns if restarted else takeover_ns):
             raise ChannelError(SENDER, f"conflicting publisher {sender} ignored: already receiving from {self.publisher}")

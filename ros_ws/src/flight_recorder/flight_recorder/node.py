@@ -52,7 +52,7 @@ class _RecordedTopic:
     subscription: PolledSubscription
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
-    publisher: str = ""  # of the last message
+    publisher: str | None = None  # of the last message
     publishers: int = 0  # number of publishers at the last check
 
     @property
@@ -269,7 +269,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def graph_checks(self) -> list[Callable[[], None]]:
         foreign = (topic for topic in self._topics if topic.foreign)
-        checks = (partial(self.check_publishers, topic.name, topic.channel.type.name) for topic in foreign)
+        checks = (partial(self.endpoints.check_publishers, topic.name, topic.channel.type.name) for topic in foreign)
         return [*super().graph_checks(), *checks]
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:

@@ -2,8 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compatibility of the publishers and subscribers of a topic: message type and quality of service (QoS)."""
 
+from collections.abc import Sequence
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
+
+from flight_core.rates import NANOSECONDS
+from flight_ros.throttle import Throttle
+
+LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
 
 
 def type_name(message: type) -> str:
@@ -27,3 +36,32 @@ def mismatch(topic: str, peer: TopicEndpointInfo, message_type: str, qos: QoSPro
         if compatibility == QoSCompatibility.ERROR:
             return f"{topic}: {node} {verb} with incompatible quality of service: {reason}"
     return ""
+
+
+class EndpointMonitor:
+    """Logs an error for each peer of a node that does not match: the topic would stay silent."""
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._throttle = node, Throttle(LOG_PERIOD_NS)
+
+    def check_publishers(self, topic: str, message_type: str, qos: QoSProfile | None = None) -> None:
+        """Log an error for each publisher of a topic that does not match a subscription of this type and QoS."""
+        self._log_mismatches(topic, self._node.get_publishers_info_by_topic(topic), message_type, qos)
+
+    def check_subscribers(self, publisher: Publisher) -> None:
+        """Log an error for each subscriber of a topic that does not match a publisher of the node."""
+        topic = publisher.topic_name
+        # The graph reports the QoS of both sides in the same terms. A new publisher is not in it yet.
+        for own in self._node.get_publishers_info_by_topic(topic):
+            if own.node_name == self._node.get_name():
+                peers = self._node.get_subscriptions_info_by_topic(topic)
+                self._log_mismatches(topic, peers, own.topic_type, own.qos_profile)
+                return
+
+    def _log_mismatches(
+        self, topic: str, peers: Sequence[TopicEndpointInfo], message_type: str, qos: QoSProfile | None
+    ) -> None:
+        for peer in peers:
+            sentence = mismatch(topic, peer, message_type, qos)
+            if sentence and self._throttle.due(sentence):
+                self._node.get_logger().error(sentence)

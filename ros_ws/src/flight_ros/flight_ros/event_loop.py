@@ -160,7 +160,7 @@ def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: boo
     """
     for node in nodes:
         awaited = node.awaited_topic()
-        refused_ns, sentence = node.refusals.get(awaited, (0, ""))
+        refused_ns, sentence = node.refusals.last.get(awaited, (0, ""))
         if refused_ns >= advance_ns:
             raise FlightEnded(f"timed out waiting for {awaited}: a sample was refused: {sentence}")
     if not began:

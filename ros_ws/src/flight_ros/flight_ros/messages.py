@@ -27,6 +27,7 @@ STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsu
 STAMP_PLACE = len(ENCAPSULATION)
 LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
+FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
 NO_CHANNELS: FloatArray = np.zeros(0)
 
 
@@ -148,12 +149,15 @@ class NamedDecoder:
         return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)
 
 
-def sender_of(raw: bytes) -> str:
-    """The publisher of a message that begins with a header, read without decoding the rest; empty where there is none."""
-    if len(raw) < LENGTH_PLACE + COUNT.size:
-        return ""
+def sender_of(raw: bytes) -> str | None:
+    """The publisher of a message that begins with a header, read without decoding names and values.
+
+    None for bytes that are too short, or not little-endian.
+    """
+    if len(raw) < FRAME_ID_PLACE or raw[:2] != ENCAPSULATION[:2]:
+        return None
     (length,) = COUNT.unpack_from(raw, LENGTH_PLACE)
-    return publisher_of(raw[LENGTH_PLACE + COUNT.size : LENGTH_PLACE + COUNT.size + length - 1].decode(errors="replace"))
+    return publisher_of(raw[FRAME_ID_PLACE : FRAME_ID_PLACE + length - 1].decode(errors="replace"))
 
 
 def stamp_of(raw: bytes) -> int:

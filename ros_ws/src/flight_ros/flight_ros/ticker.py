@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ticker: a fixed rate on the monotonic clock with absolute deadlines, without drift and independent of the system clock."""
 
+import math
 import time
 from typing import NamedTuple
+
+import numpy as np
 
 SPIN_TIME = 2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
 MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
@@ -51,3 +54,40 @@ class Ticker:
         tick = Tick(number, max(self._last, 0), late_ns)
         self._last = number
         return tick
+
+
+class TickTimes:
+    """Periods and compute times of the ticks since the last report, and the number of missed ticks."""
+
+    def __init__(self) -> None:
+        self._periods: list[int] = []  # ns
+        self._compute: list[int] = []  # ns
+        self._missed = 0
+        self._begin_ns: int | None = None
+
+    def begin(self, tick: Tick) -> None:
+        """A tick begins."""
+        now_ns = time.monotonic_ns()
+        if self._begin_ns is not None:
+            self._periods.append(now_ns - self._begin_ns)
+        self._begin_ns = now_ns
+        self._missed += tick.missed
+
+    def end(self) -> None:
+        """The tick that began ends."""
+        self._compute.append(time.monotonic_ns() - (self._begin_ns or 0))
+
+    def report(self) -> dict[str, object]:
+        """Mean, 99th percentile and maximum in s of the times since the last report."""
+        report: dict[str, object] = {"missed ticks": self._missed}
+        for key, times in (("period", self._periods), ("compute time", self._compute)):
+            if times:
+                values = np.sort(times) * 1e-9
+                nearest = math.ceil(0.99 * len(values)) - 1  # np.percentile would import numpy.ma inside a tick
+                report |= {
+                    f"{key} mean (s)": f"{values.mean():.6f}",
+                    f"{key} p99 (s)": f"{values[nearest]:.6f}",
+                    f"{key} max (s)": f"{values[-1]:.6f}",
+                }
+                times.clear()
+        return report

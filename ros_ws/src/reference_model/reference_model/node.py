@@ -3,19 +3,29 @@
 """The reference model node: publishes y_m of equation (2) in real time or in lockstep."""
 
 from collections import deque
+from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from flight_core.channels import ATTITUDE
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns
-from flight_core.vectors import ChannelError, FloatArray, require_not_future, require_not_old
+from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, stamp_of
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, U_M, Y_M
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
+
+
+class Command(NamedTuple):
+    """A received u_m."""
+
+    stamp_ns: int
+    u_m: FloatArray
+    attitude: FloatArray | None  # phi and theta of the aircraft, where guidance sends them
+    sender: str
 
 
 class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
@@ -28,11 +38,10 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def __init__(self) -> None:
         super().__init__("reference_model", ReferenceModelConfig)
         self._reference = Reference(self.parameters)
+        self._start_ns = 0  # of the flight; in lockstep t = 0
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(self.parameters.outputs)
-        (self._publisher_lock,) = self.publisher_locks = (PublisherLock(),)
-        self._decoder = Decoder(self.parameters.outputs)
-        self._attitude_decoder = Decoder(ATTITUDE)
+        self._decoder, self._attitude_decoder = Decoder(self.parameters.outputs), Decoder(ATTITUDE)
         rate = self.parameters.u_m_rate
         self._u_m_ns = period_ns(rate, "u_m_rate") if rate else 0
         if self.parameters.lockstep:
@@ -40,8 +49,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             self._next: FloatArray | None = None
             self._clock_subscription = self.subscribe(CLOCK)
         if self._u_m_ns or not self.parameters.lockstep:
-            self._u_m_subscription = self.subscribe(U_M)
-            self._u_m_due: deque[bytes] = deque()
+            lock = PublisherLock(self._timeouts_ns)
+            self._u_m = self.receive(U_M, self._decode_u_m, self._take_u_m, lock=lock, max_age_ns=self._max_age_ns)
+            self._u_m_due: deque[Command | None] = deque()
 
     def period_ns(self) -> int:
         return self._reference.period_ns
@@ -52,43 +62,42 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def tick(self, tick: Tick, now_ns: int) -> None:
         before = self._reference.source()
         self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))
-        for received in self._u_m_subscription.take():
-            self._take_u_m(received.message, now_ns, now_ns - tick.number * self.period_ns())
+        self._start_ns = now_ns - tick.number * self.period_ns()
+        self._u_m.poll(now_ns)
         if (source := self._reference.source()) != before:
             self._log_source(source)
 
-    def _take_u_m(self, message: bytes, now_ns: int, start_ns: int) -> None:
-        """Give a u_m to the reference, unless it is invalid, old or from a conflicting publisher."""
-        live = self.parameters.live
-        max_age_ns, takeover_ns = nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
-        try:
-            sample = self._decoder.decode(message)
-            if sample is None:
-                return
-            self._publisher_lock.check(sample.sender, now_ns, max_age_ns, takeover_ns)
-            require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-            require_not_old(sample.stamp_ns, now_ns, max_age_ns)
-            self._reference.take(sample.stamp_ns - start_ns, sample.value, self._attitude(message))
-            self._publisher_lock.refresh(sample.sender, now_ns)
-        except ChannelError as error:
-            self.reject(self._u_m_subscription, error.reason, str(error))
+    def _max_age_ns(self) -> int:
+        return nanoseconds(self.parameters.live.max_age)
 
-    def _attitude(self, message: bytes) -> FloatArray | None:
-        """The attitude where the message has it. Read of accepted messages alone: a storm of others would delay y_m."""
+    def _timeouts_ns(self) -> tuple[int, int]:
+        """Timeouts of the publisher of u_m. Another node may take over once the wings are level."""
+        live = self.parameters.live
+        return nanoseconds(live.max_age), nanoseconds(live.max_age + live.levelling)
+
+    def _decode_u_m(self, raw: bytes) -> Command | None:
+        sample = self._decoder.decode(raw)
+        return None if sample is None else Command(sample.stamp_ns, sample.value, self._attitude(raw), sample.sender)
+
+    def _attitude(self, raw: bytes) -> FloatArray | None:
+        """The attitude where the message has it."""
         try:
-            sample = self._attitude_decoder.decode(message)
+            sample = self._attitude_decoder.decode(raw)
         except ChannelError as error:
             if error.reason != "name":
                 raise
             return None
         return None if sample is None else sample.value
 
+    def _take_u_m(self, command: Command, now_ns: int) -> None:
+        self._reference.take(command.stamp_ns - self._start_ns, command.u_m, command.attitude)
+
     def _log_source(self, source: str) -> None:
         if source == "ending":
             levels = "wings are levelled, then" if self.parameters.live.speed is not None else "from now on"
-            self.get_logger().error(f"{self._u_m_subscription.name} timed out: {levels} all commands are zero")
+            self.get_logger().error(f"{self._u_m.name} timed out: {levels} all commands are zero")
         else:
-            self.get_logger().info(f"commands from {self._u_m_subscription.name} replace the profile")
+            self.get_logger().info(f"commands from {self._u_m.name} replace the profile")
 
     def advance(self) -> bool:
         self._clock_ns = max([self._clock_ns, *(stamp_of(received.message) for received in self._clock_subscription.take())])
@@ -108,15 +117,16 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         if not self._u_m_ns or t_ns < 0 or t_ns % self._u_m_ns:
             return True
         if not self._u_m_due:
-            self._u_m_due.extend(received.message for received in self._u_m_subscription.take())
+            self._u_m_due.extend(self._u_m.receive())
         if not self._u_m_due:
             return False
-        self._take_u_m(self._u_m_due.popleft(), t_ns, 0)
+        if (command := self._u_m_due.popleft()) is not None:
+            self._u_m.accept(command, t_ns)
         return True
 
     def awaited_topic(self) -> str:
         waits = self._u_m_ns and self._next is None
-        return (self._u_m_subscription if waits else self._clock_subscription).name
+        return (self._u_m if waits else self._clock_subscription).name
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         level, _, figures = super().status()

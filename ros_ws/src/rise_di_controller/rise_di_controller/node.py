@@ -5,8 +5,6 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
-from functools import partial
-
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
@@ -44,8 +42,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
-        self._y_subscription, self._y_decoder = self.subscribe(Y), Decoder(outputs)
-        self._y_m_subscription, self._y_m_decoder = self.subscribe(Y_M), Decoder(outputs)
+        self._y = self.receive(Y, Decoder(outputs).decode, self._controller.take_y, lock=self._new_lock())
+        self._y_m = self.receive(Y_M, Decoder(outputs).decode, self._controller.take_y_m, lock=self._new_lock())
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.inputs)
         self._internals_encoder = self.encoder(self._controller.names)
@@ -54,10 +52,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self._inputs = LockstepInputs(
                 period_ns(self.parameters.y_rate, "y_rate"),
                 self.period_ns(),
-                partial(self.received, self._y_subscription, self._y_decoder),
-                partial(self.received, self._y_m_subscription, self._y_m_decoder),
+                self._y.receive,
+                self._y_m.receive,
             )
-        self._y_publisher_lock, self._y_m_publisher_lock = self.publisher_locks = PublisherLock(), PublisherLock()
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
             self.trigger_configure()
@@ -102,13 +99,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             for instant_ns in instants:
                 self._step(instant_ns, 0)
         self._last_ns = now_ns
-        for subscription, decoder, take, lock in (
-            (self._y_subscription, self._y_decoder, self._controller.take_y, self._y_publisher_lock),
-            (self._y_m_subscription, self._y_m_decoder, self._controller.take_y_m, self._y_m_publisher_lock),
-        ):
-            for sample in self.received(subscription, decoder):
-                if sample is not None:
-                    self.accept(subscription, take, sample, now_ns, lock, *self._ages_ns())
+        self._y.poll(now_ns)
+        self._y_m.poll(now_ns)
         self._step(now_ns, tick.late_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
@@ -117,7 +109,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
-    def _ages_ns(self) -> tuple[int, int]:
+    def _new_lock(self) -> PublisherLock | None:
+        """None in lockstep, where each sample of y is an instant, of any publisher."""
+        return None if self.parameters.lockstep else PublisherLock(self._timeouts_ns)
+
+    def _timeouts_ns(self) -> tuple[int, int]:
         """Ages above which a publisher has timed out: for the same node in another process, and for another node.
 
         Another one may take over once the failsafe has brought u to trim.
@@ -143,24 +139,24 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         advanced = False
         for now_ns, due, y, y_m in self._inputs.complete():
             if y is not None:
-                self.accept(self._y_subscription, self._controller.take_y, y, now_ns)
+                self._y.accept(y, now_ns)
             for sample in y_m:
-                self.accept(self._y_m_subscription, self._controller.take_y_m, sample, now_ns)
+                self._y_m.accept(sample, now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
         return advanced
 
     def awaited_topic(self) -> str:
-        return (self._y_m_subscription if self._inputs.has_y else self._y_subscription).name
+        return (self._y_m if self._inputs.has_y else self._y).name
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._controller.stale(now_ns)
-        for subscription in (self._y_subscription, self._y_m_subscription):
-            if subscription.topic.name in stale:
-                self.warn_no_publisher(subscription)
+        for receiver in (self._y, self._y_m):
+            if receiver.subscription.topic.name in stale:
+                self.warn_no_publisher(receiver.subscription)
         if not stale:
-            pair = f"no {self._y_m_subscription.name} at the stamp of {self._y_subscription.name}"
+            pair = f"no {self._y_m.name} at the stamp of {self._y.name}"
             self.get_logger().warning(f"{pair}: check for a delay and for different clocks", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:

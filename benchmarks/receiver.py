@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Time of a receiver for one message of y that has arrived: a right one taken by the controller, and refused ones.
+
+python -m benchmarks.speed --only receiver
+"""
+
+import time
+
+import numpy as np
+from benchmarks.nodes import open_node
+
+from flight_bringup.scenarios import find_scenario
+from flight_core.publisher_lock import PublisherLock
+from flight_core.vectors import FloatArray
+from flight_ros.messages import Decoder, Encoder
+from flight_ros.receiver import MAX_SIZE, Receiver, Refusals
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import NEWEST_SAMPLES, Y
+from rise_di_controller.controller import Controller
+
+RIGHT = "right message, taken"
+REPEATS, WARM_UP = 20_000, 200
+OWN, FOREIGN = "/aircraft#1", "/foreign#2"
+TAKEOVER_NS = 10**15  # no publisher times out
+
+
+def long_message(sender: str, size: int) -> bytes:
+    """A message of this many bytes, or some less, of channels that the controller does not want."""
+    count = (size - 100) // 20  # 12 bytes a name, 8 a value
+    return Encoder([f"c{k:05}" for k in range(count)], sender).encode(0, np.zeros(count))
+
+
+def measure() -> dict[str, FloatArray]:
+    """Times of one message each, ns, of a right message and of refused ones."""
+    parameters = find_scenario("osprey_gust").controller
+    controller, encoder = Controller(parameters), Encoder(parameters.outputs, OWN)
+    refused = {
+        "message of a conflicting publisher, refused": Encoder(parameters.outputs, FOREIGN).encode(0, np.zeros(4)),
+        f"message of a conflicting publisher of {MAX_SIZE} bytes, refused": long_message(FOREIGN, MAX_SIZE),
+        "message of a conflicting publisher of 1.2 MB, refused": long_message(FOREIGN, 1_200_000),
+        "message under the name of the publisher of 1.2 MB, refused": long_message(OWN, 1_200_000),
+    }
+    took = {name: np.empty(REPEATS) for name in (RIGHT, *refused)}
+    with open_node("receiver") as node:
+        subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
+        lock = PublisherLock(lambda: (TAKEOVER_NS, TAKEOVER_NS))
+        receiver = Receiver(subscription, Refusals(node), Decoder(parameters.outputs).decode, controller.take_y, lock=lock)
+
+        for k in range(REPEATS):  # in turn, since the speed of the host drifts
+            for name, message in {RIGHT: encoder.encode(k, np.full(4, 1e-6 * k)), **refused}.items():
+                begin_ns = time.perf_counter_ns()
+                receiver.take_message(message, REPEATS)
+                took[name][k] = time.perf_counter_ns() - begin_ns
+    return {name: times[WARM_UP:] for name, times in took.items()}

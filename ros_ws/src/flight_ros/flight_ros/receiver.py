@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Receivers: the samples of a topic, checked and taken at a tick. Refused samples are counted and logged."""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Generic, Protocol, TypeVar
+
+from rclpy.node import Node
+
+from flight_core.publisher_lock import SENDER, PublisherLock
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import ChannelError, require_not_future, require_not_old
+from flight_ros.messages import sender_of
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.throttle import Throttle
+
+MAX_SIZE = 16_384
+"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest of a flight, has 1,844."""
+
+LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one topic and reason
+
+
+class Sample(Protocol):
+    """What a receiver needs of a decoded message."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """The instant to which the sample belongs."""
+
+    @property
+    def sender(self) -> str:
+        """The publisher."""
+
+
+S = TypeVar("S", bound=Sample)
+
+
+def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
+    """Raise ChannelError, reason "size", for a message of more bytes."""
+    if len(raw) > limit:
+        raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
+
+
+class Refusals:
+    """The refused samples of a node."""
+
+    def __init__(self, node: Node) -> None:
+        self.counts: Counter[str] = Counter()  # by "topic: reason"
+        self.last: dict[str, tuple[int, str]] = {}  # by full topic: instant on the monotonic clock, and sentence
+        self._node = node
+        self._throttle = Throttle(LOG_PERIOD_NS)
+        self._conflict = ""
+
+    def add(self, subscription: PolledSubscription, reason: str, sentence: str) -> None:
+        """Count a refused sample, and log at most one in 2 s for each topic and reason.
+
+        A conflicting publisher is an ERROR, here and in the diagnostics.
+        """
+        key = f"{subscription.topic.name}: {reason}"
+        self.counts[key] += 1
+        self.last[subscription.name] = time.monotonic_ns(), sentence
+        if reason == SENDER:
+            self._conflict = f"{subscription.name}: {sentence}"
+        if not self._throttle.due(key):
+            return
+        if reason == SENDER:
+            self._node.get_logger().error(f"{subscription.name}: sample refused: {sentence}")
+        else:
+            self._node.get_logger().warning(f"{subscription.name}: sample refused: {sentence}")
+
+    def conflict(self) -> str:
+        """The last sample of a conflicting publisher since the last call, as a sentence; empty without a conflict."""
+        sentence, self._conflict = self._conflict, ""
+        return sentence
+
+
+class Receiver(Generic[S]):
+    """The samples of one topic. Checks go from cheap to costly: size, publisher, content, stamp.
+
+    A message that is too long, or of a conflicting publisher, is refused without decoding names and values: a flood of these
+    messages costs no more than as many right ones. `decode` returns None for a vector without channels. `take` gets a sample
+    and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
+    the lead over the clock; None leaves stamps to `take`. All of these raise ChannelError to refuse.
+    """
+
+    def __init__(
+        self,
+        subscription: PolledSubscription,
+        refusals: Refusals,
+        decode: Callable[[bytes], S | None],
+        take: Callable[[S, int], None],
+        *,
+        lock: PublisherLock | None = None,
+        max_age_ns: Callable[[], int] | None = None,
+    ) -> None:
+        self.subscription, self.lock = subscription, lock
+        self._refusals, self._decode, self._take = refusals, decode, take
+        self._max_age_ns = max_age_ns
+
+    @property
+    def name(self) -> str:
+        """The full name of the topic."""
+        return self.subscription.name
+
+    def poll(self, now_ns: int, limit: int | None = None) -> list[bool]:
+        """Take the messages since the last call, at most `limit`. Returns whether each message was valid."""
+        return [self.take_message(received.message, now_ns) for received in self.subscription.take(limit)]
+
+    def take_message(self, raw: bytes, now_ns: int) -> bool:
+        """Check and take a message. Returns whether the message was valid."""
+        try:
+            require_size(raw)
+            if self.lock is not None and (sender := sender_of(raw)) is not None:
+                self.lock.check(sender, now_ns)
+            if (sample := self._decode(raw)) is not None:
+                self._accept(sample, now_ns)
+        except ChannelError as error:
+            self._refusals.add(self.subscription, error.reason, str(error))
+            return False
+        return True
+
+    def receive(self) -> list[S | None]:
+        """Lockstep: decode the messages since the last call, for `accept`. None: without channels, or refused."""
+        samples: list[S | None] = []
+        for received in self.subscription.take():
+            try:
+                require_size(received.message)
+                samples.append(self._decode(received.message))
+            except ChannelError as error:
+                self._refusals.add(self.subscription, error.reason, str(error))
+                samples.append(None)
+        return samples
+
+    def accept(self, sample: S, now_ns: int) -> None:
+        """Check and take a decoded sample."""
+        try:
+            self._accept(sample, now_ns)
+        except ChannelError as error:
+            self._refusals.add(self.subscription, error.reason, str(error))
+
+    def _accept(self, sample: S, now_ns: int) -> None:
+        if self.lock is not None:
+            self.lock.check(sample.sender, now_ns)
+        if self._max_age_ns is not None:
+            max_age_ns = self._max_age_ns()
+            require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+            require_not_old(sample.stamp_ns, now_ns, max_age_ns)
+        self._take(sample, now_ns)
+        if self.lock is not None:
+            self.lock.refresh(sample.sender, now_ns)

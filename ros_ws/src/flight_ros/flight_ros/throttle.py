@@ -1,0 +1,21 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Throttle of repeated log lines. That of rclpy counts by the line of code, not by topic and reason."""
+
+import time
+
+
+class Throttle:
+    """Lets a line of the log pass once in a period."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._passed_ns: dict[str, int] = {}  # by line
+
+    def due(self, line: str) -> bool:
+        """Whether the line has not passed for a period; then the line passes now."""
+        now_ns = time.monotonic_ns()
+        due = now_ns - self._passed_ns.get(line, -self._period_ns) >= self._period_ns
+        if due:
+            self._passed_ns[line] = now_ns
+        return due
