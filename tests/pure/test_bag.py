@@ -449,7 +449,7 @@ def first_chunk(log: bytes) -> tuple[bytes, list[int]]:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_wrong_message_index_changes_nothing_that_read(data: st.DataObject, recorded: Path) -> None:
+def test_wrong_message_index_changes_no_message(data: st.DataObject, recorded: Path) -> None:
     """The index saves the steps from message to message: it must agree with them, or they are taken."""
     chunk, places = first_chunk((recorded / "run_0.mcap").read_bytes())
     by_steps = messages_of(chunk, b"")

@@ -89,7 +89,7 @@ def test_worst_flights_kept_with_diverged_ones_first() -> None:
     diverged = scores == 4.0
     halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
     total = halves[0] + halves[1]
-    assert [one.number for one in total.worst] == [4, *range(29, 29 - WORST_KEPT + 1, -1)]
+    assert [flight.number for flight in total.worst] == [4, *range(29, 29 - WORST_KEPT + 1, -1)]
     assert total.worst[0].score is None
     assert (total.flights, total.diverged, total.lost) == (30, 1, 19)  # 11 to 29 are above 10
     assert total.figures["score"].count == 29
@@ -215,7 +215,7 @@ def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> 
         "published": define(gusty, 20, 0.5, 7, 20, wind="published"),
         "scenario": define(published, 20, 0.5, 7, 20),
     }
-    tallies = {name: fly_campaign(tmp_path / name, one).tally(0) for name, one in of.items()}
+    tallies = {name: fly_campaign(tmp_path / name, campaign).tally(0) for name, campaign in of.items()}
     # Half of Z_alpha with the whole force of the gust has a larger error.
     assert tallies["own"].figures["score"].largest < 0.9 * tallies["published"].figures["score"].largest
     assert tallies["scenario"] == tallies["published"]  # its own uncertain aircraft does not fly
@@ -334,7 +334,7 @@ def refusal(*words: str) -> str:
 
 
 @pytest.mark.parametrize("content", ["", Tally.of(0, np.zeros(9), {"score": np.ones(9)}).model_dump_json()])
-def test_chunk_that_damaged_or_of_another_campaign_named(flown: Campaign, content: str) -> None:
+def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, content: str) -> None:
     path = flown.folder / CHUNKS / "0-000000.json"
     path.write_text(content, encoding="utf-8")
     assert refusal("--resume", str(flown.folder)).startswith(
@@ -443,7 +443,7 @@ def test_chunk_that_ends_workers_is_one_sentence() -> None:
 def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:
     spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)
-    workers = [one for one in psutil.Process(spread.pid).children(recursive=True) if one.cpu_times().user > 0.5]
+    workers = [process for process in psutil.Process(spread.pid).children(recursive=True) if process.cpu_times().user > 0.5]
     assert workers, "no worker of dask found"
     workers[0].kill()
     assert figures(spread) == whole

@@ -211,7 +211,7 @@ def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["mavros", "rosflight"])
-def test_override_that_offered_reliably_is_not_lost(name: str) -> None:
+def test_reliably_offered_override_is_not_lost(name: str) -> None:
     """Publishers of rc_io.cpp:47 and rosflight_io.cpp:534, with ROS 2's default reliability."""
     channel_map = named_map(name)
     assert {channel_map.topics[row.topic].reliability for row in channel_map.overrides.values()} == {"reliable"}

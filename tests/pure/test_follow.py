@@ -165,7 +165,7 @@ def test_index_with_more_entries_than_chunk_has_messages_counts_as_damage(record
 
 
 @pytest.mark.parametrize("part", [0.4, 1.0])
-def test_file_that_replaced_is_not_read_on(part: float, run: Path) -> None:
+def test_replaced_file_is_not_read_on(part: float, run: Path) -> None:
     path, content = run / "run_0.mcap", (run / "run_0.mcap").read_bytes()
     path.write_bytes(content[: len(content) // 2])
     follower = Follower(run, all_of)

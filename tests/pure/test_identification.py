@@ -334,7 +334,7 @@ def test_aircraft_that_does_not_trim_gives_one_sentence(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_file_is_overwritten_only_if_it_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_overwritten_only_if_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "jsbsim_c172p.yaml").write_text("mine\n", encoding="utf-8")
     refused = rise_di("jsbsim:c172p", "--speed", "46", "--altitude", "900").exception

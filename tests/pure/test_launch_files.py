@@ -256,7 +256,7 @@ def test_flight_ends_after_duration_and_in_lockstep_when_aircraft_completes_it(t
 
 
 @pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
-def test_live_page_served_where_it_asked_for_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
+def test_live_page_served_on_request_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
     assert not every(ExecuteProcess, started(name, **given, runs=tmp_path)[0])
     actions, context = started(name, **given, watch="true", runs=tmp_path)
     (page,) = every(ExecuteProcess, actions)

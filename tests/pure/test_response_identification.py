@@ -97,7 +97,7 @@ def test_output_that_never_moves_refused_by_name() -> None:
     assert found.Omega[1, 0] == 0.0
 
 
-def test_short_log_refused_with_time_that_needed() -> None:
+def test_short_log_refused_with_needed_time() -> None:
     y, u = flown(0.1, seconds=5.0)
     with pytest.raises(ParameterError, match=r"the log: found .* s in which u acts .* expected .* s or more"):
         identified(y, u)

@@ -65,7 +65,7 @@ class Page:
         return found
 
 
-def test_target_that_guidance_does_not_take_ends_at_once_when_it_cancelled(peer_node: Peer) -> None:
+def test_target_not_taken_by_guidance_ends_when_cancelled(peer_node: Peer) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
         sent = worker.submit(client.send_target, {"phi": 0.1})
         guidance = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force

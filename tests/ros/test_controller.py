@@ -319,7 +319,7 @@ def test_deactivated_controller_publishes_trim_but_standby_that_was_never_activa
     assert peer_node.received["internals"] == []
 
 
-def test_controller_that_starts_inactive_publishes_trim_until_it_activated(start_node: Start, peer_node: Peer) -> None:
+def test_controller_that_starts_inactive_publishes_trim_until_activated(start_node: Start, peer_node: Peer) -> None:
     start_node("rise_di_controller", "-p", "start_active:=false")
     peer_node.until(lambda: len(peer_node.received["u"]) > 20, each=lambda: peer_node.send(0.01))
     assert peer_node.call(GetState, "controller/get_state", GetState.Request()).current_state.label == "inactive"

@@ -160,7 +160,7 @@ def test_modes_of_second_controller_refused(flight: Flight) -> None:
     assert flight.last("target.heading") == 1.0  # that of an INACTIVE controller is forgotten
 
 
-def test_route_to_stopped_guidance_ends_at_once_when_it_cancelled(flight: Flight) -> None:
+def test_route_to_stopped_guidance_ends_when_cancelled(flight: Flight) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker, flight.process.stopped():
         sent = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
         flight.until(lambda: flight.peer.node.count_publishers("route") == 1)

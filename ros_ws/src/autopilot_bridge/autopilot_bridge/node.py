@@ -300,7 +300,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             profile = os.environ.get(transport.PROFILE_VARIABLE, "")
             return f"no publisher. The autopilot's agent needs the same DDS profile, {transport.PROFILE_VARIABLE}={profile}"
         kind = type_name(subscription.topic.type)
-        faults = (mismatch(subscription.name, one, kind, subscription.qos) for one in publishers)
+        faults = (mismatch(subscription.name, publisher, kind, subscription.qos) for publisher in publishers)
         refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
         return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
 
@@ -309,7 +309,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
         A topic with another publisher ends the engagement.
         """
-        outgoing = (partial(self.endpoints.check_subscribers, one.publisher) for one in self._outgoing.values())
+        outgoing = (
+            partial(self.endpoints.check_subscribers, outgoing_message.publisher)
+            for outgoing_message in self._outgoing.values()
+        )
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
     def _find_conflicts(self) -> None:

@@ -151,7 +151,7 @@ class FlightMonitor(_Client):
     def engagement(self) -> list[tuple[str, str]]:
         """Phases of a bridge with their reasons, in order, since the last call."""
         messages = () if self._engagement is None else self._engagement.take()
-        return [(one.message.key, one.message.value) for one in messages]
+        return [(received.message.key, received.message.value) for received in messages]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""
@@ -227,7 +227,7 @@ class EngagementClient(_Client):
 
     def _received_phases(self) -> list[tuple[str, str]]:
         """Phases of the bridge with their reasons, since the request."""
-        self._phases += [(one.message.key, one.message.value) for one in self._engagement_subscription.take()]
+        self._phases += [(received.message.key, received.message.value) for received in self._engagement_subscription.take()]
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:
@@ -350,7 +350,7 @@ class ControlClient(_Client):
 
     def _reaches_guidance(self, publisher: Publisher) -> bool:
         """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
-        known = [one.node_name for one in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
         return "guidance" in known and len(known) <= publisher.get_subscription_count()
 
     def hold(self) -> str:

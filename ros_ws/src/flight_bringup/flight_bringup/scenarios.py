@@ -33,7 +33,9 @@ def with_route(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Scenario:
     Raises ParameterError where it cannot be flown.
     """
     flown = speeds(waypoints, scenario.aircraft.channels().speed)
-    route = {key: [getattr(one, key) for one in waypoints] for key in ("north", "east", "altitude")} | {"V": list(flown)}
+    route = {key: [getattr(waypoint, key) for waypoint in waypoints] for key in ("north", "east", "altitude")} | {
+        "V": list(flown)
+    }
     return scenario.vary(guidance={"route": route, "program": {}})
 
 

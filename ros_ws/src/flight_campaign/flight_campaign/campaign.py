@@ -59,7 +59,7 @@ class Definition(Config):
         if self.sweep is None:
             return scenario
         value, factor = getattr(scenario.controller, self.sweep.parameter), self.factor(case)
-        scaled = tuple(factor * one for one in value) if isinstance(value, tuple) else factor * value
+        scaled = tuple(factor * number for number in value) if isinstance(value, tuple) else factor * value
         return scenario.vary(controller={self.sweep.parameter: scaled})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:

@@ -136,9 +136,9 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
 def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
     columns = [Column("", head) for head in ("aircraft", "score", "fly it again")]
     rows = [
-        [label, str(one["number"]), "diverged" if one["score"] is None else f"{one['score']:.3g}", one["command"]]
+        [label, str(flight["number"]), "diverged" if flight["score"] is None else f"{flight['score']:.3g}", flight["command"]]
         for label, case in zip(labels, cases, strict=True)
-        for one in case["fly_again"]
+        for flight in case["fly_again"]
     ]
     return Table("Worst flights", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
 
@@ -186,9 +186,9 @@ def _sweep(definition: Definition, tallies: Sequence[Tally]) -> plotting.Figure 
         return None
     figure = plotting.Figure(1, 1, 260)
     scores = [tally.figures["score"] for tally in tallies]
-    curves = {"mean": [one.mean for one in scores]}
-    curves |= {label: [one.quantile(share) for one in scores] for label, share in SPREAD.items()}
-    curves["worst"] = [one.largest for one in scores]
+    curves = {"mean": [score.mean for score in scores]}
+    curves |= {label: [score.quantile(share) for score in scores] for label, share in SPREAD.items()}
+    curves["worst"] = [score.largest for score in scores]
     for (label, values), colour in zip(curves.items(), COLOURS, strict=True):
         look = {"type": "scatter", "mode": "lines+markers", "name": label, "line": {"color": colour}}
         figure.add(look | {"x": np.array(definition.sweep.factors), "y": np.array(values)})

@@ -233,7 +233,10 @@ def tune(
         return dict(zip(begin, np.split(np.exp(vectors.T), ends), strict=True))
 
     together = POPULATION * len(seeds) // PARTS
-    flights = [one._replace(fleet=repeat_flights(one.fleet, together)) for one in evaluations(objective, benchmark)]
+    flights = [
+        evaluation._replace(fleet=repeat_flights(evaluation.fleet, together))
+        for evaluation in evaluations(objective, benchmark)
+    ]
     each, control_law, of_one = len(flights[0].weight), law.control_law(benchmark.model), law.params(begin, benchmark.model)
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:

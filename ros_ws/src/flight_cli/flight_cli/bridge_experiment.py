@@ -137,7 +137,7 @@ def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:
         raise ParameterError(f"{run}: found no engagement, expected a flight in which the bridge was engaged")
-    return tape, [(one.start_ns, one.stop_ns or int(tape["u"].stamp_ns[-1])) for one in flown]
+    return tape, [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
 
 
 def _digits(value: float, digits: int) -> str:

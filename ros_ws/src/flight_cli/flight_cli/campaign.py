@@ -183,12 +183,12 @@ def _write_results(monte_carlo: Campaign) -> tuple[dict[str, Any], Table]:
 def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
     """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
     again = []
-    for one in tally.worst[:RERUN]:
+    for flight in tally.worst[:RERUN]:
         suffix = "" if monte_carlo.definition.sweep is None else f"_{monte_carlo.definition.factor(case):g}"
-        path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{one.number}.yaml"
-        write_file(path, scenario_yaml(monte_carlo.definition.aircraft_scenario(one.number, case)))
+        path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{flight.number}.yaml"
+        write_file(path, scenario_yaml(monte_carlo.definition.aircraft_scenario(flight.number, case)))
         command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
-        again.append({"number": one.number, "score": one.score, "command": command})
+        again.append({"number": flight.number, "score": flight.score, "command": command})
     return again
 
 
@@ -205,10 +205,10 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
         share, low, high = tally.share(count)
         console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
-    for one in figures["fly_again"]:
-        score = "diverged" if one["score"] is None else f"score {one['score']:.3g}"
+    for flight in figures["fly_again"]:
+        score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"
         console.print(
-            f"worst: aircraft {one['number']}, {score}; again: {one['command']} (or --lockstep, over topics)",
+            f"worst: aircraft {flight['number']}, {score}; again: {flight['command']} (or --lockstep, over topics)",
             soft_wrap=True,
             highlight=False,
         )

@@ -57,15 +57,15 @@ def _guidance_table(segments: Sequence[Mapping[str, Any]]) -> Table:
     """What guidance held in each segment: rms and largest error."""
     headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
     table = new_table("Guidance by segment, in m, m/s and deg", headings, left=("segment",))
-    for one in segments:
-        held = one["lateral"], one["vertical"]
+    for segment in segments:
+        held = segment["lateral"], segment["vertical"]
         units = [QUANTITY_UNITS[each["quantity"]] for each in held]
         names = ", ".join(each["quantity"] for each in held)
         errors = [
             format_value(each[name], unit.factor) for each, unit in zip(held, units, strict=True) for name in ("rms", "max")
         ]
-        leg = "" if one["leg"] is None else f"leg {one['leg']}: "
-        table.add_row(leg + names, f"{one['stop']:.1f}", *errors, format_value(one["V"]["rms"]))
+        leg = "" if segment["leg"] is None else f"leg {segment['leg']}: "
+        table.add_row(leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"]))
     return table
 
 

@@ -51,9 +51,9 @@ def watch(
     require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
     require(not namespace or control or control_real, "--namespace", "no --control", "--control beside it")
     chosen = [newest_run(runs) if run is None else run, *([ghost] if ghost is not None else [])]
-    for one in chosen:
+    for folder in chosen:
         if not wait:
-            require_log(one)
+            require_log(folder)
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
         require(ghost is None, "--text", "two runs", "one run")
@@ -98,8 +98,8 @@ def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: s
         try:
             serve(runs, ports, _announce, control)
         finally:
-            for one in controls:
-                one.close()
+            for opened in controls:
+                opened.close()
 
 
 @contextmanager

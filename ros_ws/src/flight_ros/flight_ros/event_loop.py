@@ -95,9 +95,9 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         node.get_logger().fatal(f"unexpected exception, the node ends: {traceback.format_exc()}")
         sys.exit(1)
     finally:
-        for one in nodes:
-            one.finish()
-            one.destroy_node()
+        for node in nodes:
+            node.finish()
+            node.destroy_node()
         rclpy.try_shutdown()
 
 

@@ -192,7 +192,7 @@ class FlightNode(Node, Generic[P]):
 
         They log an error for each peer with another message type or incompatible QoS: its topic would stay silent.
         """
-        subscribed = ((one.name, type_name(one.topic.type), one.qos) for one in self.polled_subscriptions)
+        subscribed = ((receiver.name, type_name(receiver.topic.type), receiver.qos) for receiver in self.polled_subscriptions)
         return [
             *(partial(self.endpoints.check_subscribers, publisher) for publisher in self._flight_publishers),
             *(partial(self.endpoints.check_publishers, *topic) for topic in subscribed),

@@ -217,5 +217,7 @@ def _tuned_scenario(scenario: Scenario) -> Scenario:
     """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
     shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
     own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
-    alike = (one for one in shipped if (one.aircraft.airframe, one.aircraft.actuators.lag) == own)
-    return next((one for one in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(one))), scenario)
+    alike = (candidate for candidate in shipped if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == own)
+    return next(
+        (candidate for candidate in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(candidate))), scenario
+    )

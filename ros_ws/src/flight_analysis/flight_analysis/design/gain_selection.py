@@ -543,7 +543,7 @@ def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) 
 def yaml_flow(value: Any, precision: int = 6) -> str:
     """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(yaml_flow(one, precision) for one in value)}]"
+        return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {yaml_flow(one)}" for key, one in value.items()) + "}"
     if isinstance(value, bool):

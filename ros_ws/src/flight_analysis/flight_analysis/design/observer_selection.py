@@ -257,7 +257,7 @@ def _parameters(
     whole[-1] = MIN_K
     share = K / whole
     k_g = MIN_K - 1.0
-    Phi, Gamma, L, F = (tuple(one.ravel().tolist()) for one in (design.Phi, design.Gamma, design.L, design.F))
+    Phi, Gamma, L, F = (tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F))
     require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
     observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
     changes: dict[str, Any] = {
