@@ -62,6 +62,7 @@ SPEED = {
     "ticks": (60.0, "8 min"),
     "flight": (10.0, "1 min"),
     "start": (10.0, "1 min"),
+    "import": (10.0, "10 s"),
     "lockstep": (30.0, "1 min"),
     "recorder": (30.0, "1 min"),
 }

@@ -45,6 +45,7 @@ TOPICS = (
             "speed-ticks": "lateness of ticks",
             "speed-flight": "CPU and memory of each process of a flight in real time",
             "speed-start": "from the start of a process to its first u",
+            "speed-import": "processor time of `import rise_di` and of `rise-di --help`",
             "speed-lockstep": "lockstep flights",
             "speed-recorder": "the recorder at 1 kHz on six topics",
         },

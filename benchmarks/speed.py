@@ -13,11 +13,13 @@ import argparse
 import contextlib
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -57,6 +59,8 @@ OBSERVED = {
     "osprey_observer": "controller, whole tick, 100 Hz, RISE-DI with feedforward and observer",
 }
 WARM_UP = 1.0  # s, excluded from the measurement of a process
+IMPORTS = 9  # processes of each kind
+PROCESS, IMPORT = "processor time (ms)", "import (ms)"  # columns
 MATCHED_WITHIN = 20.0  # s
 OWN_MISSES = "missed excluding host delays"  # a column
 
@@ -370,6 +374,28 @@ def seconds_to_first_u() -> float:
     return received[0].received_ns / NANOSECONDS - begin
 
 
+def import_rows() -> Iterator[Row]:
+    """Processor time of an import, alone and with the start of Python, and of `rise-di --help`; medians."""
+    floor, ours, usage = "python, import numpy", "python, import rise_di", "rise-di --help"
+    alone = "import time; begin = time.process_time(); import {}; print(1e3 * (time.process_time() - begin))"
+    commands = {name: [sys.executable, "-c", alone.format(name.split()[-1])] for name in (floor, ours)}
+    commands[usage] = [RISE_DI, "--help"]
+    whole, imported = defaultdict(list), defaultdict(list)
+    for _ in range(IMPORTS):  # in turns, since the speed of the host drifts
+        for name, command in commands.items():
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            output = subprocess.run(command, check=True, capture_output=True, text=True).stdout  # noqa: S603 - this stack
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            whole[name].append(1e3 * (after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime))
+            if name != usage:
+                imported[name].append(float(output))
+    figures = {name: {PROCESS: float(np.median(times))} for name, times in whole.items()}
+    figures |= {name: figures[name] | {IMPORT: float(np.median(times))} for name, times in imported.items()}
+    yield Row(floor, figures[floor], floor)
+    yield Row(ours, figures[ours], floor, (Goal(IMPORT, 50.0), Goal(PROCESS, 0.6, of_floor=True)))
+    yield Row(usage, figures[usage], goals=(Goal(PROCESS, 300.0),))
+
+
 def lockstep_rows(seconds: float, folder: Path) -> Iterator[Row]:
     """Steps a second of lockstep flights, over topics and without them."""
     for name, speed in lockstep.measure(folder, max(seconds, 10.0), 3).items():
@@ -397,6 +423,7 @@ GROUPS: dict[str, Group] = {
     "ticks": lambda seconds, folder: tick_rows(seconds),
     "flight": flight_rows,
     "start": lambda seconds, folder: start_rows(folder),
+    "import": lambda seconds, folder: import_rows(),
     "lockstep": lockstep_rows,
     "recorder": recorder_rows,
 }

@@ -13,7 +13,11 @@ import pytest
 from tools import parameters
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PAGES = [REPOSITORY / "docs" / "get-started.md", *sorted((REPOSITORY / "docs" / "tutorials").glob("*.md"))]
+PAGES = [
+    REPOSITORY / "docs" / "get-started.md",
+    REPOSITORY / "docs" / "reference" / "python.md",
+    *sorted((REPOSITORY / "docs" / "tutorials").glob("*.md")),
+]
 NOTEBOOKS = sorted((REPOSITORY / "examples" / "notebooks").glob("*.ipynb"))
 BLOCK = re.compile(
     r"(?:<!-- (?P<reason>not run by the tests of the pages: [^\n]+) -->\n)?```(?P<kind>\w*)\n(?P<text>.*?)```", re.DOTALL

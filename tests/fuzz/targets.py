@@ -33,7 +33,7 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
-from flight_analysis.closed_loop.replay import recorded_parameters, replay
+from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import LIBRARY, find_scenario
 from flight_core.channels import POSE
@@ -288,9 +288,8 @@ def write_run(folder: Path, content: bytes) -> Path:
 def _replay(file: Path) -> None:
     recorded = read_run(file)
     if recorded.scenario is not None:
-        parameters = recorded_parameters(recorded.scenario)
         with np.errstate(all="ignore"):
-            replay(recorded.tape, parameters, None, parameter_changes(file, "/controller", type(parameters).model_fields))
+            replay(recorded)
 
 
 def log(

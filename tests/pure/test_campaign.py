@@ -268,8 +268,8 @@ def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sweep", "sentence"),
     [
-        (Sweep(parameter="gain", factors=(1.0,)), "--sweep: found gain, expected a parameter of the controller: k_g"),
-        (Sweep(parameter="beta", factors=(0.0,)), r"--sweep: found \(0.0,\), expected factors above 0"),
+        (Sweep(parameter="gain", factors=(1.0,)), "sweep: found gain, expected a parameter of the controller: k_g"),
+        (Sweep(parameter="beta", factors=(0.0,)), r"sweep: found \(0.0,\), expected factors above 0"),
     ],
 )
 def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
@@ -303,7 +303,7 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
 
 def test_sweep_of_law_without_that_parameter_refused() -> None:
     pi = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["pi"], "controller"))
-    with pytest.raises(ParameterError, match=r"^--sweep: found beta, expected a parameter .*: K, Lambda, input_scale$"):
+    with pytest.raises(ParameterError, match=r"^sweep: found beta, expected a parameter .*: K, Lambda, input_scale$"):
         define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
 
 

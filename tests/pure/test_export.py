@@ -25,7 +25,7 @@ pytestmark = pytest.mark.package("flight_analysis")
 def flight(osprey_gust: Scenario) -> RecordedFlight:
     scenario = osprey_gust.vary(flight={"duration": 3.0})
     tape = simulate(scenario)
-    return RecordedFlight("run", scenario, tape, summarise(scenario, tape, tape.outcome))
+    return RecordedFlight("run", scenario, tape, summarise(tape, scenario))
 
 
 def test_table_has_row_per_instant_and_null_without_sample() -> None:

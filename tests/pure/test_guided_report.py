@@ -189,7 +189,7 @@ def flight() -> RecordedFlight:
     """The first seconds of the route of the osprey: a capture."""
     scenario = find_scenario("osprey_route").vary(flight={"duration": 4.0})
     tape = simulate(scenario)
-    return RecordedFlight("osprey_route", scenario, tape, summarise(scenario, tape, tape.outcome))
+    return RecordedFlight("osprey_route", scenario, tape, summarise(tape, scenario))
 
 
 def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None:

@@ -16,10 +16,8 @@ from flight_analysis.closed_loop.replay import recorded_parameters, recorded_sce
 from flight_analysis.report.run_folder import read_flight
 from flight_core.rates import NANOSECONDS
 from flight_log.repair import repair
-from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
-from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = pytest.mark.package("flight_log")
 
@@ -65,9 +63,7 @@ def test_summary_equal_to_last_digit(run: Path) -> None:
 
 def test_every_bit_is_replayed(run: Path) -> None:
     recorded = read_run(run)
-    assert recorded.scenario is not None
-    changes = parameter_changes(run, "/controller", RiseDiConfig.model_fields)
-    result = replay(recorded.tape, recorded_parameters(recorded.scenario), changes=changes)
+    result = replay(recorded)
     assert result.equal(), result.first()
     assert result.checked.all()
     assert len(result.number) == len(recorded.tape["internals"].stamp_ns) > 30  # ticks of 10 ms in the shorter flight

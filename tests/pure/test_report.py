@@ -90,7 +90,7 @@ def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPL
 
 
 def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> RecordedFlight:
-    return RecordedFlight(name, scenario, tape, summarise(scenario, tape, outcome))
+    return RecordedFlight(name, scenario, tape, summarise(tape, scenario, outcome))
 
 
 def headings(page: str) -> list[str]:

@@ -50,7 +50,7 @@ def page(servo: RecordedFlight, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def recorded(name: str, scenario: Scenario, tape: Tape) -> RecordedFlight:
-    return RecordedFlight(name, scenario, tape, summarise(scenario, tape, tape.outcome))
+    return RecordedFlight(name, scenario, tape, summarise(tape, scenario))
 
 
 def open_page(browser: Browser, path: Path, scheme: str = "light") -> None:

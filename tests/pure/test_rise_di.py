@@ -1,16 +1,48 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The Python interface `rise_di`: its names, its laziness, its types, its sentences about wrong input."""
+"""The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the sentences about wrong input."""
 
 import ast
+import importlib
+import json
+import re
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, assert_type
 
+import numpy as np
+import polars as pl
 import pytest
+from tests.conftest import REPOSITORY
 from tests.pure.test_import_rule import modules_loaded_by
 
 import rise_di
+from rise_di_controller import law, laws
 
-pytestmark = pytest.mark.package("rise_di")
+pytestmark = [pytest.mark.package("rise_di"), pytest.mark.slow]
+
+SCENARIO = rise_di.find_scenario("osprey_gust", duration=2.0)
+SOFT = SCENARIO.vary(controller={"beta": np.array([2.0, 2.0, 1.0, 1.0])})
+
+
+@pytest.fixture(scope="module")
+def tape() -> rise_di.Tape:
+    return rise_di.simulate(SOFT)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> rise_di.FlightResult:
+    """A run of a scenario that differs from its file."""
+    return rise_di.fly(SOFT, runs=tmp_path_factory.mktemp("runs"))
+
+
+@pytest.fixture(scope="module")
+def run(flown: rise_di.FlightResult) -> rise_di.RecordedRun:
+    return rise_di.read_run(flown.mcap.parent)
+
+
+# Names
 
 
 def test_every_name_loads() -> None:
@@ -35,6 +67,12 @@ def test_the_import_loads_no_library() -> None:
     assert modules_loaded_by("import rise_di") - modules_loaded_by("import typing, importlib") == {"rise_di"}
 
 
+def test_the_interface_needs_no_ros() -> None:
+    """Every name is loaded, and none of the modules is of ROS."""
+    ros = {"rclpy", "flight_ros", "ament_index_python", "launch", "sensor_msgs"}
+    assert not modules_loaded_by("import rise_di\nfor name in dir(rise_di): getattr(rise_di, name)") & ros
+
+
 def test_completion_knows_every_name() -> None:
     names = {name for _, _, name in type_checker_imports()}
     assert {*names, "__version__"} == {*rise_di.__all__, "__version__"} == set(dir(rise_di))
@@ -43,3 +81,343 @@ def test_completion_knows_every_name() -> None:
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'rise_di' has no attribute 'simulat'"):
         rise_di.simulat  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_the_version_is_that_of_the_package() -> None:
+    assert f"\n## {rise_di.__version__} - " in (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_the_page_of_the_interface_has_every_name() -> None:
+    page = (REPOSITORY / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: rise_di\.(\w+)$", page, re.MULTILINE)) == rise_di.__all__
+
+
+def test_the_law_is_that_of_the_controller() -> None:
+    assert (rise_di.engage, rise_di.step, rise_di.laws) == (law.engage, law.step, laws.names)
+
+
+# Old names
+
+
+OLD_NAMES = {
+    *("RecordedRun", "ReplayResult", "Scenario", "Signal", "Tape", "best_error", "data_frame", "error_metrics"),
+    *("load_scenario", "read_run", "recorded_scenario", "replay", "simulate", "summarise"),
+}
+
+
+@pytest.mark.parametrize("name", sorted(OLD_NAMES))
+def test_an_old_name_works_with_a_warning(name: str) -> None:
+    old = importlib.import_module("flight_analysis")
+    replacement = "find_scenario" if name == "load_scenario" else name
+    with pytest.warns(FutureWarning, match=rf"^flight_analysis\.{name}: .* rise_di\.{replacement} "):
+        value = getattr(old, name)
+    if name != "load_scenario":
+        assert value is getattr(rise_di, name)
+
+
+def test_old_names_are_imported_as_before() -> None:
+    with pytest.warns(FutureWarning, match="flight_analysis.load_scenario"):
+        from flight_analysis import load_scenario  # noqa: PLC0415
+    assert load_scenario(SCENARIO.path).controller == SCENARIO.controller
+
+
+def test_a_module_of_flight_analysis_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    from flight_analysis import metrics  # noqa: PLC0415
+
+    assert metrics is sys.modules["flight_analysis.metrics"]
+    assert not recwarn
+
+
+# A flight
+
+
+def test_a_flight_has_types(tape: rise_di.Tape) -> None:
+    assert_type(SCENARIO, rise_di.Scenario)
+    assert_type(rise_di.data_frame(tape), pl.DataFrame)
+    assert_type(rise_di.best_error(tape), tuple[str, rise_di.Signal])
+    assert_type(rise_di.laws(), tuple[str, ...])
+    assert tape["y"]["q"].shape == tape.time("y").shape == (1001,)  # 2 s at 500 Hz
+
+
+def test_the_summary_of_a_tape_needs_nothing_else(tape: rise_di.Tape) -> None:
+    summary = rise_di.summarise(tape)
+    assert summary == rise_di.summarise(tape, SOFT, tape.outcome)
+    assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 2.0)
+    assert summary["errors"]["q"]["whole"] == rise_di.error_metrics(rise_di.best_error(tape)[1]["q"])._asdict()
+
+
+def test_the_old_order_of_the_summary_works_with_a_warning(tape: rise_di.Tape) -> None:
+    old: Any = rise_di.summarise
+    with pytest.warns(FutureWarning, match=r"the order is summarise\(tape, scenario, outcome\)"):
+        assert old(SOFT, tape, tape.outcome) == rise_di.summarise(tape)
+    with pytest.warns(FutureWarning, match="the order is"):
+        assert old(SOFT, tape, "interrupted")["outcome"] == "interrupted"
+
+
+def test_a_data_frame_has_the_samples_of_the_tape(tape: rise_di.Tape) -> None:
+    frame = rise_di.data_frame(tape)
+    assert frame["y.q"].drop_nulls().to_list() == tape["y"]["q"].tolist()
+    assert frame["u.elevator"].drop_nulls().to_list() == tape["u"]["elevator"].tolist()
+
+
+def test_a_simulated_tape_is_replayed() -> None:
+    """The scenario of the tape has the parameters, so that other parameters differ."""
+    tape = rise_di.simulate(SOFT)
+    result = rise_di.replay(tape)
+    assert result.equal()
+    assert result.checked.all()
+    assert not rise_di.replay(tape, SCENARIO.controller).equal()
+
+
+# A log
+
+
+def test_a_varied_flight_leaves_its_scenario_in_the_log(run: rise_di.RecordedRun) -> None:
+    scenario = rise_di.recorded_scenario(run)
+    assert (scenario.controller, scenario.flight, scenario.aircraft) == (SOFT.controller, SOFT.flight, SOFT.aircraft)
+    assert run.path is not None
+    assert rise_di.recorded_scenario(str(run.path)) == scenario == rise_di.recorded_scenario(run.scenario_file())
+
+
+def test_a_log_has_the_samples_of_the_flight(run: rise_di.RecordedRun, tape: rise_di.Tape) -> None:
+    assert run.tape.outcome == "unknown"
+    for topic in ("y", "y_m", "u", "internals"):
+        assert np.ascontiguousarray(run.tape[topic].values).tobytes() == tape[topic].values.tobytes()
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_paths_are_texts_or_path_like(flown: rise_di.FlightResult, kind: Callable[[Path], Any]) -> None:
+    folder = flown.mcap.parent
+    assert rise_di.replay(kind(folder)).equal()
+    assert rise_di.read_run(kind(flown.mcap)).tape["u"].names == ("elevator", "aileron", "rudder", "thrust")
+    page, flights = rise_di.report(kind(folder))
+    assert (page, flights[0].summary) == (flown.report, flown.flight.summary)
+    assert rise_di.find_scenario(kind(folder / "osprey_gust.yaml")).controller == SOFT.controller
+
+
+def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.RecordedRun) -> None:
+    slower = SOFT.vary(controller={"Lambda": SOFT.rise_di().Lambda[0] * np.ones(4, dtype=np.float32)})
+    again = rise_di.replay(run, others=slower.controller)
+    assert not again.equal()
+    assert again.notes[0].startswith("open loop")
+
+
+def test_a_report_writes_files_for_other_programs(flown: rise_di.FlightResult, tmp_path: Path) -> None:
+    folder = flown.mcap.parent
+    rise_di.report(folder, csv=tmp_path / "flight.csv", parquet=str(tmp_path / "flight.parquet"))
+    assert (tmp_path / "flight.csv").is_file()
+    assert pl.read_parquet(tmp_path / "flight.parquet").equals(rise_di.data_frame(flown.flight.tape))
+    page, flights = rise_di.report(folder, folder, html=tmp_path / "two.html")
+    assert page.is_file()
+    assert len(flights) == 2
+
+
+# Laws, gains, campaigns
+
+
+def test_numpy_is_accepted_wherever_numbers_are() -> None:
+    """Arrays of any real type, scalars and shapes, against lists of Python numbers."""
+    gains = {"beta": [2.0, 2.0, 1.0, 1.0], "D": [1, -1, 1, 1], "k_g": 3.0}
+    arrays = {"beta": np.array(gains["beta"], dtype=np.float32), "D": np.array(gains["D"]), "k_g": np.float64(3.0)}
+    varied = SCENARIO.vary(controller=arrays, flight={"duration": np.int64(3), "lockstep": np.True_})
+    assert varied == SCENARIO.vary(controller=gains, flight={"duration": 3.0, "lockstep": True})
+    assert {type(value) for value in varied.rise_di().beta} == {float}
+    assert rise_di.find_scenario("osprey_gust", duration=np.float64(2.0)) == SCENARIO
+    assert rise_di.decompose(np.eye(2)).D.tolist() == rise_di.decompose([[1.0, 0.0], [0.0, 1.0]]).D.tolist()
+
+
+def test_another_law_leaves_the_gains_of_the_law_before() -> None:
+    fields = rise_di.law_schema("pi").model_fields
+    assert {"K", "Lambda"} <= fields.keys()
+    varied = SCENARIO.vary(controller={"law": "pi", "K": np.ones(4), "Lambda": np.ones(4)})
+    assert varied.controller.law == "pi"
+    assert varied.controller.rate == SCENARIO.controller.rate
+
+
+def test_selected_gains_fly() -> None:
+    selection = rise_di.select_gains("osprey", SCENARIO, samples=2, lag=np.zeros(4), delay=np.float64(0.0))
+    chosen = SCENARIO.vary(controller=selection.engineering.controller)
+    assert chosen.controller == selection.engineering.controller
+    assert rise_di.simulate(chosen).outcome == "completed"
+    assert "/**/controller" in rise_di.gains_yaml(selection)
+    checked = rise_di.check_gains(rise_di.load_airframe("osprey"), chosen, samples=2)
+    assert checked.controller == chosen.controller
+
+
+def test_a_campaign_is_resumed_with_the_same_figures(tmp_path: Path) -> None:
+    flights: list[tuple[int, int]] = []
+
+    def progress(flown: int, total: int) -> None:
+        flights.append((flown, total))
+
+    folder, report, figures = rise_di.fly_campaign(
+        "osprey_servo",
+        4,
+        duration=1.0,
+        chunk=2,
+        workers=1,
+        sweep={"beta": np.array([1.0, 2.0])},
+        runs=tmp_path,
+        progress=progress,
+    )
+    assert flights == [(2, 8), (4, 8), (6, 8), (8, 8)]
+    assert report.is_file()
+    assert figures == json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert [case["factor"] for case in figures["cases"]] == [1.0, 2.0]
+    assert rise_di.resume_campaign(str(folder)).figures == figures
+
+
+def test_margins_are_those_of_the_checked_gains() -> None:
+    """The same airframe, loop and gains, without uncertain aircraft, by two functions."""
+    servo = rise_di.find_scenario("osprey_servo")
+    margins, checked = rise_di.margins(servo), rise_di.check_gains("osprey", servo, samples=0)
+    assert checked.margins is not None
+    assert margins.delay == checked.margins.delay
+    assert margins.nominal.phase.tolist() == checked.margins.nominal.phase.tolist()
+
+
+def test_airframes_are_found_by_name() -> None:
+    assert "osprey" in rise_di.airframes()
+    facts = rise_di.airframe_facts("osprey")
+    assert facts.D is not None
+    assert facts.D.tolist() == rise_di.decompose(facts.Omega).D.tolist()
+
+
+# Wrong input
+
+
+A_RUN = "expected the folder of a run or an MCAP file"
+api: Any = rise_di
+scenario: Any = SCENARIO
+SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
+    "unknown scenario": (lambda: api.find_scenario("osprey_gast"), "scenario: found 'osprey_gast', expected one of "),
+    "no scenario": (lambda: api.find_scenario(None), "scenario: found None, expected one of "),
+    "missing file": (lambda: api.find_scenario(Path("a.yaml")), "scenario: found 'a.yaml', expected one of "),
+    "text as duration": (lambda: api.find_scenario("osprey_gust", "5"), "flight.duration: found '5', expected a number"),
+    "unknown section": (
+        lambda: scenario.vary(controler={"rate": 1.0}),
+        "controler: found no such section, expected controller perhaps, or another of flight, aircraft, ",
+    ),
+    "parameter as section": (
+        lambda: scenario.vary(beta=[1.0]),
+        "beta: found no such section, expected it in a section: vary(controller={'beta': ...})",
+    ),
+    "number as section": (
+        lambda: scenario.vary(controller=3),
+        "controller: found 3, expected a mapping of its parameters",
+    ),
+    "wrong set": (lambda: scenario.vary(controller=scenario.flight), "controller: found FlightConfig("),
+    "unknown parameter": (
+        lambda: scenario.vary(controller={"betta": 1}),
+        "controller.betta: unknown key, expected beta perhaps, or another of ",
+    ),
+    "short list": (
+        lambda: scenario.vary(controller={"beta": np.ones(2)}),
+        "controller.beta: found 2 values, expected 4, one for each of q, p, r, V",
+    ),
+    "matrix as list": (
+        lambda: scenario.vary(controller={"beta": np.eye(4)}),
+        "controller.beta[0]: found [1.0, 0.0, 0.0, 0.0], expected a number (and 3 more)",
+    ),
+    "NaN": (
+        lambda: scenario.vary(controller={"beta": np.full(4, np.nan)}),
+        "controller.beta[0]: found nan, expected a finite number (and 3 more)",
+    ),
+    "law without gains": (lambda: scenario.vary(controller={"law": "pi"}), "controller.K: missing, expected "),
+    "name as scenario": (lambda: api.simulate("osprey_gust"), "scenario: found 'osprey_gust', expected a Scenario, "),
+    "duration as progress": (
+        lambda: api.simulate(scenario, 20),
+        "progress: found 20, expected a function of the flight time",
+    ),
+    "folder as number": (lambda: api.fly(scenario, runs=3), "runs: found 3, expected the path of a folder"),
+    "missing run": (lambda: api.read_run("runs/latst"), f"runs/latst: found no .mcap file, {A_RUN}"),
+    "no run": (lambda: api.read_run(None), f"run: found None, {A_RUN}"),
+    "empty path": (lambda: api.read_run(""), f"run: found '', {A_RUN}"),
+    "NUL in a path": (lambda: api.read_run("a\0b"), f"a\\x00b: found no .mcap file, {A_RUN}"),
+    "run of a tape": (lambda run: api.recorded_scenario(run.tape), "run: found Tape("),
+    "tape without parameters": (lambda run: api.replay(run.tape), "parameters: found None, expected the parameters of "),
+    "scenario as parameters": (lambda run: api.replay(run, scenario), "parameters: found Scenario("),
+    "mapping as parameters": (lambda run: api.replay(run, others={"beta": 1}), "others: found {'beta': 1}, expected the "),
+    "number as changes": (lambda run: api.replay(run, changes=3), "changes: found 3, expected a list of changes, "),
+    "run as tape": (lambda run: api.data_frame(tape=run), "tape: found RecordedRun("),
+    "path as tape": (lambda: api.best_error("runs/latest"), "tape: found 'runs/latest', expected a Tape, "),
+    "no samples": (lambda: api.data_frame(api.Tape({})), "tape: found no topic, expected a flight"),
+    "tape of a log": (
+        lambda run: api.summarise(run.tape),
+        "scenario: found none on the tape of a log, expected summarise(run.tape, recorded_scenario(run))",
+    ),
+    "signal as samples": (lambda tape: api.error_metrics(tape["y"]), "errors: found Signal("),
+    "channel as topic": (lambda tape: tape["q"], "the log: found no topic q among y, y_m, "),
+    "list as topic": (lambda tape: tape[["y"]], "the log: found no topic ['y'] among y, y_m, "),
+    "unknown channel": (lambda tape: tape["y"]["Q"], "the log: found no channel Q among q, V, p, r, expected one"),
+    "report of nothing": (api.report, f"runs: found none, {A_RUN}"),
+    "list of runs": (lambda: api.report(["a"]), f"run: found ['a'], {A_RUN}"),
+    "number as file": (lambda: api.report("a", csv=3), "csv: found 3, expected the path of a file"),
+    "unknown law": (lambda: api.law_schema("nope"), "law: found 'nope', expected a registered law: "),
+    "unknown airframe": (lambda: api.load_airframe("ospry"), "airframe: found 'ospry', expected one of "),
+    "text as rate": (lambda: api.select_gains("osprey", rate="fast"), "rate: found 'fast', expected 1 to 1000 Hz"),
+    "text as lags": (lambda: api.select_gains("osprey", lag="0.1"), "lag: found '0.1', expected seconds, 0 or more"),
+    "too few lags": (
+        lambda: api.select_gains("osprey", lag=[0.1, 0.2]),
+        "lag: found 2 values, expected one for all or one for each of elevator, thrust, aileron, rudder",
+    ),
+    "number as inputs": (lambda: api.select_gains("osprey", inputs=3), "inputs: found 3, expected the inputs elevator, "),
+    "percent as part": (lambda: api.select_gains("osprey", uncertainty=30), "uncertainty: found 30, expected 0 to 1"),
+    "half a sample": (lambda: api.select_gains("osprey", samples=2.5), "samples: found 2.5, expected an integer from 0 "),
+    "scenario as airframe": (lambda: api.select_gains(scenario), "airframe: found Scenario("),
+    "name as loop": (lambda: api.margins("osprey_servo"), "scenario: found 'osprey_servo', expected a Scenario, "),
+    "part of an aircraft": (lambda: api.margins(scenario, 0.5), "aircraft: found 0.5, expected an integer of 0 or more"),
+    "number as selection": (lambda: api.gains_yaml(3), "selection: found 3, expected a Selection, "),
+    "no aircraft": (
+        lambda: api.fly_campaign(scenario, 0),
+        "campaign.aircraft: found 0, expected greater than ",
+    ),
+    "unknown wind": (
+        lambda: api.fly_campaign(scenario, 2, wind="x"),
+        "campaign.wind: found 'x', expected 'air_relative' or ",
+    ),
+    "text as sweep": (
+        lambda: api.fly_campaign(scenario, 2, sweep="beta=1"),
+        "sweep: found 'beta=1', expected one ",
+    ),
+    "unknown sweep": (
+        lambda: api.fly_campaign(scenario, 2, sweep={"a": [1.0]}),
+        "sweep: found a, expected a parameter of ",
+    ),
+    "number as factors": (
+        lambda: api.fly_campaign(scenario, 2, sweep={"beta": 1}),
+        "sweep.factors: found 1, expected a ",
+    ),
+    "no threads": (lambda: api.fly_campaign(scenario, 2, workers=0), "workers: found 0, expected an integer of "),
+    "missing campaign": (lambda: api.resume_campaign("nope"), "nope: found no campaign "),
+    "text as matrix": (lambda: api.decompose("x"), "Omega: found 'x', expected a matrix of numbers, (m, m)"),
+    "ragged matrix": (
+        lambda: api.decompose([[1, 2], [3]]),
+        "Omega: found [[1, 2], [3]], expected a matrix ",
+    ),
+    "list as array": (lambda: api.engage([1.0], [1.0]), "found [1.0], expected an array of NumPy or of JAX"),
+    "scenario as controller": (lambda: api.Controller(scenario), "parameters: found Scenario("),
+    "name as a file": (
+        lambda: api.scenario_yaml("osprey_gust"),
+        "scenario: found 'osprey_gust', expected a Scenario",
+    ),
+}
+
+
+@pytest.mark.parametrize("call", SENTENCES)
+def test_wrong_input_is_one_sentence(call: str, request: pytest.FixtureRequest) -> None:
+    wrong, sentence = SENTENCES[call]
+    names = wrong.__code__.co_varnames[: wrong.__code__.co_argcount] if wrong.__name__ == "<lambda>" else ()
+    arguments = [request.getfixturevalue(name) for name in names]
+    with pytest.raises(rise_di.ParameterError) as refused:
+        wrong(*arguments)
+    assert str(refused.value).startswith(sentence)
+
+
+def test_wrong_input_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(rise_di.ParameterError):
+        api.fly(SCENARIO, runs=tmp_path, progress=3)
+    for wrong in ({"progress": 3}, {"workers": 0}):
+        with pytest.raises(rise_di.ParameterError):
+            api.fly_campaign(SCENARIO, 2, runs=tmp_path, **wrong)
+    assert list(tmp_path.iterdir()) == []

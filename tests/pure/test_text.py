@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tests.joint_states import JOINT_STATE, vector
 
-from flight_cli.output import display_path
+from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import Config, ParameterError
 from flight_core.text import MAX_LENGTH

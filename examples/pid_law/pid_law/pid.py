@@ -6,12 +6,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.fields import Field
-from flight_core.parameters import NonNegatives, Positives, require_length
-from flight_core.vectors import Array, array_namespace
-from rise_di_controller.control_law import ControlLaw, Measurements, without_limits
-from rise_di_controller.params import ControllerConfig
-from rise_di_controller.saturation import Limits, limited_integral, saturate
+from rise_di import (
+    Array,
+    ControlLaw,
+    ControllerConfig,
+    Field,
+    Limits,
+    Measurements,
+    NonNegatives,
+    Positives,
+    array_namespace,
+    limited_integral,
+    require_length,
+    saturate,
+    without_limits,
+)
 
 
 class PidParams(NamedTuple):

@@ -156,8 +156,10 @@ def airframes() -> list[str]:
     return names_in(LIBRARY)
 
 
-def load_airframe(name: FilePath) -> Airframe:
-    """An airframe by name in the library, or by the path of a file. Raises ParameterError."""
+def load_airframe(name: FilePath | Airframe) -> Airframe:
+    """An airframe by name in the library, or by the path of a file; an Airframe as it is. Raises ParameterError."""
+    if isinstance(name, Airframe):
+        return name
     path = find_file(name, LIBRARY, "airframe", EXPECTED)
     return _parsed(os.fspath(name), path, read_file(path, f"airframe {path}", EXPECTED))
 

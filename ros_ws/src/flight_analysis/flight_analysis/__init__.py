@@ -1,40 +1,40 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Flights without ROS: fly a scenario in one process, read a log, compare figures, replay a controller.
+"""Analysis of flights without ROS: the closed loop in one process, design, metrics, the report.
 
-The names below are the Python interface of the stack. They keep their meaning within a minor version; see CHANGELOG.md.
-
-    from flight_analysis import data_frame, read_run, simulate
-    from flight_bringup.scenarios import find_scenario
-
-    scenario = find_scenario("osprey_gust").vary(controller={"beta": [2.0, 2.0, 1.0, 1.0]})
-    tape = simulate(scenario)          # a Tape: tape["y"]["q"] is an array, tape.time("y") its times
-    frame = data_frame(tape)           # all signals as one table of polars
-    run = read_run(Path("runs/latest"))
+The Python interface is the package `rise_di`. The names that this package had in version 0.2 work with a warning.
 """
 
-from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
-from flight_analysis.closed_loop.scenario import Scenario, load_scenario
-from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import best_error, error_metrics
-from flight_analysis.report.data_frame import data_frame
-from flight_analysis.report.summary import summarise
-from flight_core.tape import Signal, Tape
-from flight_log.tape_reader import RecordedRun, read_run
+import warnings
+from importlib import import_module
+from types import MappingProxyType
+from typing import Any
 
-__all__ = [
-    "RecordedRun",
-    "ReplayResult",
-    "Scenario",
-    "Signal",
-    "Tape",
-    "best_error",
-    "data_frame",
-    "error_metrics",
-    "load_scenario",
-    "read_run",
-    "recorded_scenario",
-    "replay",
-    "simulate",
-    "summarise",
-]
+_FORMER = MappingProxyType(
+    {
+        "RecordedRun": "flight_log.tape_reader",
+        "ReplayResult": "flight_analysis.closed_loop.replay",
+        "Scenario": "flight_analysis.closed_loop.scenario",
+        "Signal": "flight_core.tape",
+        "Tape": "flight_core.tape",
+        "best_error": "flight_analysis.metrics",
+        "data_frame": "flight_analysis.report.data_frame",
+        "error_metrics": "flight_analysis.metrics",
+        "load_scenario": "flight_analysis.closed_loop.scenario",
+        "read_run": "flight_log.tape_reader",
+        "recorded_scenario": "flight_analysis.closed_loop.replay",
+        "replay": "flight_analysis.closed_loop.replay",
+        "simulate": "flight_analysis.closed_loop.simulate",
+        "summarise": "flight_analysis.report.summary",
+    }
+)
+_NEW = MappingProxyType({"load_scenario": "find_scenario"})
+
+
+def __getattr__(name: str) -> Any:
+    """A name of version 0.2, with a warning that has the name in `rise_di`."""
+    if name not in _FORMER:
+        raise AttributeError(f"module 'flight_analysis' has no attribute {name!r}")
+    now = f"the name is rise_di.{_NEW.get(name, name)} now; flight_analysis.{name} ends with the next minor version"
+    warnings.warn(f"flight_analysis.{name}: {now}", FutureWarning, stacklevel=2)
+    return getattr(import_module(_FORMER[name]), name)

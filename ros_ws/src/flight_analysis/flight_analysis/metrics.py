@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from flight_core.modes import Mode
+from flight_core.parameters import require
 from flight_core.rates import seconds
-from flight_core.tape import Signal, Tape
-from flight_core.vectors import FloatArray
+from flight_core.tape import Signal, Tape, as_tape
+from flight_core.vectors import FloatArray, as_array
 from rise_di_controller.internals import Saturation
 
 Windows = Mapping[str, tuple[float, float]]
@@ -123,7 +124,7 @@ def true_error(tape: Tape) -> Signal | None:
 
 def best_error(tape: Tape) -> tuple[str, Signal]:
     """Name and signal of the best error on a tape: the true error, or else the measured error."""
-    error = true_error(tape)
+    error = true_error(as_tape(tape))
     return (MEASURED_ERROR, tracking_error(tape)) if error is None else (TRUE_ERROR, error)
 
 
@@ -246,11 +247,13 @@ def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = S
     return {"whole": np.ones(len(t), dtype=bool), "calm": free, **{kind: parts[kind] for kind in (*commands, "gust")}}
 
 
-def error_metrics(errors: FloatArray) -> ErrorMetrics:
-    """Root mean square sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0."""
-    if len(errors) == 0:
+def error_metrics(errors: ArrayLike) -> ErrorMetrics:
+    """Root mean square sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0. Raises ParameterError."""
+    e = as_array(errors, "errors", expected := "samples of one channel, (N,)")
+    require(e.ndim == 1, "errors", f"an array of shape {e.shape}", expected)
+    if len(e) == 0:
         return ErrorMetrics(float("nan"), float("nan"))
-    return ErrorMetrics(float(np.sqrt(np.mean(errors**2))), float(np.max(np.abs(errors))))
+    return ErrorMetrics(float(np.sqrt(np.mean(e**2))), float(np.max(np.abs(e))))
 
 
 def errors_by_part(

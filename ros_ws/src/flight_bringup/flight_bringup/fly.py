@@ -14,14 +14,17 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import fly
-from flight_analysis.report.run_folder import attachments_for
+from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import Autopilot
 from flight_bringup.processes import FlightProcesses, handle_signals
+from flight_bringup.scenarios import find_scenario, written
+from flight_core.arguments import FilePath, as_path
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED, INTERRUPTED
+from flight_core.parameters import ParameterError, require
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
@@ -152,6 +155,32 @@ def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
 
     with writing("", run, EXPECTED), TapeWriter(run, attachments_for(scenario, run)) as writer, handle_signals(interrupt):
         return fly(scenario, record, lambda t: progress(t, "in one process"))
+
+
+def fly_and_report(
+    scenario: FilePath | Scenario, runs: FilePath = "runs", progress: Callable[[float], None] | None = None
+) -> FlightResult:
+    """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly --in-process` does.
+
+    `progress` is called with the flight time once per simulated second. A scenario that differs from its file is written beside
+    the log. The log holds the outcome of a flight that ended early. Raises ParameterError where nothing can be written, and
+    for a flight that ended before its first sample.
+    """
+    require(progress is None or callable(progress), "progress", progress, "a function of the flight time in s")
+    chosen = find_scenario(scenario)
+    run = new_run(chosen, as_path(runs, "runs", "the path of a folder"))
+    if not _is_its_file(chosen):
+        chosen = written(chosen, run / f"{chosen.name}.yaml")
+    outcome = fly_in_process(chosen, run, lambda t, _: None if progress is None else progress(t))
+    return write_report(run, outcome)
+
+
+def _is_its_file(scenario: Scenario) -> bool:
+    """Whether a scenario is what its file holds."""
+    try:
+        return load_scenario(scenario.path) == scenario
+    except ParameterError:
+        return False
 
 
 class _DeferredInterrupt:

@@ -54,8 +54,8 @@ def end_with_parent() -> list[str]:
 
 @contextmanager
 def handle_signals(handler: Any) -> Iterator[None]:
-    """Handle the signals of `handle_shutdown` in the block."""
-    before = handle_shutdown(handler)
+    """Handle the signals of `handle_shutdown` in the block; Python permits handlers in the main thread alone."""
+    before = handle_shutdown(handler) if threading.current_thread() is threading.main_thread() else {}
     try:
         yield
     finally:

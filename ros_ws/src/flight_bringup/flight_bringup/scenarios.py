@@ -21,9 +21,14 @@ def scenarios() -> list[str]:
     return names_in(LIBRARY)
 
 
-def find_scenario(name: FilePath, duration: float | None = None) -> Scenario:
-    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError."""
-    scenario = load_scenario(find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute())
+def find_scenario(name: FilePath | Scenario, duration: float | None = None) -> Scenario:
+    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError.
+
+    A Scenario is returned as it is, or with the duration.
+    """
+    scenario = (
+        name if isinstance(name, Scenario) else load_scenario(find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute())
+    )
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
 
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from flight_campaign.missions import Mission
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
+CHUNK = 1000  # aircraft computed at once
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
 
 
@@ -108,8 +109,8 @@ def define(
     """
     if sweep is not None:
         swept = swept_parameters(scenario.controller)
-        require(sweep.parameter in swept, "--sweep", sweep.parameter, f"a parameter of the controller: {', '.join(swept)}")
-        require(all(factor > 0.0 for factor in sweep.factors), "--sweep", sweep.factors, "factors above 0")
+        require(sweep.parameter in swept, "sweep", sweep.parameter, f"a parameter of the controller: {', '.join(swept)}")
+        require(all(factor > 0.0 for factor in sweep.factors), "sweep", sweep.factors, "factors above 0")
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The campaign report: tables, then histograms of the errors, and the score over the swept gain."""
 
+import json
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,23 +12,25 @@ import numpy as np
 
 from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.closed_loop.margins import LoopMargins
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report import plotting
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
-from flight_analysis.report.margins import LEAST_MARGINS, least_margins
+from flight_analysis.report.margins import LEAST_MARGINS, least_margins, margins_as_json
 from flight_analysis.report.plotting import SampleStore, set_layout
-from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units
+from flight_analysis.report.run_folder import REPORT, SUMMARY
+from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null
 from flight_analysis.report.tables import Table
-from flight_campaign.campaign import MARGIN_AIRCRAFT, Definition
+from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
-from flight_core.files import write_file
+from flight_core.files import display_path, write_file, writing
 from flight_core.vectors import FloatArray
 
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
 WIND_EFFECTS: dict[WindEffect, str] = {"air_relative": "by each aircraft's own A", "published": "that of the airframe"}
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
+RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 
 
@@ -34,6 +38,47 @@ OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay margin: of all inputs at once."
     f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer"
 )
+
+
+def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
+    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary and the overview.
+
+    Raises ParameterError.
+    """
+    definition = campaign.definition
+    tallies = [campaign.tally(case) for case in range(definition.cases)]
+    margins = [campaign.margins(case) for case in range(definition.cases)]
+    with writing("", campaign.folder, "a folder and a disk that can"):
+        cases = [
+            {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign, case, tally)}
+            | {"margins": None if of_loop is None else margins_as_json(of_loop)}
+            for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
+        ]
+        figures = {
+            "scenario": definition.name,
+            "aircraft": definition.aircraft,
+            "uncertainty": definition.uncertainty,
+            "wind": definition.wind,
+            "seed": definition.seed,
+            "sweep": None if definition.sweep is None else definition.sweep.parameter,
+            "cases": cases,
+        }
+        figures = finite_or_null(figures)
+        write_file(campaign.folder / SUMMARY, json.dumps(figures, indent=1))
+        write_page(campaign.folder / REPORT, definition, tallies, cases, margins)
+    return figures, overview(definition, tallies, margins)
+
+
+def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
+    """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
+    definition, again = campaign.definition, []
+    suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
+    for aircraft in tally.worst[:RERUN]:
+        path = campaign.folder / f"{definition.name}{suffix}_{aircraft.number}.yaml"
+        write_file(path, scenario_yaml(definition.aircraft_scenario(aircraft.number, case)))
+        command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
+        again.append({"number": aircraft.number, "score": aircraft.score, "command": command})
+    return again
 
 
 def write_page(

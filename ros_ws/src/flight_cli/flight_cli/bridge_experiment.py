@@ -32,8 +32,8 @@ from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
-from flight_cli.output import display_path, flight_progress, new_table, print_json
-from flight_core.files import write_file, writing
+from flight_cli.output import flight_progress, new_table, print_json
+from flight_core.files import display_path, write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di campaign`: a Monte Carlo campaign, a scenario flown by thousands of uncertain aircraft."""
 
-import json
 import math
 import shlex
 import time
@@ -14,39 +13,28 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.uncertainty import WindEffect
-from flight_analysis.closed_loop.scenario import scenario_yaml
-from flight_analysis.report.margins import margins_as_json
-from flight_analysis.report.run_folder import REPORT, SUMMARY, new_run
-from flight_analysis.report.summary import QUANTITY_UNITS, display_units, finite_or_null
-from flight_analysis.report.tables import Table
+from flight_analysis.report.run_folder import REPORT, new_run
+from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
-from flight_campaign.campaign import Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import (
-    FIGURE_HEADINGS,
-    WIND_EFFECTS,
-    figure_rows,
-    overview,
-    write_page,
-)
+from flight_campaign.campaign import CHUNK, Campaign, Definition, Sweep, define
+from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, write_results
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
     INTERRUPTED,
     SHOWN_COLUMN,
-    display_path,
     new_table,
+    options,
     parse_numbers,
     print_json,
     progress_bar,
 )
-from flight_core.files import write_file, writing
+from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.parameters import require
 
-CHUNK = 1000  # aircraft computed at once
 OF_DEFINITION = ("aircraft", "uncertainty", "wind", "seed", "sweep", "duration", "chunk", "runs")  # options of a new campaign
-RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 
 
 class EngineName(StrEnum):
@@ -100,13 +88,13 @@ def campaign(
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
-        size = chunk or CHUNK
-        definition = define(chosen, aircraft, uncertainty, seed, size, None if sweep is None else _parse_sweep(sweep), wind)
+        swept = None if sweep is None else _parse_sweep(sweep)
+        with options("sweep"):
+            definition = define(chosen, aircraft, uncertainty, seed, chunk or CHUNK, swept, wind)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
-    with writing("", monte_carlo.folder, "a folder and a disk that can"):
-        figures, results = _write_results(monte_carlo)
+    figures, results = write_results(monte_carlo)
     if as_json:
         print_json(figures)
         return
@@ -153,43 +141,6 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
         )
         raise typer.Exit(INTERRUPTED) from None
     return done * seconds / (time.monotonic() - begin)
-
-
-def _write_results(monte_carlo: Campaign) -> tuple[dict[str, Any], Table]:
-    """Write the summary, the report and the scenarios of the worst aircraft; returns the summary and the overview."""
-    definition = monte_carlo.definition
-    tallies = [monte_carlo.tally(case) for case in range(definition.cases)]
-    margins = [monte_carlo.margins(case) for case in range(definition.cases)]
-    cases = [
-        {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(monte_carlo, case, tally)}
-        | {"margins": None if of_loop is None else margins_as_json(of_loop)}
-        for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
-    ]
-    figures = {
-        "scenario": definition.name,
-        "aircraft": definition.aircraft,
-        "uncertainty": definition.uncertainty,
-        "wind": definition.wind,
-        "seed": definition.seed,
-        "sweep": None if definition.sweep is None else definition.sweep.parameter,
-        "cases": cases,
-    }
-    figures = finite_or_null(figures)
-    write_file(monte_carlo.folder / SUMMARY, json.dumps(figures, indent=1))
-    write_page(monte_carlo.folder / REPORT, definition, tallies, cases, margins)
-    return figures, overview(definition, tallies, margins)
-
-
-def _write_worst(monte_carlo: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
-    """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
-    again = []
-    for flight in tally.worst[:RERUN]:
-        suffix = "" if monte_carlo.definition.sweep is None else f"_{monte_carlo.definition.factor(case):g}"
-        path = monte_carlo.folder / f"{monte_carlo.definition.name}{suffix}_{flight.number}.yaml"
-        write_file(path, scenario_yaml(monte_carlo.definition.aircraft_scenario(flight.number, case)))
-        command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
-        again.append({"number": flight.number, "score": flight.score, "command": command})
-    return again
 
 
 def _show(console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]) -> None:

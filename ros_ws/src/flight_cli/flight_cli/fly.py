@@ -17,13 +17,13 @@ from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     ENDED_EARLY,
     INTERRUPTED,
-    display_path,
     flight_progress,
     parse_numbers,
     print_json,
     show_flight,
 )
 from flight_core import outcome as ends
+from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import Origin, read_route

@@ -30,7 +30,6 @@ from flight_analysis.report.summary import (
 )
 from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError
-from flight_core.text import printable
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
 LATEST = Path("runs/latest")  # the run of a command that is given none
@@ -157,8 +156,3 @@ def write_text(option: str, path: Path, text: str) -> None:
     """Write a file that an option names. Raises ParameterError where it cannot be written."""
     with writing(option, path, "the path of a file"):
         write_file(path, text)
-
-
-def display_path(path: Path) -> str:
-    """A path relative to the working folder if it is below it, else as it is; unprintable characters as escapes."""
-    return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))

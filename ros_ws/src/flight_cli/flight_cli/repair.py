@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 
 from flight_analysis.report.run_folder import PARAMETERS
-from flight_cli.output import display_path
-from flight_core.files import parse_yaml
+from flight_core.files import display_path, parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
 from flight_log.repair import FileRepair

@@ -19,8 +19,7 @@ from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_core.files import parse_yaml
-from flight_core.parameters import ParameterError, require
-from flight_log.stored_messages import parameter_changes
+from flight_core.parameters import require
 from flight_log.tape_reader import read_run
 
 DIFFERS = 1
@@ -45,16 +44,12 @@ def replay(
     require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
     with Console(stderr=True, quiet=as_json).status(f"computing {run} again"):
         recorded = read_run(run, namespace)
-        if recorded.scenario is None:
-            raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-        parameters = recorded_parameters(recorded.scenario)
+        parameters = recorded_parameters(recorded.scenario_file())
         others = vary(parameters, changed) if changed else None
-        controller = f"{recorded.namespace}/controller"
-        changes = parameter_changes(run, controller, type(parameters).model_fields) if others is None else []
-        result = recompute(recorded.tape, parameters, others, changes)
+        result = recompute(recorded, parameters, others)
         guided = None
         if others is None and "guidance" in recorded.tape:
-            guided = replay_guidance(recorded.tape, recorded_scenario(recorded.scenario).guidance)
+            guided = replay_guidance(recorded.tape, recorded_scenario(recorded).guidance)
     require(bool(result.checked.any()), str(run), "no tick that could be checked", "a log with two successive ticks")
     if csv_file is not None:
         _write_csv(csv_file, result, parameters.inputs)

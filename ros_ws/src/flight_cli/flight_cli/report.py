@@ -10,13 +10,10 @@ import typer
 from rich.console import Console
 
 from flight_analysis.report import comparison
-from flight_analysis.report.export import write_csv, write_parquet, write_png
-from flight_analysis.report.html import write_page
-from flight_analysis.report.run_folder import read_flight, write_report
+from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
-from flight_cli.output import LATEST, display_path, new_table, print_json, show_flight
-from flight_core.files import writing
-from flight_core.parameters import require
+from flight_cli.output import LATEST, new_table, options, print_json, show_flight
+from flight_core.files import display_path
 
 
 def report(
@@ -38,22 +35,11 @@ def report(
 
     Exit status: 0, or 2 bad input.
     """
-    runs = runs or [LATEST]
-    outputs = [("--png", png, write_png), ("--csv", csv, write_csv), ("--parquet", parquet, write_parquet)]
-    require(output is None or (len(runs) == 1 and html is None), "--output", "a comparison", "one run; --html for several")
-    if len(runs) == 1 and html is None:
-        result = write_report(runs[0], output=output)
-        flights, page = [result.flight], result.report
-    else:
-        flights, page = [read_flight(run) for run in runs], html or runs[0].absolute().parent / "comparison.html"
-        outputs.insert(0, ("--html", page, write_page))
-    for option, path, write in outputs:
-        if path is not None:
-            with writing(option, path, "the path of a file"):
-                write(path, flights)
+    with options("html", "output", "png", "csv", "parquet"):
+        page, flights = write_report(*(runs or [LATEST]), html=html, output=output, png=png, csv=csv, parquet=parquet)
     if as_json:
         summaries = [flight.summary for flight in flights]
-        print_json(summaries[0] if len(runs) == 1 else summaries)
+        print_json(summaries[0] if len(flights) == 1 else summaries)
         return
     if len(flights) == 1:
         show_flight(Console(), flights[0])

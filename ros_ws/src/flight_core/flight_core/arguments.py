@@ -49,6 +49,16 @@ def as_numbers(value: object, key: str, expected: str) -> tuple[float, ...]:
     return read if isinstance(read, tuple) else (float(read),)
 
 
+def as_names(value: object, key: str, expected: str) -> tuple[str, ...]:
+    """Names from a list, a tuple or an array, or from a text with commas. Raises ParameterError for other values."""
+    if isinstance(value, str):
+        value = value.split(",") if value else ()
+    problems = Problems()
+    read: tuple[str, ...] = kind_of(tuple[str, ...]).read(value, key, problems)
+    require(not problems.sentences(), key, short_repr(value), expected)
+    return read
+
+
 def as_instance(value: object, kind: type[T], key: str, expected: str) -> T:
     """The value, of a class. Raises ParameterError for a value of a different class."""
     if not isinstance(value, kind):

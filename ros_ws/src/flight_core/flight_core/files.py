@@ -19,6 +19,7 @@ from yaml.composer import Composer
 
 from flight_core.arguments import FilePath, as_path
 from flight_core.parameters import ParameterError, require
+from flight_core.text import printable
 
 # Exceptions of PyYAML: YAMLError for invalid syntax, the rest for an invalid scalar ("0b_", "2001-99-99", "!!bool 2")
 # or for too deep nesting.
@@ -126,6 +127,11 @@ def find_file(name: FilePath, library: Path, key: str, kind: str) -> Path:
     path = Path(text) if text.endswith(".yaml") else library / f"{text}.yaml"
     require(is_file(path), key, repr(text), expected)
     return path
+
+
+def display_path(path: Path) -> str:
+    """A path relative to the working folder if it is below it, else as it is; unprintable characters as escapes."""
+    return printable(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def open_nonblocking(path: str | Path) -> BinaryIO:

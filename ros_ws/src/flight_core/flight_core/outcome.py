@@ -6,6 +6,7 @@ from flight_core.text import bounded
 
 COMPLETED = "completed"
 INTERRUPTED = "interrupted"
+UNKNOWN = "unknown"  # on the tape of a log
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
 

@@ -104,11 +104,7 @@ class Config:
             elif name in REMOVED and name not in cls.model_fields:
                 problems.unknown.append(f"{key}.{name}: {REMOVED[name]}")
             elif name not in cls.model_fields:
-                near = [
-                    f"{match} perhaps, or another" for match in difflib.get_close_matches(name, sorted(cls.model_fields), n=1)
-                ]
-                known = f"{(near or ['one'])[0]} of {', '.join(sorted(cls.model_fields))}"
-                problems.unknown.append(f"{key}.{name}: unknown key, expected {known}")
+                problems.unknown.append(f"{key}.{name}: unknown key, expected {one_of(sorted(cls.model_fields), name)}")
         if len(problems.sentences()) > before:
             return None
         built = cls.__new__(cls)
@@ -189,7 +185,9 @@ class NodeConfig(Config):
 
 Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
 Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
+"""Type of a parameter: a list of at least one number, each above 0."""
 NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
+"""Type of a parameter: a list of at least one number, each 0 or more."""
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Signs = Annotated[tuple[int, ...], Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -200,6 +198,12 @@ def require(condition: bool, key: str, found: object, expected: str) -> None:
     """Raise ParameterError naming `key`, what was found and what is expected, unless the condition holds."""
     if not condition:
         raise ParameterError(f"{key}: found {found}, expected {expected}")
+
+
+def one_of(known: Sequence[str], name: str) -> str:
+    """What is expected in place of an unknown name: a known name, the similar one first."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"{near[0]} perhaps, or another of {', '.join(known)}" if near else f"one of {', '.join(known)}"
 
 
 def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> None:

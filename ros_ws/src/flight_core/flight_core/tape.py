@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flight_core.arguments import as_instance
 from flight_core.outcome import COMPLETED
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 
@@ -64,22 +65,34 @@ class Signal:
 
 @dataclass(frozen=True)
 class Tape:
-    """A flight: signals by topic name. `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome."""
+    """A flight: signals by topic name.
+
+    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. `scenario` is the scenario that `simulate`
+    flew, None on the tape of a log.
+    """
 
     signals: Mapping[str, Signal]
     start_ns: int = 0
     notes: tuple[str, ...] = ()
     outcome: str = COMPLETED
+    scenario: object = None
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""
-        if topic not in self.signals:
+        if topic not in self:
             raise ParameterError(f"the log: found no topic {topic} among {', '.join(self.signals) or 'none'}, expected one")
         return self.signals[topic]
 
-    def __contains__(self, topic: str) -> bool:
-        return topic in self.signals
+    def __contains__(self, topic: object) -> bool:
+        return isinstance(topic, str) and topic in self.signals
 
     def time(self, topic: str) -> FloatArray:
         """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
         return (self[topic].stamp_ns - self.start_ns) / NANOSECONDS
+
+
+def as_tape(value: object) -> Tape:
+    """The value, a Tape with samples. Raises ParameterError for another value."""
+    tape = as_instance(value, Tape, "tape", "a Tape, as simulate returns one and as a RecordedRun has one: run.tape")
+    require(bool(tape.signals), "tape", "no topic", "a flight")
+    return tape

@@ -10,11 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flight_core.fields import short_repr
+from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
 from flight_core.text import bounded
 
 FloatArray = NDArray[np.float64]
-Array = Any  # an array of NumPy or of JAX
+Array = Any
+"""An array of NumPy or of JAX."""
 Scalar = Any  # a Python float, or an array with a value per aircraft of a fleet
 FUTURE = "future"  # the reason of a ChannelError for a stamp ahead of the clock
 
@@ -46,11 +49,25 @@ class _Floats:
 def array_namespace(array: Scalar) -> Any:
     """The array namespace of an array by the array API standard; `_Floats` for a Python float.
 
-    NumPy 1 arrays lack `__array_namespace__`.
+    NumPy 1 arrays lack `__array_namespace__`. Raises ParameterError for a list.
     """
     if isinstance(array, (np.ndarray, np.generic)):
         return _NUMPY
-    return _Floats if isinstance(array, (float, int)) else array.__array_namespace__()
+    if isinstance(array, (float, int)):
+        return _Floats
+    if not hasattr(array, "__array_namespace__"):
+        raise ParameterError(f"found {short_repr(array)}, expected an array of NumPy or of JAX")
+    return array.__array_namespace__()
+
+
+def as_array(value: Any, key: str, expected: str) -> FloatArray:
+    """The value as an array of float64. Raises ParameterError for what is no array of real numbers."""
+    try:
+        if not np.iscomplexobj(value):
+            return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):  # a text, rows of different lengths, objects
+        pass
+    raise ParameterError(f"{key}: found {short_repr(value)}, expected {expected}")
 
 
 class StampedVector(NamedTuple):

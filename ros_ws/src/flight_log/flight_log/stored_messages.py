@@ -17,7 +17,7 @@ from flight_core.rates import NANOSECONDS
 from flight_log.named_vectors import typestore
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import Scan
-from flight_log.tape_reader import ROSBAG2
+from flight_log.tape_reader import A_RUN, ROSBAG2
 
 PARAMETER_EVENTS = "/parameter_events"
 PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
@@ -40,7 +40,7 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
     Raises ParameterError for a missing or unreadable bag.
     """
     files = bag_files(run)
-    require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
+    require(bool(files), str(run), "no .mcap file", A_RUN)
     for file in files:
         schemas: dict[int, Schema] = {}
         channels: dict[int, tuple[str, str, str]] = {}

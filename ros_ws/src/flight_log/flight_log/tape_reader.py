@@ -14,7 +14,9 @@ import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
+from flight_core.arguments import FilePath, as_path
 from flight_core.files import is_file, is_folder
+from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
@@ -27,6 +29,7 @@ from flight_log.named_vectors import PATH, STAMP, Decoder, Table, decode_routes,
 from flight_log.rosbag2_metadata import METADATA, bag_files, is_compressed, read_bag_metadata
 from flight_log.scan import MessageBatch, Scan
 
+A_RUN = "the folder of a run or an MCAP file"
 ROUTE = "route"
 BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
@@ -52,7 +55,8 @@ class RecordedRun(NamedTuple):
     """The content of a log. `metadata` holds the named sets of strings, `attachments` the files except the scenario.
 
     `latency` is the latency of the loop from y to u, `engagements` are the engagements of a bridge; None for a log without
-    samples of the kind, or no bag of MCAP files. The content is of the aircraft in `namespace`, "" for the root.
+    samples of the kind, or no bag of MCAP files. The content is of the aircraft in `namespace`, "" for the root. `path` is
+    where the log was read.
     """
 
     tape: Tape
@@ -62,15 +66,24 @@ class RecordedRun(NamedTuple):
     latency: Signal | None = None
     engagements: list[Engagement] | None = None
     namespace: str = ""
+    path: Path | None = None
+
+    def scenario_file(self) -> StoredFile:
+        """The scenario in the log. Raises ParameterError for a log without one."""
+        if self.scenario is None:
+            where = "the log" if self.path is None else str(self.path)
+            raise ParameterError(f"{where}: found a log without its scenario, expected a run that was flown from one")
+        return self.scenario
 
 
-def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
+def read_run(run: FilePath, namespace: str | None = None) -> RecordedRun:
     """Read the folder or a file of a run: named vectors by topic name (without the namespace), samples by stamp.
 
     The bag comes from this stack or from `ros2 bag record`: MCAP in one or several files, or SQLite. A truncated MCAP file is
     read up to the last complete chunk, and a note of the tape says so. Raises ParameterError for a missing bag, for a bag
     without a sample, and for several aircraft, in a namespace each, of which `namespace` names none.
     """
+    run = as_path(run, "run", A_RUN)
     log = _read(run)
     filled = {topic: signal for topic, samples in log.topics.items() if (signal := samples.signal()) is not None}
     require(bool(filled), str(run), "; ".join(["no sample on any topic", *log.notes_at(None)]), "a recorded flight")
@@ -83,10 +96,10 @@ def read_run(run: Path, namespace: str | None = None) -> RecordedRun:
     told = [log.topics[topic].note(name) for topic, name in names.items()]
     told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, told)]
-    tape = Tape(signals, start_ns, tuple(map(printable, notes)))
+    tape = Tape(signals, start_ns, tuple(map(printable, notes)), UNKNOWN)
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), delays, engaged, aircraft)
+    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run)
 
 
 def _aircraft(topics: Collection[str]) -> list[str]:
@@ -101,7 +114,7 @@ def _namespace_of_one_aircraft(topics: Collection[str], namespace: str | None, w
     if namespace is None:
         require(len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for")
         return aircraft[0] if aircraft else ""
-    chosen = f"/{namespace.strip('/')}".rstrip("/")
+    chosen = f"/{str(namespace).strip('/')}".rstrip("/")
     require(chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}")
     return chosen
 
@@ -310,7 +323,7 @@ def _add(run: Path, log: _Log) -> None:
     if is_compressed(information) or run.suffix == ".db3" or (not files and is_file(run / METADATA)):
         _read_other(run, log)
     else:
-        require(bool(files), str(run), "no .mcap file", "the folder of a run or an MCAP file")
+        require(bool(files), str(run), "no .mcap file", A_RUN)
         for file in files:
             _read_mcap(file, log)
 

@@ -16,14 +16,26 @@ from typing import TYPE_CHECKING
 
 __all__ = [
     "Airframe",
+    "Array",
+    "CampaignResult",
     "ControlLaw",
     "Controller",
+    "ControllerConfig",
+    "Field",
+    "FlightResult",
+    "GainAssessment",
     "LawParams",
     "LawState",
+    "Limits",
+    "LoopMargins",
     "Measurements",
+    "NonNegatives",
     "ParameterError",
+    "Positives",
+    "RecordedFlight",
     "RecordedRun",
     "ReplayResult",
+    "Report",
     "RiseDiConfig",
     "Scenario",
     "Selection",
@@ -34,6 +46,7 @@ __all__ = [
     "TunedLaw",
     "airframe_facts",
     "airframes",
+    "array_namespace",
     "best_error",
     "check_gains",
     "data_frame",
@@ -41,73 +54,95 @@ __all__ = [
     "engage",
     "error_metrics",
     "find_scenario",
+    "fly",
+    "fly_campaign",
     "gains_yaml",
     "law_schema",
     "laws",
+    "limited_integral",
     "load_airframe",
     "margins",
     "read_run",
     "recorded_scenario",
     "replay",
+    "report",
+    "require_length",
+    "resume_campaign",
+    "saturate",
     "scenario_yaml",
     "scenarios",
     "select_gains",
     "simulate",
     "step",
     "summarise",
+    "without_limits",
 ]
 
 if TYPE_CHECKING:  # for type checkers and completion; a test compares these imports with HOMES
     from aircraft_sim.airframe import Airframe, airframes, load_airframe
-    from flight_analysis.closed_loop.margins import margins
+    from flight_analysis.closed_loop.margins import LoopMargins, margins
     from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
     from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
     from flight_analysis.closed_loop.simulate import simulate
     from flight_analysis.design.airframe_properties import airframe_facts
-    from flight_analysis.design.gain_selection import Selection
+    from flight_analysis.design.gain_selection import GainAssessment, Selection
     from flight_analysis.design.gain_selection import as_yaml as gains_yaml
     from flight_analysis.metrics import best_error, error_metrics
     from flight_analysis.report.data_frame import data_frame
-    from flight_analysis.report.summary import summarise
+    from flight_analysis.report.report import Report, report
+    from flight_analysis.report.run_folder import FlightResult
+    from flight_analysis.report.summary import RecordedFlight, summarise
+    from flight_bringup.fly import fly_and_report as fly
     from flight_bringup.scenarios import find_scenario, scenarios
-    from flight_core.parameters import ParameterError
+    from flight_core.fields import Field
+    from flight_core.parameters import NonNegatives, ParameterError, Positives, require_length
     from flight_core.tape import Signal, Tape
-    from flight_core.vectors import StampedVector
+    from flight_core.vectors import Array, StampedVector, array_namespace
     from flight_log.tape_reader import RecordedRun, read_run
+    from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.gain_design import check_gains, select_gains
-    from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
+    from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
     from rise_di_controller.controller import Controller
     from rise_di_controller.decomposition import decompose
     from rise_di_controller.law import LawParams, LawState, Sign, engage, step
     from rise_di_controller.laws import names as laws
     from rise_di_controller.laws import schema as law_schema
+    from rise_di_controller.params import ControllerConfig
     from rise_di_controller.rise_di import RiseDiConfig
+    from rise_di_controller.saturation import Limits, limited_integral, saturate
 
     __version__: str
 else:  # type checkers would take a module with __getattr__ to have any name
     HOMES = {
         "aircraft_sim.airframe": ("Airframe", "airframes", "load_airframe"),
-        "flight_analysis.closed_loop.margins": ("margins",),
+        "flight_analysis.closed_loop.margins": ("LoopMargins", "margins"),
         "flight_analysis.closed_loop.replay": ("ReplayResult", "recorded_scenario", "replay"),
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
         "flight_analysis.design.airframe_properties": ("airframe_facts",),
-        "flight_analysis.design.gain_selection": ("Selection", "as_yaml as gains_yaml"),
+        "flight_analysis.design.gain_selection": ("GainAssessment", "Selection", "as_yaml as gains_yaml"),
         "flight_analysis.metrics": ("best_error", "error_metrics"),
         "flight_analysis.report.data_frame": ("data_frame",),
-        "flight_analysis.report.summary": ("summarise",),
+        "flight_analysis.report.report": ("Report", "report"),
+        "flight_analysis.report.run_folder": ("FlightResult",),
+        "flight_analysis.report.summary": ("RecordedFlight", "summarise"),
+        "flight_bringup.fly": ("fly_and_report as fly",),
         "flight_bringup.scenarios": ("find_scenario", "scenarios"),
-        "flight_core.parameters": ("ParameterError",),
+        "flight_core.fields": ("Field",),
+        "flight_core.parameters": ("NonNegatives", "ParameterError", "Positives", "require_length"),
         "flight_core.tape": ("Signal", "Tape"),
-        "flight_core.vectors": ("StampedVector",),
+        "flight_core.vectors": ("Array", "StampedVector", "array_namespace"),
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
+        "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.gain_design": ("check_gains", "select_gains"),
-        "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw"),
+        "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),
         "rise_di_controller.controller": ("Controller",),
         "rise_di_controller.decomposition": ("decompose",),
         "rise_di_controller.law": ("LawParams", "LawState", "Sign", "engage", "step"),
         "rise_di_controller.laws": ("names as laws", "schema as law_schema"),
+        "rise_di_controller.params": ("ControllerConfig",),
         "rise_di_controller.rise_di": ("RiseDiConfig",),
+        "rise_di_controller.saturation": ("Limits", "limited_integral", "saturate"),
     }
     """The names by the module that holds each, as an import statement has them."""
 

@@ -5,6 +5,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
@@ -14,7 +15,7 @@ from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import gains_by_rule, gains_of_search, model_for, with_aircraft_observer
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
-from flight_core.arguments import FilePath, as_count, as_number, as_numbers
+from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.params import ControllerConfig
@@ -34,7 +35,7 @@ def select_gains(
     uncertainty: float = 0.3,
     rate: float | None = None,
     y_rate: float | None = None,
-    lag: float | Sequence[float] | None = None,
+    lag: ArrayLike | None = None,
     delay: float | None = None,
     inputs: str | Sequence[str] = (),
     gamma_2: float = 0.0,
@@ -69,16 +70,16 @@ def select_gains(
 
     Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
     """
-    chosen, frame = _scenario(scenario), _airframe(airframe)
+    chosen, frame = find_scenario(scenario), load_airframe(airframe)
     chosen.rise_di()
     setting = _with_limits(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame)._replace(
-        inputs=tuple(inputs.split(",")) if isinstance(inputs, str) and inputs else tuple(inputs),
+        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
     )
     require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
-    known_model = frame if model is None else _airframe(model)
+    known_model = frame if model is None else load_airframe(model)
     selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
     if not observer:
         return selection
@@ -99,7 +100,7 @@ def check_gains(
 
     Raises ParameterError.
     """
-    chosen, frame = _scenario(scenario), _airframe(airframe)
+    chosen, frame = find_scenario(scenario), load_airframe(airframe)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)
 
@@ -115,20 +116,12 @@ def study(airframe: Airframe, scenario: Scenario, uncertainty: float, samples: i
     )
 
 
-def _scenario(scenario: FilePath | Scenario) -> Scenario:
-    return scenario if isinstance(scenario, Scenario) else find_scenario(scenario)
-
-
-def _airframe(airframe: FilePath | Airframe) -> Airframe:
-    return airframe if isinstance(airframe, Airframe) else load_airframe(airframe)
-
-
 def _loop(
     scenario: Scenario,
     airframe: Airframe,
     rate: float | None,
     y_rate: float | None,
-    lag: float | Sequence[float] | None,
+    lag: ArrayLike | None,
     delay: float | None,
 ) -> LoopSetting:
     """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises ParameterError.
@@ -167,7 +160,7 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
     return loop._replace(base=loop.base.model_copy(update=limits))
 
 
-def _lags(lag: float | Sequence[float], airframe: Airframe) -> dict[str, float]:
+def _lags(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     """Lags by input, s. Raises ParameterError."""
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")

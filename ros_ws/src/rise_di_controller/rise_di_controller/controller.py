@@ -12,7 +12,7 @@ from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import guard, internals
-from rise_di_controller.params import ControllerConfig
+from rise_di_controller.params import ControllerConfig, as_controller
 
 
 class ControlOutput(NamedTuple):
@@ -32,6 +32,7 @@ class Controller:
     """`guard.tick` with state and the last samples of y and y_m."""
 
     def __init__(self, parameters: ControllerConfig) -> None:
+        as_controller(parameters, "parameters")
         self._law, self._guard = parameters.tuned_law(), parameters.guard()
         self._state = guard.initial_state(len(parameters.inputs))
         self.names = internals.names(parameters.logged_groups())

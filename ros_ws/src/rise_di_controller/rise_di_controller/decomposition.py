@@ -12,9 +12,10 @@ from operator import ne
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flight_core.parameters import ParameterError
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, as_array
 
 NEARLY_ZERO = 1e-9
 """Minor k is nearly zero if a change of every entry of Omega by this fraction of the entry's size could turn the sign of
@@ -49,7 +50,7 @@ class Pairing(NamedTuple):
     U: FloatArray  # (m, m) of the reordered matrix in inputs of unit response
 
 
-def decompose(Omega: FloatArray) -> SDU:
+def decompose(Omega: ArrayLike) -> SDU:
     """S, D and U of Omega, shape (m, m), by elimination without pivoting; unique.
 
         Omega = L diag(p) W,  p_k = Delta_k / Delta_(k-1),  Delta_k the leading minors, Delta_0 = 1
@@ -141,8 +142,8 @@ def _excess(U: FloatArray) -> float:
     return float(np.max(np.abs(U - np.eye(len(U)))))
 
 
-def _square(Omega: FloatArray) -> FloatArray:
-    matrix = np.array(Omega, dtype=np.float64)
+def _square(Omega: ArrayLike) -> FloatArray:
+    matrix = np.array(as_array(Omega, "Omega", "a matrix of numbers, (m, m)"))
     if matrix.ndim != 2 or len(set(matrix.shape)) != 1 or matrix.size == 0:
         raise DecompositionError(f"Omega: found shape {matrix.shape}, expected as many outputs as inputs, (m, m)")
     if not np.isfinite(matrix).all():
@@ -166,7 +167,7 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     return rows, columns
 
 
-def _eliminate(Omega: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """L, p, W and L^-1 of Omega = L diag(p) W without pivoting, L unit lower and W unit upper triangular.
 
     p_k = (L^-1)_k Omega (W^-1)_k gives the certainty of the sign of p_k.

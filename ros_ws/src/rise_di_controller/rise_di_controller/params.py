@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
+from flight_core.arguments import as_instance
 from flight_core.fields import Field
 from flight_core.parameters import (
     Config,
@@ -292,3 +293,8 @@ def __getattr__(name: str) -> Any:
         warnings.warn("rise_di_controller.params.ControllerParameters is now ControllerConfig", FutureWarning, stacklevel=2)
         return ControllerConfig
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def as_controller(value: object, key: str) -> ControllerConfig:
+    """The value, parameters of a controller. Raises ParameterError for another value."""
+    return as_instance(value, ControllerConfig, key, "the parameters of a controller, as scenario.controller")

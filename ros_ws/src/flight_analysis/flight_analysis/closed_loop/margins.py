@@ -8,7 +8,8 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import Sign
@@ -63,7 +64,10 @@ def margins(scenario: Scenario, aircraft: int = 0, uncertainty: float = 0.3, see
     gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError for the literal sign, and
     for an aircraft of JSBSim under a controller without a model.
     """
-    return loop_assessment(scenario_loop(scenario, scenario.controller, aircraft, uncertainty, seed))
+    flown = as_scenario(scenario)
+    count, numbered = as_count(aircraft, "aircraft", 0), as_count(seed, "seed", 0)
+    deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
+    return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered))
 
 
 def loop_assessment(of: LinearLoop) -> LoopMargins:

@@ -10,17 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_recorded_sections
+from flight_core.arguments import FilePath
+from flight_core.fields import short_repr
 from flight_core.modes import Mode
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
-from flight_log.tape_reader import StoredFile
+from flight_log.stored_messages import parameter_changes
+from flight_log.tape_reader import RecordedRun, StoredFile, read_run
 from rise_di_controller import feedforward, guard, internals
 from rise_di_controller.control_law import TunedLaw, restored
 from rise_di_controller.guard import ControllerState, GuardParams
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerConfig
+from rise_di_controller.params import ControllerConfig, as_controller
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
@@ -91,9 +94,14 @@ def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
-def recorded_scenario(stored: StoredFile) -> Scenario:
-    """The scenario in a log, every section validated. Raises ParameterError."""
+def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
+    """The scenario of a run, by the run as read, by its folder, or by its scenario as stored. Raises ParameterError."""
+    stored = run if isinstance(run, StoredFile) else _as_run(run).scenario_file()
     return parse_recorded_scenario(stored.content, Path(stored.name))
+
+
+def _as_run(run: RecordedRun | FilePath) -> RecordedRun:
+    return run if isinstance(run, RecordedRun) else read_run(run)
 
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
@@ -105,9 +113,15 @@ def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> Controller
 
 
 def replay(
-    tape: Tape, parameters: ControllerConfig, others: ControllerConfig | None = None, changes: Sequence[Change] = ()
+    run: Tape | RecordedRun | FilePath,
+    parameters: ControllerConfig | None = None,
+    others: ControllerConfig | None = None,
+    changes: Sequence[Change] | None = None,
 ) -> ReplayResult:
     """Compute every tick of `internals` again: (state, now, y, y_m) -> (state, u) by `guard.tick`.
+
+    `run` is the folder of a run, a run as read, or a tape. `parameters` are the parameters of the recorded controller, by
+    default from the log, or from the scenario of a simulated tape.
 
     A tick takes y from the topic `y` at the stamp of the tick; y_m, the instant of y_m and the activity of the controller come
     from `internals`. The results are dt, mode, e, the integrals, Pi and u.
@@ -119,10 +133,16 @@ def replay(
     `others` computes an open loop: the same inputs with these parameters, and the computed state throughout. Where the log does
     not begin with the flight, the law engages in the first tick, at the recorded u.
 
-    `changes` are parameter changes in flight, in order. A tick applies the changes up to the parameters of the channel
-    "parameters". Raises ParameterError for `internals` of different channels or of a version with fewer channels, and for
-    invalid changes.
+    `changes` are parameter changes in flight, in order, by default from the log, none beside `others`. A tick applies the
+    changes up to the parameters of the channel "parameters". Raises ParameterError for `internals` of different channels or of
+    a version with fewer channels, and for invalid changes.
     """
+    if others is not None:
+        others, changes = as_controller(others, "others"), changes or ()
+    elif changes is not None:
+        listed = isinstance(changes, Sequence) and all(isinstance(change, Mapping) for change in changes)
+        require(listed, "changes", short_repr(changes), "a list of changes, each a mapping of dotted names")
+    tape, parameters, changes = _recorded(run, parameters, changes)
     ticks = _Ticks(tape, parameters)
     for key in ("outputs", "inputs"):
         wanted, found = getattr(parameters, key), getattr(others or parameters, key)
@@ -151,6 +171,21 @@ def replay(
             state = ticks.state(k, in_force.limits, in_force.law, state)
     notes = (() if others is None else (OPEN_LOOP,)) + tuple(in_force.notes) + tuple(_coverage_notes(ticks, checked))
     return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes)
+
+
+def _recorded(
+    run: Tape | RecordedRun | FilePath, parameters: ControllerConfig | None, changes: Sequence[Change] | None
+) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
+    """The tape of a run, with the parameters and the changes of the run where none are given. Raises ParameterError."""
+    if isinstance(run, Tape):
+        scenario = run.scenario
+        own = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
+        return run, as_controller(own, "parameters"), changes or ()
+    read = _as_run(run)
+    own = recorded_parameters(read.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
+    if changes is None and read.path is not None:
+        changes = parameter_changes(read.path, f"{read.namespace}/controller", type(own).model_fields)
+    return read.tape, own, changes or ()
 
 
 class _ParametersInForce:

@@ -9,10 +9,11 @@ from typing import Annotated, Any
 
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.pose import every
+from flight_core.arguments import FilePath, as_instance, as_path
 from flight_core.channels import RATES_AND_SPEED
-from flight_core.fields import Field
+from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, read_file
-from flight_core.parameters import REMOVED, Config, ParameterError, require
+from flight_core.parameters import REMOVED, Config, ParameterError, one_of, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
 from flight_guidance.params import GuidanceConfig
@@ -46,24 +47,39 @@ class Scenario:
     recorder: RecorderConfig
     guidance: GuidanceConfig | None = None  # None: the commands are those of the reference model
 
-    def vary(self, **sections: Mapping[str, Any]) -> "Scenario":
+    def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).
 
-        The copy is validated. A missing section of guidance begins with the numbers by rule. Raises
-        ParameterError.
+        The value of a section is a mapping of new parameters, or a whole parameter set such as the `controller` of a second
+        scenario. Lists may be arrays. A different `law` starts without the gains of the former law. The copy is validated. A
+        missing section of guidance begins with the numbers by rule. Raises ParameterError.
         """
-        changed: dict[str, Any] = {
-            name: SCHEMAS[name].validate_mapping({**self._values(name), **changes}, name) for name, changes in sections.items()
-        }
-        varied = replace(self, **changed)
+        varied = replace(self, **{name: self._varied(name, changes) for name, changes in sections.items()})
         check_together(varied)
         return varied
 
-    def _values(self, name: str) -> dict[str, Any]:
+    def _varied(self, name: str, changes: Mapping[str, Any] | Config) -> Any:
+        """A section with changes, validated."""
+        schema = SCHEMAS.get(name)
+        if schema is None:
+            owners = [key for key in SCHEMAS if name in getattr(getattr(self, key), "model_fields", ())]
+            expected = f"it in a section: vary({owners[0]}={{{name!r}: ...}})" if owners else one_of(tuple(SCHEMAS), name)
+            raise ParameterError(f"{name}: found no such section, expected {expected}")
+        if isinstance(changes, ControllerConfig if schema is AnyLaw else schema):
+            return schema.validate_mapping(changes.model_dump(), name)
+        if not isinstance(changes, Mapping):
+            raise ParameterError(f"{name}: found {short_repr(changes)}, expected a mapping of its parameters")
+        return schema.validate_mapping({**self._values(name, changes), **changes}, name)
+
+    def _values(self, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The parameters of a section that changes are added to."""
         section: Config | None = getattr(self, name)
-        return (
-            guidance_by_rule(self.aircraft, self.reference_model, self.controller) if section is None else section.model_dump()
-        )
+        if section is None:
+            return guidance_by_rule(self.aircraft, self.reference_model, self.controller)
+        values = section.model_dump()
+        if isinstance(section, ControllerConfig) and changes.get("law", section.law) != section.law:
+            return {key: values[key] for key in ControllerConfig.model_fields}
+        return values
 
     def rise_di(self) -> RiseDiConfig:
         """The parameters of a controller with RISE-DI. Raises ParameterError for a different law."""
@@ -78,6 +94,11 @@ class Scenario:
         return {name: (gust.start, gust.start + 2.0 * gust.length / speed) for name, gust in self.aircraft.gusts.items()}
 
 
+def as_scenario(value: object) -> Scenario:
+    """The value, a Scenario. Raises ParameterError for another value."""
+    return as_instance(value, Scenario, "scenario", "a Scenario, as find_scenario and recorded_scenario return one")
+
+
 SCHEMAS: dict[str, type[Config]] = {
     "flight": FlightConfig,
     "aircraft": AircraftConfig,
@@ -89,8 +110,9 @@ SCHEMAS: dict[str, type[Config]] = {
 OPTIONAL = ("guidance",)
 
 
-def load_scenario(path: Path) -> Scenario:
+def load_scenario(path: FilePath) -> Scenario:
     """Read and validate a scenario file. Raises ParameterError with a sentence."""
+    path = as_path(path, "scenario", A_SCENARIO)
     return parse_scenario(read_file(path, str(path), A_SCENARIO), path)
 
 
@@ -157,8 +179,9 @@ def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, 
 def scenario_yaml(scenario: Scenario, overrides: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """The text of a scenario file with every parameter, defaults included. `overrides` replace parameters by section.
 
-    A parameter with the value None or empty, the default, is left out.
+    A parameter with the value None or empty, the default, is left out. Raises ParameterError for what is no scenario.
     """
+    as_scenario(scenario)
     sections = {}
     for name, schema in SCHEMAS.items():
         section: Config | None = getattr(scenario, name)

@@ -9,9 +9,10 @@ from contextlib import suppress
 import numpy as np
 
 from aircraft_sim.simulator import Simulator
-from flight_analysis.closed_loop.scenario import Scenario, require_euler
+from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_euler
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
+from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
@@ -49,7 +50,13 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
 ) -> Tape:
-    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says."""
+    """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says.
+
+    Raises ParameterError for what is no scenario.
+    """
+    as_scenario(scenario)
+    change = 'a function of the flight time; scenario.vary(flight={"duration": ...}) changes the duration'
+    require(progress is None or callable(progress), "progress", progress, change)
     parts: list[Mapping[str, Signal]] = []
     outcome = fly(scenario, parts.append, progress, guide)
     signals = {}
@@ -57,7 +64,7 @@ def simulate(
         samples = [part[topic] for part in parts if topic in part]
         stamp_ns = np.concatenate([signal.stamp_ns for signal in samples])
         signals[topic] = Signal(stamp_ns, last.names, np.concatenate([signal.values for signal in samples]))
-    return Tape(signals, outcome=outcome)
+    return Tape(signals, outcome=outcome, scenario=scenario)
 
 
 def fly(  # noqa: PLR0912, PLR0915 - a part a node

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eig, eigvals
 
 from aircraft_sim.airframe import Airframe, airframes, load_airframe
+from flight_core.arguments import FilePath
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, Pairing, coupling, leading_minors, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
@@ -73,12 +74,13 @@ class AirframeFacts(NamedTuple):
         return ", ".join(steps) or "none needed"
 
 
-def airframe_facts(airframe: Airframe) -> AirframeFacts:
-    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe; SI.
+def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
+    """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, or of a name or file; SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
     part (A, B, C): f is left out. A published A may contain gravity.
     """
+    airframe = load_airframe(airframe)
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
     Omega, hidden = C @ B, np.logical_not(C.any(axis=0))
     zeros = invariant_zeros(A, B, C)

@@ -34,6 +34,7 @@ from flight_analysis.design import gain_conditions
 from flight_analysis.design.airframe_properties import invariant_zeros
 from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix
+from flight_core.arguments import as_instance
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import Array, FloatArray
@@ -582,6 +583,7 @@ CONTROLLER_YAML = yaml_template("""\
 
 def as_yaml(selection: Selection) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments."""
+    as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     controller, study = selection.engineering.controller, selection.study
     params = controller.law_params()
     rows, columns = law_order(study.airframe, controller)

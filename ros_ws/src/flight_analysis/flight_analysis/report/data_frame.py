@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Tape
+from flight_core.tape import Tape, as_tape
 
 if TYPE_CHECKING:  # it loads in some tenths of a second
     import polars as pl
@@ -21,6 +21,7 @@ def data_frame(tape: Tape) -> "pl.DataFrame":
     """
     import polars as pl  # noqa: PLC0415
 
+    as_tape(tape)
     stamps = np.unique(np.concatenate([signal.stamp_ns for signal in tape.signals.values()]))
     columns: dict[str, np.ndarray] = {"stamp_ns": stamps, "t": (stamps - tape.start_ns) / NANOSECONDS}
     missing: dict[str, np.ndarray] = {}

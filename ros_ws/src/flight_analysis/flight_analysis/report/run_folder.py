@@ -91,7 +91,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     name = printable(folder.name if run.is_dir() else run.stem)
     engaged = _engaged(tape, flown or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
-    summary = summarise(scenario, engaged if has_figures else tape, outcome or _previous_outcome(folder / SUMMARY))
+    summary = summarise(engaged if has_figures else tape, scenario, outcome or _previous_outcome(folder / SUMMARY))
     if flown is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in flown]
         summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
@@ -122,9 +122,8 @@ def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
 
 def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
     """The scenario in a log, with a path beside the log. Raises ParameterError."""
-    if recorded.scenario is None:
-        raise ParameterError(f"{run}: found a log without its scenario, expected a run that was flown from one")
-    return parse_recorded_scenario(recorded.scenario.content, _folder(run) / recorded.scenario.name)
+    stored = recorded.scenario_file()
+    return parse_recorded_scenario(stored.content, _folder(run) / stored.name)
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:

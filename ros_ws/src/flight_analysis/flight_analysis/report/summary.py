@@ -3,12 +3,13 @@
 """Metrics of a flight for `summary.json` and the tables, with the units and columns of the tables."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.metrics import (
     GUIDED_LEGEND,
     PARTS_LEGEND,
@@ -30,10 +31,11 @@ from flight_analysis.metrics import (
 from flight_analysis.report.guided import UNITS, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
-from flight_core.tape import Tape
+from flight_core.tape import Tape, as_tape
 from flight_core.units import SI_PER_UNIT
 
 NO_VALUE = "-"
+OLD_ORDER = "summarise(scenario, tape, outcome): the order is summarise(tape, scenario, outcome), and summarise(tape) is enough"
 
 
 class DisplayUnit(NamedTuple):
@@ -108,8 +110,19 @@ class RecordedFlight(NamedTuple):
         return period_ns(self.scenario.controller.rate, "controller.rate")
 
 
-def summarise(scenario: Scenario, tape: Tape, outcome: str) -> dict[str, Any]:
-    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys."""
+def summarise(tape: Tape, scenario: Scenario | None = None, outcome: str | None = None) -> dict[str, Any]:
+    """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys.
+
+    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. Raises ParameterError for
+    a tape without y and y_m. The order `summarise(scenario, tape, outcome)` of version 0.2 works with a warning.
+    """
+    if isinstance(tape, Scenario):
+        warnings.warn(OLD_ORDER, FutureWarning, stacklevel=2)
+        return summarise(as_tape(scenario), tape, outcome)
+    flown = as_tape(tape).scenario if scenario is None else scenario
+    require(flown is not None, "scenario", "none on the tape of a log", "summarise(run.tape, recorded_scenario(run))")
+    scenario = as_scenario(flown)
+    outcome = tape.outcome if outcome is None else outcome
     for topic in ("y", "y_m"):
         require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
     events = transients(scenario, tape)

@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The report of recorded runs: the page of one run or of a comparison, and the data for other programs."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from flight_analysis.report.export import write_csv, write_parquet, write_png
+from flight_analysis.report.html import write_page
+from flight_analysis.report.run_folder import read_flight, write_report
+from flight_analysis.report.summary import RecordedFlight
+from flight_core.arguments import FilePath, as_path
+from flight_core.files import writing
+from flight_core.parameters import require
+from flight_log.tape_reader import A_RUN
+
+A_FILE = "the path of a file"
+
+
+class Report(NamedTuple):
+    """A report that is written: the path of the page, and the flights on the page."""
+
+    page: Path
+    flights: list[RecordedFlight]
+
+
+def report(
+    *runs: FilePath,
+    html: FilePath | None = None,
+    output: FilePath | None = None,
+    png: FilePath | None = None,
+    csv: FilePath | None = None,
+    parquet: FilePath | None = None,
+) -> Report:
+    """Write the report page of a recorded run, or a page that compares several runs with the first, as `rise-di report` does.
+
+    Args:
+        runs: Folders of runs, or MCAP files.
+        html: Page of a comparison; None: comparison.html beside the first run. With one run: its page alone.
+        output: Folder for the report of one run; None: the folder of the log.
+        png: File for y over y_m, e and u as one figure.
+        csv: File for all signals, one row an instant, one column a channel.
+        parquet: File for the same table as Parquet.
+
+    Raises ParameterError for a run that cannot be read, and for a file that cannot be written.
+    """
+    require(bool(runs), "runs", "none", A_RUN)
+    folders = [as_path(run, "run", A_RUN) for run in runs]
+    wanted = (("html", html, write_page), ("png", png, write_png), ("csv", csv, write_csv), ("parquet", parquet, write_parquet))
+    files = [(key, as_path(path, key, A_FILE), write) for key, path, write in wanted if path is not None]
+    alone = len(folders) == 1 and html is None
+    require(output is None or alone, "output", "a comparison", "one run; html for several")
+    if alone:
+        result = write_report(folders[0], output=None if output is None else as_path(output, "output", "the path of a folder"))
+        page, flights = result.report, [result.flight]
+    else:
+        flights = [read_flight(folder) for folder in folders]
+        if html is None:
+            files.insert(0, ("html", folders[0].absolute().parent / "comparison.html", write_page))
+        page = files[0][1]
+    for key, path, write in files:
+        with writing(key, path, A_FILE):
+            write(path, flights)
+    return Report(page, flights)

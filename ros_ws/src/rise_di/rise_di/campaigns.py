@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Monte Carlo campaigns, as `rise-di campaign` flies them with the threads of this process."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from aircraft_sim.uncertainty import WindEffect
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.run_folder import REPORT, new_run
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import engines
+from flight_campaign.campaign import CHUNK, Campaign, Sweep, define
+from flight_campaign.campaign_report import write_results
+from flight_core.arguments import FilePath, as_count, as_path
+from flight_core.parameters import ParameterError, require
+
+Progress = Callable[[int, int], None]
+"""Takes the number of flights so far and of all flights of a campaign."""
+
+
+class CampaignResult(NamedTuple):
+    """A campaign that has flown. `figures` is its summary.json."""
+
+    folder: Path
+    report: Path
+    figures: dict[str, Any]
+
+
+def fly_campaign(
+    scenario: FilePath | Scenario,
+    aircraft: int = 1000,
+    *,
+    uncertainty: float = 0.3,
+    wind: WindEffect | None = None,
+    seed: int = 1,
+    sweep: Mapping[str, ArrayLike] | None = None,
+    duration: float | None = None,
+    chunk: int = CHUNK,
+    workers: int | None = None,
+    runs: FilePath = "runs",
+    progress: Progress | None = None,
+) -> CampaignResult:
+    """Fly thousands of uncertain aircraft around the airframe of a scenario, and write the report of the campaign.
+
+    Args:
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        aircraft: How many uncertain aircraft.
+        uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the airframe; None: the scenario's.
+        seed: Seed of the aircraft.
+        sweep: A parameter of the controller and factors that multiply it: {"beta": [0.5, 1.0, 2.0]}.
+        duration: Seconds to fly; None: those of the scenario.
+        chunk: Aircraft computed at once. More are faster on a GPU.
+        workers: Threads; None: one a core.
+        runs: Folder that the folder of the campaign is made in.
+        progress: Called with the flights so far and all flights, after each chunk.
+
+    Raises ParameterError with one sentence for what a campaign cannot fly. After Ctrl-C `resume_campaign` continues.
+    """
+    chosen = find_scenario(scenario, duration)
+    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind)
+    flies, report = _threads(workers), _progress(progress)
+    folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
+    return _fly(Campaign.begin(folder, definition), flies, report)
+
+
+def resume_campaign(folder: FilePath, *, workers: int | None = None, progress: Progress | None = None) -> CampaignResult:
+    """Fly the aircraft that an interrupted campaign has not flown. Raises ParameterError for a folder without a campaign."""
+    return _fly(Campaign.resume(as_path(folder, "folder", "the folder of a campaign")), _threads(workers), _progress(progress))
+
+
+def _threads(workers: int | None) -> engines.Engine:
+    return engines.threads(None if workers is None else as_count(workers, "workers", 1))
+
+
+def _progress(progress: Progress | None) -> Progress:
+    require(progress is None or callable(progress), "progress", progress, "a function of the flights so far and of all flights")
+    return progress or (lambda flown, total: None)
+
+
+def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:
+    if sweep is None:
+        return None
+    if not isinstance(sweep, Mapping) or len(sweep) != 1:
+        raise ParameterError(
+            f'sweep: found {sweep!r}, expected one parameter and its factors, as in {{"beta": [0.5, 1.0, 2.0]}}'
+        )
+    ((parameter, factors),) = sweep.items()
+    return Sweep.validate_mapping({"parameter": parameter, "factors": factors}, "sweep")
+
+
+def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> CampaignResult:
+    definition, missing = campaign.definition, campaign.missing()
+    total = definition.aircraft * definition.cases
+    flown = total - sum(definition.size(job) for job in missing)
+    for flights in campaign.fly(engine):
+        flown += flights
+        progress(flown, total)
+    figures, _ = write_results(campaign)
+    return CampaignResult(campaign.folder, campaign.folder / REPORT, figures)
