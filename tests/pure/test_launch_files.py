@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files with a stand-in for `launch`, which is not on PyPI (tests/launch_stand_in.py).
+"""The launch files with the official `launch` where it is installed, else with a stand-in (tests/launch_stand_in.py).
 
 Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
 """
@@ -234,7 +234,7 @@ def test_node_that_is_not_ready_in_time_named(tmp_path: Path) -> None:
     (warn,) = timer.actions
     assert isinstance(warn, OpaqueFunction)
     assert publish(actions, context, f"/recorder#{PID}") == []
-    assert warn.function(context) == [stand_in.LogInfo("timed out waiting for controller: not ready after 20 s")]
+    assert warn.function(context) == [stand_in.LogInfo(msg="timed out waiting for controller: not ready after 20 s")]
     assert publish(actions, context, f"/controller#{PID}")
     assert warn.function(context) == []
 
