@@ -71,6 +71,7 @@ messages: .venv/.messages
 	@$(BIN)/python -m tools.messages $(PACKAGE) $(SOURCE) $(if $(MESSAGES),--messages $(MESSAGES)) $(ARGS)
 
 wheel: .venv/.fly
+	@rm -rf dist
 	$(BIN)/uv build --quiet --no-build-isolation --python $(BIN)/python --out-dir dist
 
 setup: .venv/.workspace
