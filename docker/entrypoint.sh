@@ -11,4 +11,8 @@ shift
 for program in /opt/rise-di/install/lib/*/"$name"; do
   [ ! -x "$program" ] || exec "$program" "$@"
 done
+if [ "$name" = ros2 ]; then # under the interpreter of the venv, whose packages the launch files need
+  set -- "$(command -v ros2)" "$@"
+  name=python3
+fi
 exec "$name" "$@"
