@@ -33,6 +33,7 @@ from tests.ros.conftest import Process, logged
 from tests.ros.peer import peer
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_bringup.graph import AIRCRAFT, BRIDGE, CONTROLLER, GUIDANCE, RECORDER, REFERENCE_MODEL
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -52,14 +53,7 @@ class Kind(Enum):
     BRIDGED = "the bridge and a simulated autopilot in place of the aircraft"
 
 
-PACKAGES = {
-    "recorder": "flight_recorder",
-    "controller": "rise_di_controller",
-    "aircraft": "aircraft_sim",
-    "reference_model": "reference_model",
-    "guidance": "guidance",
-    "bridge": "autopilot_bridge",
-}
+MODULES = {node.executable: node.module for node in (RECORDER, CONTROLLER, AIRCRAFT, REFERENCE_MODEL, GUIDANCE, BRIDGE)}
 FOUR: tuple[str, ...] = ("recorder", "controller", "aircraft", "reference_model")
 ROLES = {
     Kind.PLAIN: FOUR,
@@ -341,7 +335,7 @@ class Flight:
             words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]
         preload = {} if self._clock is None else {"LD_PRELOAD": str(self._clock), "FAULTS_CLOCK": str(self._step)}
         with patch.dict(os.environ, preload):
-            arguments = (f"{PACKAGES[role]}.main", "--ros-args", "--params-file", str(self.scenario), *words)
+            arguments = (MODULES[role], "--ros-args", "--params-file", str(self.scenario), *words)
             process = self._run(*arguments, cwd=self.folder)
         self.probe.monitored.append(process)
         return process
@@ -591,4 +585,9 @@ class Flight:
         except AssertionError as error:
             ticks, delay = self.ticks(time.time() - 2.0), self.host_delay(begin, time.time())
             e = np.abs(ticks.e).max(axis=0, initial=0.0)
-            raise AssertionError(f"{error}: {ticks.modes}, e {e}, host scheduling delay up to {delay:.2f} s") from None
+            ended = [
+                f"\n{role}: {process.output}" for role, process in self.processes.items() if process.popen.poll() is not None
+            ]
+            raise AssertionError(
+                f"{error}: {ticks.modes}, e {e}, host scheduling delay up to {delay:.2f} s{''.join(ended)}"
+            ) from None
