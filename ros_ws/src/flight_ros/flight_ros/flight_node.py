@@ -203,8 +203,9 @@ class FlightNode(Node, Generic[P]):
         return self.parameters.lockstep
 
     def require_peers(self) -> None:
-        """Raise FlightEnded after the loss of a peer of a lockstep flight."""
+        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to the other peers."""
         if self.peers is not None and (role := self.peers.lost()):
+            self.peers.report(role)
             raise FlightEnded(f"{LOST_CONTACT} {role}")
 
     def finish(self) -> None:

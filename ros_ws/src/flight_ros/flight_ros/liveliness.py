@@ -8,12 +8,13 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from std_msgs.msg import Empty
+from std_msgs.msg import String
 
+from flight_ros.rclpy_private import take_messages
 from flight_ros.topics import LIVELINESS
 
 SHUTDOWN_GRACE_NS = 600_000_000
-"""A peer that shuts down may do so because it lost another one. A busy process may notice that loss this much later."""
+"""Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another cause sends no report."""
 
 ROLES = ("aircraft", "reference_model", "guidance", "controller", "recorder")
 
@@ -21,21 +22,22 @@ ROLES = ("aircraft", "reference_model", "guidance", "controller", "recorder")
 class LivelinessMonitor:
     """Asserts the liveliness of a node on `alive/<role>` and monitors that of the other roles.
 
-    The middleware sends the heartbeats. It reports the end of a process within the lease duration of `LIVELINESS`, or within
-    that of the participant, two seconds, if the process ended before its first heartbeat. A role that never appeared is not
-    lost: a flight can run without a recorder.
+    The middleware sends the heartbeats. The only message of a role is its report: the name of the role that it lost. It reports
+    the end of a process within the lease duration of `LIVELINESS`, or within that of the participant, two seconds, if the
+    process ended before its first heartbeat. A role that never appeared is not lost: a flight can run without a recorder.
     """
 
     def __init__(self, node: Node, role: str) -> None:
-        self._dead = ""  # the first role whose heartbeats stopped
+        self._role = role
+        self._dead = ""  # the first role whose heartbeats stopped, or that a peer reported
         self._left = ""  # the first role that shut down cleanly
         self._left_ns = 0
-        self._publisher = node.create_publisher(Empty, f"alive/{role}", LIVELINESS)
+        self._publisher = node.create_publisher(String, f"alive/{role}", LIVELINESS)
         self._subscriptions = [
             node.create_subscription(
-                Empty,
+                String,
                 f"alive/{peer}",
-                lambda _: None,
+                self._on_report,
                 LIVELINESS,
                 event_callbacks=SubscriptionEventCallbacks(
                     liveliness=partial(self._on_liveliness, peer), matched=partial(self._on_matched, peer)
@@ -48,11 +50,22 @@ class LivelinessMonitor:
     def lost(self) -> str:
         """The role that was lost; empty if none was.
 
-        A role that shut down cleanly is reported after SHUTDOWN_GRACE_NS, unless the role that it lost is reported first.
+        A role that shut down cleanly is lost after SHUTDOWN_GRACE_NS, unless a report names the role that ended first.
         """
+        for subscription in self._subscriptions:  # the executor may serve a report later than the end of its publisher
+            for message, _ in take_messages(subscription, 1):
+                self._on_report(message)
         if self._dead or not self._left or time.monotonic_ns() - self._left_ns < SHUTDOWN_GRACE_NS:
             return self._dead
         return self._left
+
+    def report(self, role: str) -> None:
+        """Publish the role that was lost, so that all peers name the role that ended first."""
+        self._publisher.publish(String(data=role))
+
+    def _on_report(self, message: String) -> None:
+        if message.data in ROLES and message.data != self._role:
+            self._dead = self._dead or message.data
 
     def _on_liveliness(self, role: str, event: Any) -> None:
         if event.alive_count > 0:  # alive, possibly as the role of a new flight

@@ -25,10 +25,16 @@ NEWEST_SAMPLES = QoSProfile(depth=128, reliability=ReliabilityPolicy.BEST_EFFORT
 # A lockstep flight needs every sample from the first one on, also of a subscriber that is matched late. The depth is for speed:
 # with a full history, Fast DDS requests an acknowledgement of each sample.
 LOCKSTEP = QoSProfile(depth=20_000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# No messages are sent with it: the middleware reports the loss of liveliness. It asserts it every two thirds of the lease, so a
-# process that the host stops for less than the other third, 0.6 s, is never lost. With a lease of 1 s, 2 of 20 stops of 0.4 s
-# lost the process. The lease is shorter than that of the participant, 2 s, which does not tell a kill from a clean end.
-LIVELINESS = QoSProfile(depth=1, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=1.8))
+# The middleware reports the loss of liveliness. It asserts it every two thirds of the lease, so a process that the host stops
+# for less than the other third, 0.6 s, is never lost. With a lease of 1 s, 2 of 20 stops of 0.4 s lost the process. The lease
+# is shorter than that of the participant, 2 s, which does not tell a kill from a clean end. The only message of a node is the
+# name of the role that it lost, before it ends.
+LIVELINESS = QoSProfile(
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    liveliness=LivelinessPolicy.AUTOMATIC,
+    liveliness_lease_duration=Duration(seconds=1.8),
+)
 RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # For topics of other publishers, which may not keep samples. If a publisher offers less, the recorder requests less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
