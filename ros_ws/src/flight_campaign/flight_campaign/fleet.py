@@ -24,6 +24,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import missions
 from flight_campaign.benchmark_course import Course, Segments
 from flight_campaign.missions import Mission
+from flight_core.arithmetic import product
 from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
@@ -353,8 +354,5 @@ def _in_trim(fleet: Fleet, vehicle: Vehicle, y_late: int, u_late: int, mission: 
 
 
 def _product(matrices: Array, vector: Any) -> Array:
-    """Sum over j of matrices[:, j] vector[j]: the matrix-vector product of each aircraft, compiled to one loop."""
-    total = 0.0 * matrices[:, 0] if matrices.shape[1] else jnp.zeros((matrices.shape[0], matrices.shape[-1]))
-    for j in range(matrices.shape[1]):
-        total = total + matrices[:, j] * vector[j]
-    return total
+    """The matrix-vector product of each aircraft, compiled to one loop; 0 for matrices without a column."""
+    return product(matrices, vector) if matrices.shape[1] else jnp.zeros((matrices.shape[0], matrices.shape[-1]))

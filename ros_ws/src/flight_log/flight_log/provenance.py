@@ -8,11 +8,14 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import psutil
+
+from flight_core.arithmetic import ARITHMETIC, ARITHMETIC_OF_HOST
 
 # All packages of the stack, as in ros_ws/src.
 STACK = (
@@ -46,6 +49,7 @@ DEPENDENCIES = (
     "zstandard",
 )
 
+VERSIONS = "rise_di_versions"  # name of the versions in the metadata of a log
 GIT_TIMEOUT = 5.0  # s
 
 
@@ -53,15 +57,20 @@ def provenance() -> dict[str, dict[str, str]]:
     """The provenance of this process now. What cannot be determined is left out."""
     return {
         "rise_di_flight": {"start": datetime.now(UTC).isoformat(timespec="seconds"), "command": shlex.join(sys.argv)},
-        "rise_di_versions": versions(),
+        VERSIONS: versions(),
         "rise_di_revision": revision(Path(__file__).resolve()),
         "rise_di_host": host(),
     }
 
 
+def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """Number of the arithmetic of u in a log: versions without a number are older; a log without versions has the present."""
+    return metadata.get(VERSIONS, {"arithmetic": ARITHMETIC}).get("arithmetic", ARITHMETIC_OF_HOST)
+
+
 def versions() -> dict[str, str]:
-    """Versions of Python, of the installed packages of the stack and of the installed main dependencies."""
-    installed = {"python": platform.python_version()}
+    """Versions of Python, the arithmetic of u, the installed packages of the stack and the installed main dependencies."""
+    installed = {"python": platform.python_version(), "arithmetic": ARITHMETIC}
     for name in (*STACK, *DEPENDENCIES):
         try:
             installed[name] = version(name)

@@ -9,6 +9,7 @@ here. See docs/theory.md.
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+from flight_core.arithmetic import product
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits, saturate
@@ -37,16 +38,6 @@ class ObserverState(NamedTuple):
     z: Array  # (s,) estimates, predicted for the next tick
     u_o: Array  # (m,) the observer's contribution to the trim
     sigma: Array  # (1,) fade-in after engagement, 0 to 1
-
-
-def product(matrix: Array, vector: Array) -> Array:
-    """The product of a matrix (k, s) with a vector (s,) or (s, N); of N matrices (k, s, N) with N vectors (s, N): (k, N)."""
-    if matrix.ndim == 2:
-        return matrix @ vector
-    total = matrix[:, 0] * vector[0]
-    for j in range(1, matrix.shape[1]):
-        total = total + matrix[:, j] * vector[j]
-    return total
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_recorded_sections
 from flight_core.arguments import FilePath
+from flight_core.arithmetic import arithmetic
 from flight_core.fields import short_repr
 from flight_core.modes import Mode
 from flight_core.parameters import flatten, nest, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
+from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, StoredFile, read_run
 from rise_di_controller import feedforward, guard, internals
@@ -134,9 +136,22 @@ def replay(
     not begin with the flight, the law engages in the first tick, at the recorded u.
 
     `changes` are parameter changes in flight, in order, by default from the log, none beside `others`. A tick applies the
-    changes up to the parameters of the channel "parameters". Raises ParameterError for `internals` of different channels or of
-    a version with fewer channels, and for invalid changes.
+    changes up to the parameters of the channel "parameters". The arithmetic is that of the log's provenance. Raises
+    ParameterError for `internals` of different channels or of a version with fewer channels, and for invalid changes.
     """
+    if isinstance(run, Tape):
+        return _replay(run, parameters, others, changes)
+    read = _as_run(run)
+    with arithmetic(recorded_arithmetic(read.metadata)):
+        return _replay(read, parameters, others, changes)
+
+
+def _replay(
+    run: Tape | RecordedRun,
+    parameters: ControllerConfig | None,
+    others: ControllerConfig | None,
+    changes: Sequence[Change] | None,
+) -> ReplayResult:
     if others is not None:
         others, changes = as_controller(others, "others"), changes or ()
     elif changes is not None:
@@ -174,18 +189,17 @@ def replay(
 
 
 def _recorded(
-    run: Tape | RecordedRun | FilePath, parameters: ControllerConfig | None, changes: Sequence[Change] | None
+    run: Tape | RecordedRun, parameters: ControllerConfig | None, changes: Sequence[Change] | None
 ) -> tuple[Tape, ControllerConfig, Sequence[Change]]:
     """The tape of a run, with the parameters and the changes of the run where none are given. Raises ParameterError."""
     if isinstance(run, Tape):
         scenario = run.scenario
         own = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
         return run, as_controller(own, "parameters"), changes or ()
-    read = _as_run(run)
-    own = recorded_parameters(read.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
-    if changes is None and read.path is not None:
-        changes = parameter_changes(read.path, f"{read.namespace}/controller", type(own).model_fields)
-    return read.tape, own, changes or ()
+    own = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
+    if changes is None and run.path is not None:
+        changes = parameter_changes(run.path, f"{run.namespace}/controller", type(own).model_fields)
+    return run.tape, own, changes or ()
 
 
 class _ParametersInForce:
