@@ -24,7 +24,7 @@ from flight_core.vectors import ChannelError, StampedVector
 pytestmark = pytest.mark.package("autopilot_bridge")
 
 if TYPE_CHECKING:
-    from flight_bringup.clients import FlightMonitor
+    from flight_bringup.monitor import FlightMonitor
     from flight_bringup.processes import FlightProcesses
 
 CHANNEL_MAP = named_map("ardupilot_2024")

@@ -37,12 +37,12 @@ from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import message_type, read_raw, set_field, to_channel, to_raw
 from autopilot_bridge.params import LIBRARY
 from flight_bringup import processes
-from flight_bringup.clients import ControlClient
 from flight_cli.cli import COMMANDS, application
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
+from flight_view.control_client import ControlClient
 
 pytestmark = pytest.mark.package("autopilot_bridge")
 

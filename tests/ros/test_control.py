@@ -18,11 +18,11 @@ from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer
 from tests.ros.test_lockstep import scenario_file
 
-from flight_bringup.clients import ControlClient
 from flight_core.parameters import ParameterError
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
+from flight_view.control_client import ControlClient
 from flight_view.flight import Flight
 
 pytestmark = pytest.mark.package("flight_view")

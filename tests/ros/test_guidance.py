@@ -21,7 +21,6 @@ from tests.ros.test_lockstep import FIRST_CHUNKS, ROUGH, fly, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.clients import ControlClient
 from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
@@ -31,6 +30,7 @@ from flight_guidance.modes import Lateral, Vertical
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
+from flight_view.control_client import ControlClient
 
 pytestmark = pytest.mark.package("flight_guidance")
 

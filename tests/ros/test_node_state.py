@@ -13,8 +13,8 @@ from tests.ros.peer import Peer, peer
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes
-from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import ONE_PROCESS, NodeSpec, parameter_overrides
+from flight_bringup.monitor import FlightMonitor
 from flight_bringup.processes import FlightProcesses
 from flight_core.parameters import ParameterError
 from flight_ros.topics import NODE_STATE, STATES

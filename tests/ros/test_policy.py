@@ -14,8 +14,8 @@ from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.clients import FlightMonitor
 from flight_bringup.graph import GUIDANCE, parameter_overrides
+from flight_bringup.monitor import FlightMonitor
 from flight_bringup.scenarios import find_scenario
 
 pytestmark = pytest.mark.package("flight_bringup")

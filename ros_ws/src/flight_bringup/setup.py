@@ -8,7 +8,7 @@ from setuptools import setup
 setup(
     name="flight_bringup",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Scenarios, launch files, process runner and service clients of the RISE-DI flight stack.",
+    description="Scenarios, launch files, process runner, monitor and player of the RISE-DI flight stack.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_bringup", "flight_bringup.launch"],

@@ -30,7 +30,7 @@ from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
 
 if TYPE_CHECKING:
-    from flight_bringup.clients import FlightMonitor
+    from flight_bringup.monitor import FlightMonitor
 
 POLL_PERIOD = 0.05  # s, of the progress bar
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
@@ -70,7 +70,7 @@ def fly_over_topics(
     it, or without one when too little time is left.
     Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
     """
-    from flight_bringup.clients import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     try:
         with (

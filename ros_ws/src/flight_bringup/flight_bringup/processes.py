@@ -36,7 +36,7 @@ from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
 
 if TYPE_CHECKING:
-    from flight_bringup.clients import FlightMonitor
+    from flight_bringup.monitor import FlightMonitor
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
 CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log

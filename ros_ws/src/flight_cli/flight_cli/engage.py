@@ -24,7 +24,7 @@ def engage(
     where the map has a condition for it; elsewhere max_engaged of the map ends the engagement, unless you engage again before.
     Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """
-    from flight_bringup.clients import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:
         refusal = client.disengage() if off else client.engage(lambda line: print(line, file=sys.stderr), blind=blind)

@@ -40,7 +40,7 @@ def play(
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start)
-    from flight_bringup.clients import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    from flight_bringup.player import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)
     with Player(playback.types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:

@@ -42,7 +42,7 @@ def target(
     """
     values = dict(map(_parse, commands))
     require(len(values) == len(commands), "target", "a command twice", "each once")
-    from flight_bringup.clients import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    from flight_guidance.client import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with TargetClient(namespace) as client:
         refusal = client.send(values)

@@ -84,8 +84,8 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
 
 def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:
     from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
-    from flight_bringup.clients import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
+    from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
     with ControlClient(namespace) as client:
         key, controls = new_key(), []

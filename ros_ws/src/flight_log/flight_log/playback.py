@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_ros.player` sends."""
+"""Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_bringup.player` sends."""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -22,9 +22,9 @@ ROLES = ("aircraft", "reference_model", "guidance", "controller", "recorder")
 class LivelinessMonitor:
     """Asserts the liveliness of a node on `alive/<role>` and monitors that of the other roles.
 
-    The middleware sends the heartbeats. The only message of a role is its report: the name of the role that it lost. It reports
-    the end of a process within the lease duration of `LIVELINESS`, or within that of the participant, two seconds, if the
-    process ended before its first heartbeat. A role that never appeared is not lost: a flight can run without a recorder.
+    The middleware sends the heartbeats. It reports the end of a process within the lease duration of `LIVELINESS`, or within
+    that of the participant, two seconds, if the process ended before its first heartbeat. A role that never appeared is not
+    lost: a flight can run without a recorder. The only message of a role is its report: the name of the role that it lost.
     """
 
     def __init__(self, node: Node, role: str) -> None:

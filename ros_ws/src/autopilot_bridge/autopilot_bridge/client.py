@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Client of a bridge, for `rise-di engage` and the live page."""
+
+from collections.abc import Callable
+
+import rclpy
+from rclpy.serialization import deserialize_message
+from std_srvs.srv import SetBool, Trigger
+
+from flight_ros.client import SERVICE_TIMEOUT, Client
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
+
+ENGAGE, ENGAGE_BLIND = "bridge/engage", "bridge/engage_blind"  # services
+WITHDRAW_TIMEOUT = 1.0  # s
+U_TIMEOUT = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
+TRIM_SAMPLES = 20  # equal samples of u in a row: u has reached trim
+
+
+class EngagementClient(Client):
+    """Engages and disengages a running bridge without a jump of u (bumpless transfer)."""
+
+    def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
+        super().__init__("engage", namespace, parent)
+        self._u: list[tuple[float, ...]] = []
+        self._phases: list[tuple[str, str]] = []
+        self._waits_for = ""  # the last reason that was reported
+        self._engagement_subscription = PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
+        self._u_subscription = PolledSubscription(self._node, U, NEWEST_SAMPLES, raw=True)
+
+    def engage(self, progress: Callable[[str], None], *, blind: bool = False) -> str:
+        """Wait for u at trim and engage the bridge, which activates the controller. Returns the reason of a refusal, or "".
+
+        An engaged bridge takes the request at once: the time of `max_engaged` starts again. `blind`: without regard to the loss
+        of the transmitter. `progress` is called with what the bridge waits for, and with what it lacks once it is engaged. An
+        engagement that is not waited for any more, as after Ctrl-C, is withdrawn: the autopilot must not change its mode later.
+        """
+        self._spin_until(lambda: bool(self._received_phases()), "bridge/engagement: not received, expected a running bridge")
+        if self._phases[-1][0] != "ENGAGED":
+            self._spin_until(
+                lambda: bool(self._received_u()), "u: not received, expected a controller with y and y_m", U_TIMEOUT
+            )
+            self._spin_until(self._at_rest, f"u: not at trim after {SERVICE_TIMEOUT:g} s, expected a ramp to trim")
+        self._received_phases().clear()
+        try:
+            if refusal := self._engage_blind() if blind else self._set_engaged(engaged=True):
+                return refusal
+            silent = "bridge/engagement: no change, expected ENGAGED or a reason"
+            self._spin_until(lambda: self._settled(progress), silent, U_TIMEOUT)
+        except BaseException:
+            self._withdraw()
+            raise
+        phase, reason = self._phases[-1]
+        if phase != "ENGAGED":
+            return reason
+        if reason:
+            progress(f"warning: {reason}")
+        return ""
+
+    def _engage_blind(self) -> str:
+        return str(self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message)
+
+    def disengage(self) -> str:
+        """Disengage the bridge. Returns its reason to refuse, or ""."""
+        return self._set_engaged(engaged=False)
+
+    def _set_engaged(self, *, engaged: bool) -> str:
+        return str(self._call(SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge").message)
+
+    def _withdraw(self) -> None:
+        """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is stopped answers later."""
+        client = self._node.create_client(SetBool, ENGAGE)
+        if client.wait_for_service(WITHDRAW_TIMEOUT):
+            future = client.call_async(SetBool.Request(data=False))
+            rclpy.spin_until_future_complete(self._node, future, timeout_sec=WITHDRAW_TIMEOUT)
+        self._node.destroy_client(client)
+
+    def _received_u(self) -> list[tuple[float, ...]]:
+        for received in self._u_subscription.take():
+            self._u.append(tuple(deserialize_message(received.message, U.type).position))
+        return self._u
+
+    def _received_phases(self) -> list[tuple[str, str]]:
+        """Phases of the bridge with their reasons, since the request."""
+        self._phases += [(received.message.key, received.message.value) for received in self._engagement_subscription.take()]
+        return self._phases
+
+    def _settled(self, progress: Callable[[str], None]) -> bool:
+        """Whether the bridge has engaged, or has given up after it began to. Reports from before the request do not count."""
+        phases = [phase for phase, _ in self._received_phases()]
+        while phases and phases[0] not in {"ENGAGING", "ENGAGED"}:
+            del phases[0], self._phases[0]
+        if phases and phases[-1] == "ENGAGING" and self._phases[-1][1] != self._waits_for:
+            self._waits_for = self._phases[-1][1]
+            progress(f"waiting: {self._waits_for}")
+        return bool(phases) and phases[-1] != "ENGAGING"
+
+    def _at_rest(self) -> bool:
+        self._received_u()
+        return len(self._u) >= TRIM_SAMPLES and len(set(self._u[-TRIM_SAMPLES:])) == 1

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Monitor of a flight: what `rise-di fly` sees of the nodes."""
+
+import os
+
+from flight_core.modes import Mode
+from flight_core.parameters import require
+from flight_core.rates import seconds
+from flight_core.vectors import ChannelError, FloatArray
+from flight_ros.client import Client
+from flight_ros.messages import Decoder, stamp_of
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import (
+    ENGAGEMENT,
+    INTERNALS,
+    LOCKSTEP,
+    NEWEST_SAMPLES,
+    NODE_STATE,
+    PUBLISH,
+    RECORDED,
+    STATES,
+    Y_M,
+    NodeState,
+    Y,
+)
+
+MODES = {float(mode): mode.name for mode in Mode}
+
+
+class FlightMonitor(Client):
+    """Monitors a flight: the states of its nodes, the controller's internals, in lockstep the progress of the log."""
+
+    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool) -> None:
+        super().__init__("monitor")
+        # Each subscription slows a lockstep flight down.
+        self._internals = None if lockstep else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
+        self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
+        self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
+        self._states: dict[str, str] = {}  # by process
+        self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
+        self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
+
+    def is_ready(self, node: str, pid: int) -> bool:
+        """Whether the loop of a node runs. The process id tells it from a node of that name in another flight."""
+        for received in self._node_state.take():
+            self._states[received.message.key] = received.message.value
+        return self._states.get(f"/{node}#{pid}") in {NodeState.READY, NodeState.COMPLETED}
+
+    def newest(self) -> tuple[str, FloatArray] | None:
+        """Mode and e of the controller's newest sample since the last call, None without one."""
+        status = None
+        for received in self._internals.take() if self._internals is not None else ():
+            try:
+                sample = self._decoder.decode(received.message)
+            except ChannelError:
+                continue
+            if sample is not None:
+                status = MODES.get(sample.value[0], "?"), sample.value[1:]
+        return status
+
+    def engagement(self) -> list[tuple[str, str]]:
+        """Phases of a bridge with their reasons, in order, since the last call."""
+        messages = () if self._engagement is None else self._engagement.take()
+        return [(received.message.key, received.message.value) for received in messages]
+
+    def recorded(self) -> float | None:
+        """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""
+        messages = self._recorded.take()
+        return seconds(stamp_of(messages[-1].message)) if messages else None
+
+    def require_free_domain(self) -> None:
+        """Raise ParameterError where the domain already has an aircraft or a reference model."""
+        for topic in (Y, Y_M):
+            count = self._node.count_publishers(topic.name)
+            domain = os.environ.get("ROS_DOMAIN_ID", "0")
+            publishers = f"{count} publishers of {topic.name} already"
+            require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, "a domain of its own for each flight: set ROS_DOMAIN_ID")

@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Base class of clients: a node of a command that asks the nodes of a running flight."""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Self
+
+import rclpy
+from rclpy.exceptions import NameValidationException
+from rclpy.signals import SignalHandlerOptions
+
+from flight_core.parameters import ParameterError
+from flight_ros import transport
+
+SERVICE_TIMEOUT = 10.0  # s
+
+
+class Client:
+    """A node in the default context, or that of a `parent`, whose cancellation ends the waits of both.
+
+    A context manager: the middleware always shuts down.
+    """
+
+    def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None) -> None:
+        if parent is None:
+            transport.prepare()
+            # The command handles SIGINT, not rclpy.
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            try:
+                node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+            except NameValidationException as error:
+                rclpy.try_shutdown()
+                raise ParameterError(f"--namespace: {' '.join(str(error).split())}") from None
+            self._node, self._cancelled = node, threading.Event()
+        else:
+            self._node, self._cancelled = parent._node, parent._cancelled
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
+        deadline = time.monotonic() + timeout
+        while not condition():
+            if self._cancelled.is_set():
+                raise ParameterError("cancelled by a later request")
+            if time.monotonic() > deadline:
+                raise ParameterError(message)
+            rclpy.spin_once(self._node, timeout_sec=0.02)
+
+    def _call(self, kind: Any, name: str, request: Any, expected: str = "a flight") -> Any:
+        client = self._node.create_client(kind, name)
+        try:
+            service = f"service {client.srv_name}"
+            self._spin_until(client.service_is_ready, f"{service} not available, expected {expected} in this domain")
+            future = client.call_async(request)
+            self._spin_until(future.done, f"{service}: no response, expected one within {SERVICE_TIMEOUT:g} s")
+            return future.result()
+        finally:
+            self._node.destroy_client(client)

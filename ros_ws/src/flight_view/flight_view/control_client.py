@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Client of all nodes of a flight: the link of a live page with control."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from geometry_msgs.msg import Point, Pose, PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from nav_msgs.msg import Path
+from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rclpy.duration import Duration
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
+
+from autopilot_bridge.client import EngagementClient
+from flight_guidance.client import TargetClient
+from flight_guidance.odometry import MAP
+from flight_ros.client import Client
+from flight_ros.topics import PUBLISH, ROUTE
+
+ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
+ROUTE_POLL_PERIOD = Duration(seconds=0.05)
+
+
+class ControlClient(Client):
+    """Changes a running flight for `rise-di watch --control`. Each method but `cancel` may wait, and is called by one thread.
+
+    Methods return why something is refused, or "". They raise ParameterError where a node or its answer is missing.
+    """
+
+    NODES = ("aircraft", "bridge", "controller", "guidance")
+
+    def __init__(self, namespace: str) -> None:
+        super().__init__("control", namespace)
+        self._targets: TargetClient | None = None
+        self._engagement: EngagementClient | None = None
+
+    def nodes(self) -> list[str]:
+        """The nodes of the flight that can be commanded and are in the graph."""
+        namespace = self._node.get_namespace()
+        running = {name for name, where in self._node.get_node_names_and_namespaces() if where == namespace}
+        return [name for name in self.NODES if name in running]
+
+    def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
+        """Values of a node's parameters, without the parameters that are not set."""
+        values = self._call(GetParameters, f"{node}/get_parameters", GetParameters.Request(names=list(names))).values
+        read = {name: parameter_value_to_python(value) for name, value in zip(names, values, strict=False)}
+        return {
+            name: value.tolist() if hasattr(value, "tolist") else value for name, value in read.items() if value is not None
+        }
+
+    def set_parameters(self, node: str, values: Mapping[str, Any]) -> str:
+        """Set parameters of a node together, or none of them."""
+        request = SetParametersAtomically.Request()
+        request.parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        result = self._call(SetParametersAtomically, f"{node}/set_parameters_atomically", request).result
+        return "" if result.successful else str(result.reason)
+
+    def activate(self, *, active: bool) -> str:
+        """Activate or deactivate the controller."""
+        number = Transition.TRANSITION_ACTIVATE if active else Transition.TRANSITION_DEACTIVATE
+        request = ChangeState.Request(transition=Transition(id=number))
+        response = self._call(ChangeState, "controller/change_state", request)
+        return "" if response.success else f"the controller is {'active' if active else 'inactive'} already"
+
+    def send_target(self, values: Mapping[str, float]) -> str:
+        """Command guidance, as `rise-di target`."""
+        self._targets = self._targets or TargetClient(parent=self)
+        return self._targets.send(values)
+
+    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+        """Publish a route of waypoints, each north, east and altitude in m."""
+        places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
+        route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
+        route.header.frame_id = MAP
+        publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
+        try:
+            subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
+            self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
+            publisher.publish(route)
+            unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
+            self._spin_until(lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT)
+        finally:
+            self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
+        return ""
+
+    def _reaches_guidance(self, publisher: Publisher) -> bool:
+        """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
+        known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        return "guidance" in known and len(known) <= publisher.get_subscription_count()
+
+    def hold(self) -> str:
+        """Hold heading, altitude and airspeed of now."""
+        return str(self._call(Trigger, "guidance/hold", Trigger.Request(), "a flight with guidance").message)
+
+    def skip(self) -> str:
+        """Fly the next leg."""
+        return str(self._call(Trigger, "guidance/skip", Trigger.Request(), "a flight with guidance").message)
+
+    def engage(self) -> str:
+        """Engage the bridge, as `rise-di engage`."""
+        return self._bridge().engage(lambda reason: None)
+
+    def disengage(self) -> str:
+        """Disengage the bridge."""
+        return self._bridge().disengage()
+
+    def _bridge(self) -> EngagementClient:
+        self._engagement = self._engagement or EngagementClient(parent=self)
+        return self._engagement
+
+    def cancel(self) -> None:
+        """End the wait of the method that runs, from another thread."""
+        self._cancelled.set()
+
+    def resume(self) -> None:
+        """Wait again, after `cancel`."""
+        self._cancelled.clear()
+
+    def note(self, text: str) -> None:
+        """Write a line to the log of the flight."""
+        self._node.get_logger().info(text)
