@@ -15,14 +15,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCES = REPOSITORY / "ros_ws" / "src"
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "flight_ros"}
 ROS_SUFFIXES = ("_msgs", "_interfaces", "_srvs")
-ROS_FILES = {
-    "node.py",
-    "main.py",
-    "client.py",
-    "control_client.py",
-    "monitor.py",
-    "player.py",
-}  # a node, its executable, clients
+CLIENTS = {"client.py", "control_client.py", "monitor.py", "player.py"}
+ROS_FILES = {"node.py", "main.py"} | CLIENTS  # nodes, their executables, and clients of nodes
 ROS_FOLDERS = {"flight_ros", "launch"}
 IMPORTS: dict[str, set[str]] = {
     "flight_core": set(),
@@ -57,8 +51,8 @@ IMPORTS: dict[str, set[str]] = {
         "flight_log",
     },
     "flight_view": {
-        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core", "flight_log",
-        "flight_guidance", "rise_di_controller",
+        "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core",
+        "flight_log", "flight_guidance", "rise_di_controller",
     },
     "rise_di": {
         "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
