@@ -82,7 +82,7 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
             ["fly", "--in-process", "--lockstep"],
             "error: --in-process: found a flight over topics, in lockstep, expected one of",
         ),
-        (["report", "nowhere"], "error: nowhere: found no .mcap file"),
+        (["report", "nowhere"], "error: nowhere: found no such file or folder"),
     ],
 )
 def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: str, tmp_path: Path) -> None:

@@ -11,16 +11,18 @@ from flight_analysis.report.run_folder import PARAMETERS
 from flight_core.files import display_path, parse_yaml
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
+from flight_core.text import printable
 from flight_log.repair import FileRepair
 from flight_log.repair import repair as repair_bag
 from flight_log.rosbag2_metadata import METADATA
 from flight_log.tape_reader import read_run
 
 
-def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> None:
+def repair(run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file, which is repaired alone.")]) -> None:
     """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays as it is.
 
-    The new log holds every message that could be read, an index and metadata.yaml. The damaged file stays as *.damaged.
+    The new log holds every message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged file
+    stays as *.damaged. metadata.yaml keeps the names of missing files, and that of another program is never replaced.
     """
     repaired = repair_bag(run)
     for file in repaired.files:
@@ -28,8 +30,10 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run.")]) -> Non
             print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; the damaged file is {file.damaged.name}")
     if repaired.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
-    else:
+    elif not any(file.damaged for file in repaired.files) and not repaired.missing:
         print(f"{display_path(run)} is intact: nothing to repair")
+    if repaired.missing:
+        print(f"{printable(', '.join(repaired.missing))}: missing, and nothing here restores it; {METADATA} keeps the name")
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads a growing log: a call continues at the end of the last call. A finished log is read in the same way.
 
+A log of another storage, or a packed log, is finished: `open_log` reads it.
+
 A record is read once the record is whole, so a chunk in progress is never read. The message index behind a chunk gives the
 places of the messages: messages of unwanted topics cost nothing.
 """
@@ -21,11 +23,13 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from flight_core.rates import NANOSECONDS
-from flight_log.named_vectors import stamp_of
+from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, SQLITE, file_kind
+from flight_log.named_vectors import full_name, stamp_of
+from flight_log.open_log import ROSBAG2, open_scan, plain_message
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE_INDEX, RECORD, decode, decompress, split
 
-HEAD = struct.Struct("<BQ14xQ")  # of RECORD and MESSAGE: opcode, length, publish time
+HEAD = struct.Struct("<BQ6xQQ")  # of RECORD and MESSAGE: opcode, length, log time, publish time
 # As plain numbers: of a log of one hour 400,000 records are compared.
 CHUNK, MESSAGE, INDEX = int(Opcode.CHUNK), int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
@@ -75,12 +79,16 @@ class Follower:
         self._channels: dict[int, _Channel] = {}
         self._chunk = b""  # the last chunk
         self._indexed = True  # at least one message index of it has been read
+        self._finished: Iterator[object] | None = None  # records of a file of another storage, or of a packed file
 
     @property
     def path(self) -> Path | None:
         """The present file; None before the first file. Raises ParameterError for a folder with several bags."""
         if self._path is None:
-            self._path = next((file for file in bag_files(self.run) if file not in self._read_files), None)
+            files = bag_files(self.run)
+            if files and not self.run.is_file():
+                files += bag_files(self.run / ROSBAG2)
+            self._path = next((file for file in files if file not in self._read_files), None)
         return self._path
 
     @property
@@ -103,6 +111,12 @@ class Follower:
         while not self.fault and (path := self.path) is not None:
             if path.stat().st_size == self._size:
                 return
+            if self._position == 0 and (kind := file_kind(path)) not in {MCAP, EMPTY, BEGUN}:
+                if kind not in {*PACKED, SQLITE}:
+                    self.fault = f"{path} is {kind}: it does not begin as an MCAP file"
+                    return
+                yield from self._read_finished(path)
+                continue
             with path.open("rb", buffering=READ_BYTES) as stream:
                 status = os.fstat(stream.fileno())
                 size, identity = status.st_size, (status.st_dev, status.st_ino)
@@ -123,6 +137,22 @@ class Follower:
             self._begin_file()
             yield from self._pending_records()
 
+    def _read_finished(self, path: Path) -> Iterator[Messages | Attachment | Metadata]:
+        """The records of a file of another storage, or of a packed file."""
+        if self._finished is None:
+            self._finished = self._records_of(path)
+        for record in self._finished:
+            self._take_whole(record)
+            yield from self._pending_records()
+        self._read_files.append(path)
+        self._begin_file()
+
+    def _records_of(self, path: Path) -> Iterator[object]:
+        with open_scan(path) as scan:
+            yield from scan.records()
+        self.damaged += scan.damaged + (not scan.complete)
+        self.complete = True
+
     def _pending_records(self) -> Iterator[Messages | Attachment | Metadata]:
         """The decoded records; a caller that stops gets the rest with the next call."""
         while self._pending:
@@ -131,9 +161,6 @@ class Follower:
     def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of every whole record behind the position. The position moves on before a record is given."""
         if self._position == 0 and size >= len(MCAP0_MAGIC):
-            if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                self.fault = f"{stream.name} does not begin as an MCAP file"
-                return
             self.complete, self._position = False, len(MCAP0_MAGIC)
         stream.seek(self._position)
         while 0 < self._position <= size - RECORD.size:
@@ -191,15 +218,15 @@ class Follower:
             self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
-        """Publish times in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""
+        """Times of sending, else of receipt, in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""
         chunk, sent_ns, data = self._chunk, [], []
         for place in places:
-            opcode, length, sent = HEAD.unpack_from(chunk, place)
+            opcode, length, received, sent = HEAD.unpack_from(chunk, place)
             end = place + RECORD.size + length
             if opcode != MESSAGE or end > len(chunk):
                 raise McapError("a message index without its message")
-            sent_ns.append(sent)
-            data.append(chunk[place + HEAD.size : end])
+            sent_ns.append(sent or received)
+            data.append(plain_message(chunk[place + HEAD.size : end]))
         return sent_ns, data
 
     def _take_unindexed(self) -> None:
@@ -214,7 +241,8 @@ class Follower:
         if isinstance(record, Message):
             channel = self._channels.get(record.channel_id)
             if channel is not None and channel.rate > 0.0:
-                self._pending.append(Messages(channel.topic, channel.type_name, [record.publish_time], [record.data]))
+                sent_ns, data = record.publish_time or record.log_time, plain_message(record.data)
+                self._pending.append(Messages(channel.topic, channel.type_name, [sent_ns], [data]))
         elif isinstance(record, Attachment | Metadata):
             self._pending.append(record)
         else:
@@ -225,7 +253,7 @@ class Follower:
             self._schemas[record.id] = record.name
             self.definitions[record.name] = record.data.decode(errors="replace")
         elif isinstance(record, Channel):
-            type_name = self._schemas.get(record.schema_id, "")
+            type_name = full_name(self._schemas.get(record.schema_id, "")) if record.message_encoding == "cdr" else ""
             if record.id not in self._channels:
                 self._channels[record.id] = _Channel(record.topic, type_name, self._rate_of(record.topic, type_name))
 

@@ -74,6 +74,11 @@ def joint_state_types() -> Typestore:
     return store
 
 
+def full_name(type_name: str) -> str:
+    """The name of a message type, "pkg/msg/Type", also of the short "pkg/Type"."""
+    return type_name.replace("/", "/msg/") if type_name.count("/") == 1 else type_name
+
+
 def decoder(type_name: str) -> Decoder | None:
     """Decoder from messages of a type to named vectors; None for a type without named vectors.
 

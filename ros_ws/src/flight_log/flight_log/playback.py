@@ -5,13 +5,14 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
+from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE, decoder, flight_start_ns, stamp_of, tables
-from flight_log.rosbag2_metadata import is_compressed, read_bag_metadata
 from flight_log.stored_messages import StoredMessage, stored_messages
+from flight_log.tape_reader import A_FLIGHT, chosen_namespace, listed, names_within
 
 CLOCK = "/clock"  # never played: the player publishes its own clock
 
@@ -20,7 +21,8 @@ SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS  # a stamp further than a day from the host's clock is flight time, as in lockstep
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
-STAMPED = re.compile(r"\s*((std_msgs/)?Header|builtin_interfaces/Time)\s")
+STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")
+IDL_STRUCT = re.compile(r"\bstruct\s+\w+\s*\{")  # the first is the type itself
 
 
 class ScheduledMessage(NamedTuple):
@@ -38,25 +40,33 @@ class Playback(NamedTuple):
     types: Mapping[str, str]  # type names by full topic name
     messages: Sequence[ScheduledMessage]
     start_ns: int  # the instant of flight time 0
+    skipped: Mapping[str, str]  # by full topic name: the encoding, which no ROS topic has
 
     def t(self, due_ns: int) -> float:
         """Flight time of an instant, s."""
         return seconds(due_ns - self.start_ns)
 
 
-def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> Playback:
+def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, namespace: str | None = None) -> Playback:
     """The messages of a log from flight time `start` in s. `topics`: full or last names; empty for every topic except SHARED.
+
+    `namespace` selects an aircraft; None plays every aircraft. Topics without CDR, e.g. with JSON, are skipped.
 
     A message is due at the time of sending. In a log of a lockstep flight the host's clock has no meaning: there a message is
     due at the stamp, but not before the messages sent earlier. Raises ParameterError when the log cannot be read, lacks a
-    topic, ends before the start, or holds compressed messages.
+    topic or the namespace, or ends before the start.
     """
-    require(not is_compressed(_information(run)), str(run), "compressed messages", "plain ones: see ros2 bag convert")
     stored = sorted((message for message in stored_messages(run) if message.topic != CLOCK), key=_sent_ns)
+    skipped = {message.topic: _unsendable(message) for message in stored if _unsendable(message)}
+    stored = [message for message in stored if message.topic not in skipped]
+    if namespace is not None:
+        all_topics = {message.topic for message in stored}
+        inside = names_within(chosen_namespace(all_topics, namespace, str(run)), all_topics).keys() | {*SHARED}
+        stored = [message for message in stored if message.topic in inside]
     known = {message.topic: message for message in stored}
     wanted = {full for name in topics for full in _matching(name, known, str(run))} if topics else set(known) - set(SHARED)
-    require(bool(wanted), str(run), "no message", "a recorded flight")
-    begins_stamped = {topic: begins_with_stamp(message.definition) for topic, message in known.items()}
+    require(bool(wanted), str(run), f"no message{f' to play among {listed(skipped)}' if skipped else ''}", A_FLIGHT)
+    begins_stamped = {topic: begins_with_stamp(_definition(message)) for topic, message in known.items()}
     votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE]
     lockstep = 2 * sum(votes) > len(votes)
     messages, now_ns = [], 0
@@ -74,21 +84,30 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0) -> 
     end = seconds(messages[-1].due_ns - start_ns)
     require(begin_ns <= messages[-1].due_ns, "start", f"{start:g} s", f"a flight time before the end of the log, {end:g} s")
     kept = messages if start <= 0.0 else [message for message in messages if message.due_ns >= begin_ns]
-    return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, kept, start_ns)
+    return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, kept, start_ns, skipped)
 
 
-def begins_with_stamp(definition: str) -> bool:
-    """Whether the first field of a message type is a header or a time, by the definition as text."""
-    first = next((line for line in definition.splitlines() if not NO_FIELD.match(line)), "")
-    return bool(STAMPED.match(first))
+def _unsendable(message: StoredMessage) -> str:
+    """The reason why no ROS topic can have a message; empty for a message of a ROS topic."""
+    if message.encoding != "cdr":
+        return f"{message.type_name} in {message.encoding}".strip()
+    return "" if message.type_name else "no type"
 
 
-def _information(run: Path) -> Mapping[str, Any]:
-    """The content of metadata.yaml; empty for an unreadable file."""
+def _definition(message: StoredMessage) -> str:
+    """The definition of a type as text: of the installed package, else of the log."""
     try:
-        return read_bag_metadata(run)[0]
+        return definition(message.type_name).text
     except ParameterError:
-        return {}
+        return message.definition
+
+
+def begins_with_stamp(text: str) -> bool:
+    """Whether the first field of a message type is a header or a time, by the definition as text, ros2msg or ros2idl."""
+    if struct := IDL_STRUCT.search(text):
+        text = text[struct.end() :]
+    first = next((line for line in text.splitlines() if not NO_FIELD.match(line)), "")
+    return bool(STAMPED.match(first))
 
 
 def _matching(name: str, known: Mapping[str, StoredMessage], where: str) -> list[str]:

@@ -8,17 +8,27 @@ Needs no ROS.
 import os
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
-from flight_core.files import is_file, replacing, write_file
+from flight_core.files import is_file, parse_yaml, read_file, replacing, write_file
 from flight_core.parameters import ParameterError, require
 from flight_log.bag import CHUNK_BYTES
 from flight_log.disk import try_lock
-from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_files, bag_metadata_yaml, read_bag_metadata
+from flight_log.open_log import log_files, missing_parts, require_mcap
+from flight_log.rosbag2_metadata import (
+    INFORMATION,
+    METADATA,
+    FileContents,
+    TopicCount,
+    bag_files,
+    bag_metadata_yaml,
+    read_bag_metadata,
+)
 from flight_log.scan import Scan
 
 
@@ -38,33 +48,58 @@ class Repair(NamedTuple):
 
     files: tuple[FileRepair, ...]
     wrote_metadata: bool
+    missing: tuple[str, ...] = ()  # names of the files that metadata.yaml names and the folder lacks
 
 
 def repair(run: Path) -> Repair:
     """Rebuild the damaged files in the folder of a bag: truncated files, files with damaged parts, and metadata.yaml.
 
     A rebuilt file holds every readable record and has an index. The rebuilt file replaces the damaged file atomically; the
-    damaged file stays as *.damaged. An intact bag does not change. Raises ParameterError without a bag, while a recorder writes
-    the bag, for a bag without a readable message, and for a folder that cannot be written.
+    damaged file stays as *.damaged. An intact bag does not change. metadata.yaml keeps the names of missing files. The file
+    of a bag is repaired alone, without metadata.yaml. Raises ParameterError without a bag, while a recorder writes the bag, for
+    a bag without a readable message, for a metadata.yaml of another program, and for a folder that cannot be written.
     """
-    directory = run.parent if is_file(run) else run
-    files = bag_files(directory)
-    require(bool(files), str(run), "no .mcap file", "the folder of a run")
-    try:
-        previous, end_ns = read_bag_metadata(directory)
-        lists_all_files = previous.get("relative_file_paths") == [file.name for file in files]
-    except ParameterError:
-        previous, end_ns, lists_all_files = {}, 0, False
+    files = bag_files(run) or log_files(run)  # the latter says what is there
+    for file in files:
+        require_mcap(file)
+    previous: Mapping[str, Any] = {}
+    end_ns, missing = 0, list[str]()
+    if not is_file(run):
+        previous, end_ns = _previous_metadata(run / METADATA)
+        missing = missing_parts(files, previous)
+    named = previous.get("relative_file_paths")
     try:
         scans = [_FileScan(file) for file in files]
         repaired = [scan.rebuild() if scan.faults else scan.unchanged() for scan in scans]
-        write = not lists_all_files or any(file.damaged for file in repaired)
+        lists_all_files = isinstance(named, list) and {file.name for file in files} == {*map(str, named)} - {*missing}
+        write = not is_file(run) and (not lists_all_files or any(file.damaged for file in repaired))
         if write:
-            write_file(directory / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous))
+            if not previous and is_file(run / METADATA):
+                _keep_damaged(run / METADATA)
+            write_file(run / METADATA, bag_metadata_yaml([scan.contents() for scan in scans], previous, missing))
     except OSError as error:
         raise ParameterError(f"{run}: cannot be repaired ({error.strerror}), expected a folder that can be written") from None
     *others, last = repaired
-    return Repair((*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write)
+    return Repair((*others, last._replace(known_end_ns=max(last.known_end_ns, end_ns))), write, tuple(missing))
+
+
+def _previous_metadata(path: Path) -> tuple[Mapping[str, Any], int]:
+    """The content of metadata.yaml and the log time of the last message; empty and 0 for a missing or damaged file.
+
+    Raises ParameterError for a file of another program, which must not be replaced.
+    """
+    try:
+        return read_bag_metadata(path.parent)
+    except ParameterError:
+        if not is_file(path):
+            return {}, 0
+    try:
+        tree = parse_yaml(read_file(path, METADATA, "that of rosbag2"), METADATA, "that of rosbag2")
+    except ParameterError:
+        return {}, 0
+    foreign = bool(tree) and not (isinstance(tree, Mapping) and INFORMATION in tree)
+    require(not foreign, str(path), "a file of another program", "that of rosbag2, or none: move it elsewhere")
+    return {}, 0
 
 
 class _FileScan:

@@ -39,19 +39,50 @@ class FileContents(NamedTuple):
         return sum(count.messages for count in self.counts)
 
 
-def bag_files(run: Path) -> list[Path]:
-    """The MCAP files of a bag in the order of their numbers; the file itself when a file is given; empty for further storages.
+SUFFIXES = (".mcap", ".db3")
+PACKED_SUFFIXES = (".zstd", ".zst", ".lz4")
+"""Suffixes of the files of a bag, and the suffixes behind of packed files."""
 
-    Raises ParameterError when the files in the folder are not parts of a single bag.
+
+def plain_name(name: str) -> str:
+    """The name of a file of a bag without the suffix of a packed file."""
+    suffix = next((suffix for suffix in PACKED_SUFFIXES if name.endswith(suffix)), "")
+    return name.removesuffix(suffix)
+
+
+def part_number(name: str) -> int | None:
+    """The number of a file in a bag; None without a number."""
+    number = re.search(r"_(\d{1,9})$", Path(plain_name(name)).stem)
+    return None if number is None else int(number[1])
+
+
+def bag_files(run: Path) -> list[Path]:
+    """The files of a bag in the order of their numbers; the file itself when a file is given; empty without a file.
+
+    A file that is unpacked beside the packed file comes in place of the latter. Raises ParameterError when the files in the
+    folder are not parts of a single bag.
     """
     if is_file(run):
         return [run]
-    files = [file for file in run.glob("*.mcap") if is_file(file)] if is_folder(run) else []
-    stems = {re.sub(r"_\d+$", "", file.stem) for file in files}
-    require(
-        len(stems) < 2, str(run), f"{len(files)} .mcap files that are not parts of one bag", "one bag in the folder of a run"
-    )
-    return sorted(files, key=lambda file: (len(file.stem), file.stem))  # _2 before _10
+    named: dict[str, Path] = {}
+    try:
+        content = sorted(run.iterdir()) if is_folder(run) else []
+    except OSError as error:
+        raise ParameterError(f"{run}: cannot be read ({error.strerror}), expected the folder of a run") from None
+    for file in content:  # a plain file sorts before the packed file
+        name = plain_name(file.name)
+        if name.endswith(SUFFIXES) and is_file(file):
+            named.setdefault(name, file)
+    files = list(named.values())
+    kinds = {re.sub(r"(_\d+)?(?=\.\w+$)", "", name) for name in named}
+    require(len(kinds) < 2, str(run), _several(files), "one bag in the folder of a run")
+    return sorted(files, key=lambda file: _order(file.name))
+
+
+def _several(files: Sequence[Path]) -> str:
+    """Files of several bags, for a sentence."""
+    suffixes = " and ".join(suffix for suffix in SUFFIXES if any(suffix in file.suffixes for file in files))
+    return f"{len(files)} {suffixes} files that are not parts of one bag"
 
 
 def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
@@ -70,13 +101,13 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
     return information, end_ns
 
 
-def is_compressed(information: Mapping[str, Any]) -> bool:
-    """Whether `ros2 bag record` compressed the files or the messages of a bag, by the content of metadata.yaml."""
-    return str(information.get("compression_mode") or "none").lower() != "none"
+def bag_metadata_yaml(
+    files: Sequence[FileContents], previous: Mapping[str, Any] | None = None, missing: Sequence[str] = ()
+) -> str:
+    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous` content.
 
-
-def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any] | None = None) -> str:
-    """The text of metadata.yaml. Compression, custom data and distribution come from the `previous` content."""
+    `missing` files of the previous content stay in the lists of files.
+    """
     counts: dict[str, TopicCount] = {}
     for count in (count for file in files for count in file.counts):
         messages = count.messages + (counts[count.topic].messages if count.topic in counts else 0)
@@ -95,6 +126,7 @@ def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any]
         for count in counts.values()
     ]
     kept = previous or {}
+    described = {file.file: {"path": file.file, **_extent([file])} for file in files}
     information = {
         "version": ROSBAG2_VERSION,
         "storage_identifier": "mcap",
@@ -102,12 +134,24 @@ def bag_metadata_yaml(files: Sequence[FileContents], previous: Mapping[str, Any]
         "topics_with_message_count": topics,
         "compression_format": kept.get("compression_format", ""),
         "compression_mode": kept.get("compression_mode", ""),
-        "relative_file_paths": [file.file for file in files],
-        "files": [{"path": file.file, **_extent([file])} for file in files],
+        "relative_file_paths": sorted([*described, *missing], key=_order),
+        "files": sorted([*described.values(), *_entries(kept, missing)], key=lambda entry: _order(entry["path"])),
         "custom_data": kept.get("custom_data"),
         "ros_distro": kept.get("ros_distro", "jazzy"),
     }
     return dump_yaml({INFORMATION: information}, flow=False)
+
+
+def _order(name: str) -> tuple[int, str]:
+    """The key that sorts the files of a bag by number: _2 before _10."""
+    return len(plain_name(name)), name
+
+
+def _entries(information: Mapping[str, Any], names: Sequence[str]) -> list[dict[str, Any]]:
+    """The entries of files in the content of metadata.yaml."""
+    entries = information.get("files")
+    listed = entries if isinstance(entries, list) else []
+    return [entry for entry in listed if isinstance(entry, dict) and entry.get("path") in names]
 
 
 def _profiles(qos: str) -> list[Any]:

@@ -103,7 +103,12 @@ class MessageBatch(NamedTuple):
     channel_id: int
     data: NDArray[np.uint8]  # (N, length)
     log_ns: NDArray[np.int64]  # (N,)
-    publish_ns: NDArray[np.int64]  # (N,)
+    publish_ns: NDArray[np.int64]  # (N,), 0 where the log has no time of sending
+
+    @property
+    def sent_ns(self) -> NDArray[np.int64]:
+        """Times of sending, (N,); of receipt where the log has none."""
+        return np.where(self.publish_ns == 0, self.log_ns, self.publish_ns)
 
 
 R = TypeVar("R")

@@ -4,7 +4,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,12 +11,10 @@ from typing import Any, NamedTuple
 from mcap.records import Channel, Message, Schema
 from rosbags.serde.errors import SerdeError
 
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_log.named_vectors import typestore
-from flight_log.rosbag2_metadata import bag_files
-from flight_log.scan import Scan
-from flight_log.tape_reader import A_RUN, ROSBAG2
+from flight_log.named_vectors import full_name, typestore
+from flight_log.open_log import A_RUN, log_files, open_scan, plain_message
 
 PARAMETER_EVENTS = "/parameter_events"
 PARAMETER_EVENT = "rcl_interfaces/msg/ParameterEvent"
@@ -31,41 +28,53 @@ class StoredMessage(NamedTuple):
     definition: str  # of the type, as text
     received_ns: int
     sent_ns: int
-    data: bytes  # CDR
+    data: bytes
+    encoding: str = "cdr"
+
+
+NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
 
 
 def stored_messages(run: Path) -> Iterator[StoredMessage]:
-    """The messages of a bag of MCAP files in the order of writing; of a truncated file the readable messages.
+    """The messages of a log in the order of writing; of a truncated or damaged file the readable messages.
 
-    Raises ParameterError for a missing or unreadable bag.
+    Raises ParameterError for a missing or unreadable log.
     """
-    files = bag_files(run)
-    require(bool(files), str(run), "no .mcap file", A_RUN)
-    for file in files:
+    for file in log_files(run):
         schemas: dict[int, Schema] = {}
-        channels: dict[int, tuple[str, str, str]] = {}
+        channels: dict[int, Channel] = {}
         try:
-            for record in Scan(file).records():
-                if isinstance(record, Message) and record.channel_id in channels:
-                    yield StoredMessage(*channels[record.channel_id], record.log_time, record.publish_time, record.data)
-                elif isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel) and (schema := schemas.get(record.schema_id)) is not None:
-                    channels[record.id] = record.topic, schema.name, schema.data.decode(errors="replace")
+            with open_scan(file) as scan:
+                for record in scan.records():
+                    if isinstance(record, Message) and record.channel_id in channels:
+                        channel = channels[record.channel_id]
+                        schema = schemas.get(channel.schema_id, NO_SCHEMA)
+                        yield StoredMessage(
+                            channel.topic,
+                            full_name(schema.name),
+                            schema.data.decode(errors="replace"),
+                            record.log_time,
+                            record.publish_time,
+                            plain_message(record.data),
+                            channel.message_encoding,
+                        )
+                    elif isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel):
+                        channels[record.id] = record
         except OSError as error:
-            raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected an MCAP file") from None
+            raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected {A_RUN}") from None
 
 
 def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list[dict[str, Any]]:
     """The changes of a node's parameters on `/parameter_events`, in the order of the stamps.
 
     `node` is the full name of a node, as in "/one/controller". A change maps dotted names to values, for `known` parameters
-    or groups of parameters. None stands for a deleted parameter. SI units. The bag in the folder ROSBAG2 of a run is read, too.
+    or groups of parameters. None stands for a deleted parameter. SI units.
     """
     store = typestore()
     events: list[tuple[int, dict[str, Any]]] = []
-    beside = run / ROSBAG2
-    for stored in chain(stored_messages(run), stored_messages(beside) if bag_files(beside) else ()):
+    for stored in stored_messages(run):
         if stored.topic != PARAMETER_EVENTS or stored.type_name != PARAMETER_EVENT:
             continue
         try:

@@ -15,28 +15,38 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
 from flight_core.arguments import FilePath, as_path
-from flight_core.files import is_file, is_folder
+from flight_core.files import is_file, is_folder, read_file
 from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
+from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Signal, Tape
 from flight_core.text import printable
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
-from flight_log.named_vectors import PATH, STAMP, Decoder, Table, decode_routes, decoder, flight_start_ns, stamps_of, tables
-from flight_log.rosbag2_metadata import METADATA, bag_files, is_compressed, read_bag_metadata
-from flight_log.scan import MessageBatch, Scan
+from flight_log.named_vectors import (
+    JOINT_STATE,
+    PATH,
+    STAMP,
+    Decoder,
+    Table,
+    decode_routes,
+    decoder,
+    flight_start_ns,
+    full_name,
+    stamps_of,
+)
+from flight_log.open_log import A_RUN, NAMED, log_files, missing_parts, open_scan, plain_batches
+from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
+from flight_log.scan import MessageBatch
 
-A_RUN = "the folder of a run or an MCAP file"
+A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
 ROUTE = "route"
 BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
-
-ROSBAG2 = "rosbag2"
-"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
 
 T = TypeVar("T", bound=np.generic)
 
@@ -55,8 +65,8 @@ class RecordedRun(NamedTuple):
     """The content of a log. `metadata` holds the named sets of strings, `attachments` the files except the scenario.
 
     `latency` is the latency of the loop from y to u, `engagements` are the engagements of a bridge; None for a log without
-    samples of the kind, or no bag of MCAP files. The content is of the aircraft in `namespace`, "" for the root. `path` is
-    where the log was read.
+    samples of the kind, or without times of sending. The content is of the aircraft in `namespace`, "" for the root. `path` is
+    where the log was read, `topics` are the types of all topics of the log by full name.
     """
 
     tape: Tape
@@ -67,28 +77,46 @@ class RecordedRun(NamedTuple):
     engagements: list[Engagement] | None = None
     namespace: str = ""
     path: Path | None = None
+    topics: Mapping[str, str] = {}
+
+    def require(self, *names: str) -> None:
+        """Raise ParameterError with the topics of the log where a topic of a flight has no sample."""
+        missing = [name for name in names if name not in self.tape]
+        where, has = "the log" if self.path is None else str(self.path), listed(self.topics)
+        require(not missing, where, f"no sample of {', '.join(missing)}{f' among {has}' if has else ''}", A_FLIGHT)
 
     def scenario_file(self) -> StoredFile:
         """The scenario in the log. Raises ParameterError for a log without one."""
         if self.scenario is None:
             where = "the log" if self.path is None else str(self.path)
-            raise ParameterError(f"{where}: found a log without its scenario, expected a run that was flown from one")
+            expected = "a run that was flown from one, or the scenario: --scenario FILE"
+            raise ParameterError(f"{where}: found a log without its scenario, expected {expected}")
         return self.scenario
 
 
-def read_run(run: FilePath, namespace: str | None = None) -> RecordedRun:
+def listed(topics: Mapping[str, str]) -> str:
+    """Topics with the types, for a sentence; empty without topics."""
+    names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
+    rest = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {rest} more topics" if rest > 0 else "")
+
+
+def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | None = None) -> RecordedRun:
     """Read the folder or a file of a run: named vectors by topic name (without the namespace), samples by stamp.
 
-    The bag comes from this stack or from `ros2 bag record`: MCAP in one or several files, or SQLite. A truncated MCAP file is
-    read up to the last complete chunk, and a note of the tape says so. Raises ParameterError for a missing bag, for a bag
-    without a sample, and for several aircraft, in a namespace each, of which `namespace` names none.
+    The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several files, compressed or not. A
+    truncated MCAP file is read up to the last complete chunk, and a note of the tape says so. The file `scenario` replaces the
+    scenario in the log. Raises ParameterError for a missing bag, for a bag without a sample, for several aircraft, in a
+    namespace each, of which `namespace` names none, and for a scenario file that cannot be read.
     """
     run = as_path(run, "run", A_RUN)
+    given = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     log = _read(run)
     filled = {topic: signal for topic, samples in log.topics.items() if (signal := samples.signal()) is not None}
-    require(bool(filled), str(run), "; ".join(["no sample on any topic", *log.notes_at(None)]), "a recorded flight")
-    aircraft = _namespace_of_one_aircraft(filled, namespace, str(run))
-    names = _names_within(aircraft, filled)
+    nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
+    require(bool(filled), str(run), "; ".join([nothing, *log.notes_at(None)]), A_FLIGHT)
+    aircraft = chosen_namespace(filled, namespace, str(run))
+    names = names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
     signals = {printable(name): filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
@@ -99,7 +127,13 @@ def read_run(run: FilePath, namespace: str | None = None) -> RecordedRun:
     tape = Tape(signals, start_ns, tuple(map(printable, notes)), UNKNOWN)
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    return RecordedRun(tape, log.scenario, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run)
+    stored = given or log.scenario
+    return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds)
+
+
+def stored_scenario(path: Path) -> StoredFile:
+    """A scenario file as a file inside a log. Raises ParameterError for a file that cannot be read."""
+    return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
 
 
 def _aircraft(topics: Collection[str]) -> list[str]:
@@ -107,19 +141,21 @@ def _aircraft(topics: Collection[str]) -> list[str]:
     return sorted({topic.rpartition("/")[0] for topic in topics if topic.rpartition("/")[2] in AIRCRAFT_TOPICS})
 
 
-def _namespace_of_one_aircraft(topics: Collection[str], namespace: str | None, where: str) -> str:
+def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
     """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the choice of the caller."""
     aircraft = _aircraft(topics)
     known = ", ".join(name or "/" for name in aircraft) or "none"
     if namespace is None:
-        require(len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for")
+        require(
+            len(aircraft) < 2, where, f"aircraft in the namespaces {known}", "that one of them is asked for: --namespace NAME"
+        )
         return aircraft[0] if aircraft else ""
     chosen = f"/{str(namespace).strip('/')}".rstrip("/")
     require(chosen in aircraft, where, f"aircraft in the namespaces {known}", f"one in {namespace!r}")
     return chosen
 
 
-def _names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
+def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
     """Names within the namespace of an aircraft, by full topic name, without nested aircraft."""
     nested = [f"{name}/" for name in _aircraft(topics) if name.startswith(f"{chosen}/")]
     return {
@@ -248,6 +284,7 @@ class _Log:
         self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
         self.times: Times | None = None  # of the last y or u of a chunk
+        self.kinds: dict[str, str] = {}  # types of all topics, by full name
 
     def reader_of(self, topic: str, type_name: str, expected: int) -> Callable[[MessageBatch], None] | None:
         """Receiver of the messages of a topic, `expected` in the file; None for an unused topic."""
@@ -258,8 +295,9 @@ class _Log:
             def take(batch: MessageBatch) -> None:
                 samples.add(batch.data)
                 if batch.data.shape[1] >= STAMP.stop:
-                    self.times = Times(stamps_of(batch.data), batch.publish_ns)
-                    times.append(self.times)
+                    self.times = Times(stamps_of(batch.data), batch.sent_ns)
+                    if batch.publish_ns.all():
+                        times.append(self.times)
 
             return take
         if samples is not None:
@@ -267,7 +305,7 @@ class _Log:
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(
-                zip(map(self._time_of_stamps, batch.publish_ns), map(bytes, batch.data), strict=True)
+                zip(map(self._time_of_stamps, batch.sent_ns), map(bytes, batch.data), strict=True)
             )
         return None
 
@@ -310,73 +348,58 @@ class _Log:
 
 def _read(run: Path) -> _Log:
     log = _Log()
-    _add(run, log)
-    if is_folder(run / ROSBAG2):
-        _add(run / ROSBAG2, log)
+    files = log_files(run)
+    if is_folder(run):
+        for folder in dict.fromkeys(file.parent for file in files):
+            _add_metadata(folder, log)
+    for file in files:
+        _read_file(file, log)
     return log
 
 
-def _add(run: Path, log: _Log) -> None:
-    """Add the content of a bag."""
-    files = bag_files(run)
-    information = _bag_metadata(run, log) if files and is_folder(run) else {}
-    if is_compressed(information) or run.suffix == ".db3" or (not files and is_file(run / METADATA)):
-        _read_other(run, log)
-    else:
-        require(bool(files), str(run), "no .mcap file", A_RUN)
-        for file in files:
-            _read_mcap(file, log)
-
-
-def _bag_metadata(run: Path, log: _Log) -> Mapping[str, Any]:
-    """The content of metadata.yaml; for an unreadable file a note names the repair command."""
+def _add_metadata(folder: Path, log: _Log) -> None:
+    """Add what metadata.yaml tells of a bag; for an unreadable file a note names the repair command."""
+    information: Mapping[str, Any] = {}
     try:
-        information, log.known_end_ns = read_bag_metadata(run)
+        information, end_ns = read_bag_metadata(folder)
+        log.known_end_ns = max(log.known_end_ns, end_ns)
     except ParameterError:
-        fault = "cannot be read" if is_file(run / METADATA) else "is missing"
-        log.notes.append(f"{METADATA} {fault}: rise-di repair {shlex.quote(str(run))}")
-        return {}
-    return information
+        fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
+        mend = "rise-di repair" if any(folder.glob("*.mcap")) else "ros2 bag reindex"
+        log.notes.append(f"{METADATA} {fault}: {mend} {shlex.quote(str(folder))}")
+    if missing := missing_parts(bag_files(folder), information):
+        known = f"named in {METADATA}" if information else "a number between those there"
+        log.notes.append(f"{', '.join(missing)}: {known} and missing; the log is a part of the recording")
 
 
-def _read_mcap(file: Path, log: _Log) -> None:
-    schemas: dict[int, str] = {}
+def _read_file(file: Path, log: _Log) -> None:
     channels: dict[int, Callable[[MessageBatch], None]] = {}
-    scan = Scan(file)
+    schemas: dict[int, str] = {}
     try:
-        for record in scan.batches():
-            if isinstance(record, MessageBatch):
-                log.last_ns = max(log.last_ns, int(record.log_ns.max()))
-                if (take := channels.get(record.channel_id)) is not None:
-                    take(record)
-            elif isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                expected = scan.message_counts.get(record.id, 0)
-                if (take := log.reader_of(record.topic, schemas.get(record.schema_id, ""), expected)) is not None:
-                    channels[record.id] = take
-            else:
-                log.add(record)
+        with open_scan(file) as scan:
+            for record in scan.batches():
+                if isinstance(record, MessageBatch):
+                    log.last_ns = max(log.last_ns, int(record.log_ns.max()))
+                    if (take := channels.get(record.channel_id)) is not None:
+                        for batch in plain_batches(record):
+                            take(batch)
+                elif isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    expected, type_name = scan.message_counts.get(record.id, 0), schemas.get(record.schema_id, "")
+                    is_cdr = record.message_encoding == "cdr"
+                    log.kinds.setdefault(record.topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}")
+                    if is_cdr and (take := log.reader_of(record.topic, full_name(type_name), expected)) is not None:
+                        channels[record.id] = take
+                else:
+                    log.add(record)
     except OSError as error:
-        raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected an MCAP file") from None
+        raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected {A_RUN}") from None
     if not scan.complete:
         log.truncated.append(file.name)
     if scan.damaged:
         log.notes.append(f"{file.name} is damaged: {scan.damaged} of its parts left out")
     log.known_end_ns = max(log.known_end_ns, scan.known_end_ns)
-
-
-def _read_other(run: Path, log: _Log) -> None:
-    """A bag of a further rosbag2 storage, or a compressed bag."""
-    from rosbags.rosbag2 import Reader  # noqa: PLC0415 - takes 70 ms, which no bag of ours needs
-
-    try:
-        with Reader(run) as reader:
-            for connection, _, message in reader.messages():
-                if (samples := log.samples_of(connection.topic, connection.msgtype)) is not None:
-                    samples.add(next(tables([bytes(message)])))
-    except Exception as error:  # of SQLite, of YAML, of a decompressor: the content may be damaged anywhere
-        raise ParameterError(f"{run}: cannot be read ({error or type(error).__name__}), expected a bag of rosbag2") from None
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:

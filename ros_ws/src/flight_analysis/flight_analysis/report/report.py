@@ -12,7 +12,7 @@ from flight_analysis.report.summary import RecordedFlight
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import writing
 from flight_core.parameters import require
-from flight_log.tape_reader import A_RUN
+from flight_log.open_log import A_RUN
 
 A_FILE = "the path of a file"
 

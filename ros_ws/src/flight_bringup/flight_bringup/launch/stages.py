@@ -33,7 +33,7 @@ from flight_bringup.graph import NodeSpec, start_instant, start_lead
 from flight_bringup.processes import READY_TIMEOUT, end_with_parent
 from flight_bringup.scenarios import scenarios
 from flight_log.bag import BagWriter, LogAttachments
-from flight_log.tape_reader import ROSBAG2
+from flight_log.open_log import ROSBAG2
 from flight_ros import transport
 from flight_ros.topics import FLIGHT, NODE_STATE, STATES, NodeState
 from launch import Event, EventHandler, LaunchContext

@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Names the kind of a file by the first bytes: a log, a packed log, or a file of another program."""
+
+import struct
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
+
+from mcap.writer import MCAP0_MAGIC
+
+from flight_core.files import open_nonblocking
+
+MCAP, SQLITE, ZSTD, LZ4 = "an MCAP file", "a database of SQLite", "a zstd file", "an lz4 file"
+EMPTY, BEGUN = "an empty file", "the first bytes of an MCAP file"
+UNREADABLE = "a file that cannot be read"
+
+LOGS, PACKED = (MCAP, SQLITE), (ZSTD, LZ4)
+"""Kinds that may be a log, and kinds that may hold a log."""
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, section 3.1.1
+LZ4_MAGIC = b"\x04\x22\x4d\x18"  # LZ4 frame format, Magic Number
+
+MAGICS = MappingProxyType(
+    {
+        MCAP0_MAGIC: MCAP,
+        b"SQLite format 3\0": SQLITE,
+        ZSTD_MAGIC: ZSTD,
+        LZ4_MAGIC: LZ4,
+        b"ULog\x01\x12\x35": "a ULog of PX4",  # PX4 guide, ULog file format
+        b"\xa3\x95\x80": "a DataFlash log of ArduPilot",  # a packet with the identity FMT (ArduPilot, AP_Logger/LogStructure.h)
+        b"FMT, 128, 89,": "a DataFlash log of ArduPilot as text",
+        b"H Product:Blackbox": "a blackbox log of Betaflight or INAV",
+        b"#ROSBAG V": "a bag of ROS 1",
+        b"PK\x03\x04": "a ZIP archive",
+        b"\x1f\x8b": "a gzip file",
+        b"BZh": "a bzip2 file",
+        b"\xfd7zXZ\0": "an xz file",
+        b"7z\xbc\xaf\x27\x1c": "a 7z archive",
+        b"\x89HDF\r\n\x1a\n": "an HDF5 file",
+        b"MATLAB 5.0 MAT-file": "a MAT-file",
+        b"PAR1": "a Parquet file",
+        b"%PDF": "a PDF file",
+        b"\x89PNG": "a PNG image",
+        b"\xff\xd8\xff": "a JPEG image",
+        b"\x7fELF": "a program",
+        b"version https://git-lfs": "a pointer of Git LFS to a file that is not downloaded",
+        b"<?xml": "an XML file",
+        b"<": "an XML or HTML file",
+        b"{": "a JSON file",
+    }
+)
+"""Kinds of files by the first bytes."""
+
+TAR_PLACE, TAR = 257, b"ustar"  # POSIX.1-2017, pax, ustar Interchange Format
+MAVLINK = (b"\xfd", b"\xfe")  # first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
+TLOG_TIME = struct.Struct(">Q")  # us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
+TLOG_YEARS = (2000, 2100)
+HEAD_BYTES = 4096
+
+
+def file_kind(path: Path) -> str:
+    """The kind of a file with an article, as in "a ULog of PX4". Never raises."""
+    try:
+        with open_nonblocking(path) as stream:
+            head = stream.read(HEAD_BYTES)
+    except (OSError, ValueError):
+        return UNREADABLE
+    return kind_of(head)
+
+
+def kind_of(head: bytes) -> str:
+    """The kind of a file by the first HEAD_BYTES bytes, or the kind of a text or of unknown bytes."""
+    if MCAP0_MAGIC.startswith(head):  # also of a recorder that was killed at its start
+        return BEGUN if head else EMPTY
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip(b" \t\r\n")
+    by_magic = next((kind for magic, kind in MAGICS.items() if (text if magic.isascii() else head).startswith(magic)), "")
+    if by_magic:
+        return by_magic
+    kinds = {
+        "a file of zeros": not any(head),
+        "a tar archive": head[TAR_PLACE : TAR_PLACE + len(TAR)] == TAR,
+        "a tlog of MAVLink": head[8:9] in MAVLINK and _is_time(*TLOG_TIME.unpack_from(head)),
+        "a stream of MAVLink": head[:1] in MAVLINK,
+    }
+    return next((kind for kind, fits in kinds.items() if fits), "") or _text_kind(head)
+
+
+def _is_time(microseconds: int) -> bool:
+    first, last = (datetime(year, 1, 1, tzinfo=UTC).timestamp() * 1e6 for year in TLOG_YEARS)
+    return first < microseconds < last
+
+
+def _text_kind(head: bytes) -> str:
+    """The kind of a text; unknown bytes are no text."""
+    try:
+        text = head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 4:  # a character may be cut at the end of the head
+            return "a file of unknown content"
+        text = head[: error.start].decode("utf-8-sig")
+    if any(not (c.isprintable() or c in "\t\r\n\f") for c in text):
+        return "a file of unknown content"
+    lines = [line for line in text.splitlines() if line.strip()]
+    for separator in ",;\t":
+        if len(lines) > 1 and lines[0].count(separator) == lines[1].count(separator) > 0:
+            return "a CSV file"
+    return "a text file"

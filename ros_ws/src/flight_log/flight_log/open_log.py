@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Opens the files of a log for every reader: MCAP and SQLite, packed files, compressed messages, several files of a bag.
+
+A path that is no log is refused in one sentence with what is there.
+"""
+
+import re
+import shutil
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from itertools import groupby, islice
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+from urllib.parse import quote
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import zstandard
+from mcap.records import Channel, McapRecord, Message, Schema
+
+from flight_core.files import is_file, is_folder
+from flight_core.parameters import ParameterError, require
+from flight_log.file_kinds import BEGUN, EMPTY, LOGS, LZ4, MCAP, PACKED, SQLITE, ZSTD_MAGIC, file_kind
+from flight_log.rosbag2_metadata import METADATA, PACKED_SUFFIXES, bag_files, part_number, plain_name
+from flight_log.scan import MAX_CHUNK_BYTES, MessageBatch, Scan
+
+A_RUN = "the folder of a run or an MCAP file"
+ROSBAG2 = "rosbag2"
+"""In the folder of a run: the bag of `ros2 bag record` where that recorded the flight. A log beside it has the attachments."""
+
+BATCH = 4096  # messages of SQLite that are grouped by channel
+NAMED = 5  # files, folders or topics that a sentence names
+COPY_BYTES = 1 << 20
+UNPACK = {".zst": "zstd -d", ".zstd": "zstd -d", ".lz4": "lz4 -d"}
+
+
+def log_files(run: Path) -> list[Path]:
+    """The files of a log in the order of recording; those of the folder ROSBAG2 come last.
+
+    Raises ParameterError for a path without a log: the sentence names what is there.
+    """
+    files = [*bag_files(run), *(bag_files(run / ROSBAG2) if is_folder(run / ROSBAG2) else ())]
+    kinds = [file_kind(file) for file in files]
+    if not any(kind in (*LOGS, *PACKED) for kind in kinds) and not (is_folder(run) and {EMPTY, BEGUN} & {*kinds}):
+        raise ParameterError(f"{run}: found {_what_is_there(run, files, kinds)}, expected {A_RUN}")
+    return files
+
+
+def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> str:
+    """What a path without a log holds, for a sentence."""
+    if files:
+        return kinds[0] if is_file(run) else _some([f"{file.name}, {kind}" for file, kind in zip(files, kinds, strict=True)])
+    if not is_folder(run):
+        return "no such file or folder"
+    content = sorted(run.iterdir())
+    runs = [folder.name for folder in content if is_folder(folder) and folder.name != ROSBAG2 and _is_bag(folder)]
+    others = [f"{path.name}, {file_kind(path)}" for path in content if is_file(path) and path.name != METADATA]
+    there = f"the folders of runs {_some(runs)}" if runs else _some(others or [path.name for path in content])
+    return f"no .mcap file, but {there}" if there else "no .mcap file"
+
+
+def _is_bag(folder: Path) -> bool:
+    """Whether a folder holds the files of a single bag."""
+    with suppress(ParameterError):
+        return bool(bag_files(folder))
+    return False
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first names, and the number of the rest."""
+    rest = len(names) - NAMED
+    return "; ".join(names[:NAMED]) + (f"; and {rest} more" if rest > 0 else "")
+
+
+def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
+    """Names of the files of a bag that metadata.yaml names and the folder lacks.
+
+    Without metadata.yaml: the names of the numbers between the first and the last file. Renamed files are compared by number.
+    """
+    paths = information.get("relative_file_paths")
+    named = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
+    there = {plain_name(file.name) for file in files}
+    numbers = {number for file in files if (number := part_number(file.name)) is not None}
+    if not named and len(numbers) == len(files) > 1 and max(numbers) - min(numbers) < 2 * len(files) + 100:
+        stem = re.sub(r"\d+$", "", Path(plain_name(files[0].name)).stem)
+        suffix = files[0].name.removeprefix(Path(plain_name(files[0].name)).stem)
+        named = [f"{stem}{number}{suffix}" for number in range(min(numbers), max(numbers) + 1)]
+    if len(files) >= len(named):
+        return []
+    if any(plain_name(name) in there for name in named):
+        return [name for name in named if plain_name(name) not in there]
+    return [name for name in named if part_number(name) not in numbers]
+
+
+@contextmanager
+def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
+    """The reader of a file of a log, by the first bytes; a packed file is unpacked into a temporary folder.
+
+    Raises ParameterError for a file that cannot be read.
+    """
+    kind = file_kind(file)
+    if kind not in PACKED:
+        yield SqliteScan(file) if kind == SQLITE else Scan(file)
+        return
+    with TemporaryDirectory(prefix="rise-di-") as folder:
+        plain = Path(folder) / plain_name(file.name)
+        whole = _unpack(file, plain, kind)
+        scan = SqliteScan(plain, file) if file_kind(plain) == SQLITE else Scan(plain)
+        require(whole or isinstance(scan, Scan), str(file), "a packed file that is truncated", "a whole file")
+        yield scan
+
+
+def _unpack(file: Path, plain: Path, kind: str) -> bool:
+    """Write the content of a packed file; of a truncated file the beginning. Returns whether the file is whole.
+
+    Raises ParameterError.
+    """
+    limit = shutil.disk_usage(plain.parent).free // 2
+    opened: Any = lz4.frame.open if kind == LZ4 else zstandard.open
+    size = 0
+    try:
+        with opened(file, "rb") as source, plain.open("wb") as target:
+            while block := _read(source):
+                size += len(block)
+                unpack = UNPACK.get(file.suffix, "unpack")
+                require(size <= limit, str(file), f"more than {limit} bytes unpacked", f"them on a larger disk: {unpack}")
+                target.write(block)
+    except (EOFError, RuntimeError, zstandard.ZstdError):
+        return False
+    except OSError as error:
+        raise ParameterError(f"{file}: cannot be unpacked ({error.strerror or error}), expected {A_RUN}") from None
+    return True
+
+
+def _read(source: IO[bytes]) -> bytes:
+    return source.read(COPY_BYTES)
+
+
+def plain_message(data: bytes) -> bytes:
+    """A message that `ros2 bag record` may have compressed: the beginning of a compressed message is that of no CDR.
+
+    A damaged message stays as it is: no decoder takes it.
+    """
+    if data[:4] != ZSTD_MAGIC:
+        return data
+    try:
+        if zstandard.frame_content_size(data) > MAX_CHUNK_BYTES:
+            return data
+        return zstandard.ZstdDecompressor().stream_reader(data).read(MAX_CHUNK_BYTES)
+    except (MemoryError, zstandard.ZstdError):
+        return data
+
+
+def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
+    """As `plain_message`, of the messages of a batch; the lengths may then differ."""
+    if not len(batch.data) or batch.data[0, :4].tobytes() != ZSTD_MAGIC:
+        yield batch
+        return
+    rows = [plain_message(row.tobytes()) for row in batch.data]
+    begin = 0
+    for size, group in groupby(rows, len):
+        alike = list(group)
+        end = begin + len(alike)
+        table = np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
+        yield MessageBatch(batch.channel_id, table, batch.log_ns[begin:end], batch.publish_ns[begin:end])
+        begin = end
+
+
+class SqliteScan:
+    """A file of rosbag2's storage sqlite3, with the interface of `Scan`. The storage has no time of sending: it is 0."""
+
+    def __init__(self, path: Path, shown: Path | None = None) -> None:
+        self.path = path
+        self.complete = True
+        self.damaged = 0
+        self.known_end_ns = 0
+        self.message_counts: dict[int, int] = {}
+        self._shown = shown or path  # the packed file
+
+    def records(self) -> Iterator[McapRecord]:
+        """The schemas, channels and messages. Raises ParameterError for a database that is no bag."""
+        for row in self._rows():
+            if isinstance(row, tuple):
+                channel, log_ns, data = row
+                yield Message(channel, log_ns, data, 0, 0)
+            else:
+                yield row
+
+    def batches(self) -> Iterator[McapRecord | MessageBatch]:
+        """As `records`, the messages of a channel in a table. Raises ParameterError."""
+        rows = self._rows()
+        while block := list(islice(rows, BATCH)):
+            by_channel: dict[int, list[tuple[int, bytes]]] = defaultdict(list)
+            for row in block:
+                if isinstance(row, tuple):
+                    by_channel[row[0]].append(row[1:])
+                else:
+                    yield row
+            for channel, messages in by_channel.items():
+                for size, group in groupby(messages, lambda message: len(message[1])):
+                    alike = list(group)
+                    table = np.frombuffer(b"".join(data for _, data in alike), dtype=np.uint8).reshape(len(alike), size)
+                    log_ns = np.array([time_ns for time_ns, _ in alike], dtype=np.int64)
+                    yield MessageBatch(channel, table, log_ns, np.zeros(len(alike), dtype=np.int64))
+
+    def _rows(self) -> Iterator[Schema | Channel | tuple[int, int, bytes]]:
+        # Takes 70 ms, which no bag of ours needs.
+        from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
+        from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415
+
+        reader = Sqlite3Reader(Path(quote(str(self.path.absolute()))))  # it makes a URI of the path
+        encodings = {MessageDefinitionFormat.IDL: "ros2idl", MessageDefinitionFormat.MSG: "ros2msg"}
+        try:
+            reader.open()
+            connections = reader.connections
+            self.message_counts = {connection.id: connection.msgcount for connection in connections}
+            self.known_end_ns = max(reader.metadata.end_time - 1, 0)
+        except Exception as error:  # of SQLite or of rosbags: the content may be damaged anywhere
+            reason = str(error) or type(error).__name__
+            raise ParameterError(f"{self._shown}: cannot be read ({reason}), expected a bag of rosbag2") from None
+        try:
+            for connection in connections:
+                definition, ext = connection.msgdef, connection.ext
+                encoding = encodings.get(definition.format, "ros2msg")
+                yield Schema(id=connection.id, data=definition.data.encode(), encoding=encoding, name=connection.msgtype)
+                serialised = str(getattr(ext, "serialization_format", "cdr"))
+                yield Channel(connection.id, connection.topic, serialised, {}, connection.id)
+            for connection, log_ns, data in reader.messages(connections):
+                yield connection.id, log_ns, bytes(data)
+        except Exception:  # as above: what was read so far stays
+            self.damaged, self.complete = self.damaged + 1, False
+        finally:
+            reader.close()
+
+
+def require_mcap(file: Path) -> None:
+    """Raise ParameterError with the kind of a file that is no MCAP file; an empty file passes."""
+    kind = file_kind(file)
+    if kind in PACKED and file.name.endswith(PACKED_SUFFIXES):
+        kind += f", which {UNPACK[file.suffix]} unpacks"
+    elif kind == SQLITE:
+        kind += ", which ros2 bag reindex repairs"
+    require(kind in {MCAP, EMPTY, BEGUN}, str(file), kind, "an MCAP file")
