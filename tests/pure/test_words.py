@@ -8,7 +8,6 @@ from collections import Counter
 from functools import cache
 from statistics import median
 
-import pytest
 from tests.conftest import REPOSITORY
 from tests.pure.test_docs import FOLDERS
 
@@ -39,7 +38,6 @@ def worst_first(counts: dict[str, Counter[str]]) -> str:
     )
 
 
-@pytest.mark.xfail(strict=True, reason="30 loops with tuple targets are not renamed yet")
 def test_loop_variables_are_nouns() -> None:
     counts = {name: Counter(loop_variables(tree)) for folder in FOLDERS for name, tree in nodes(folder).items()}
     assert not sum(counts.values(), Counter()), worst_first(counts)

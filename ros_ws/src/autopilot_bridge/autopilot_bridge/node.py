@@ -106,14 +106,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
         message = message_type(row.type)()
-        rows = [(number, one) for number, one in enumerate(self._map.inputs.values()) if one.message == name]
+        rows = [(number, channel) for number, channel in enumerate(self._map.inputs.values()) if channel.message == name]
         try:
             for path, value in row.values.items():
                 set_field(message, path, value)
-            for _, one in rows:
-                for raw in (one.neutral, one.release, *one.range):
+            for _, channel in rows:
+                for raw in (channel.neutral, channel.release, *channel.range):
                     if isinstance(raw, float):
-                        set_field(message, one.field, raw)
+                        set_field(message, channel.field, raw)
             if row.stamped:
                 get_field(message, "header.stamp")
         except ChannelError as error:

@@ -78,31 +78,31 @@ def compare(
     def results(name: str) -> list[LawResult]:
         law = laws[name]
         control_law = law.control_law(benchmark.model)  # one for all gain sets: it is compiled once
-        found = []
+        law_results = []
         for objective, gains in tuned[name].items():
             params = law.params(as_gains(gains), benchmark.model)
             flown = {
-                wind: fleet.fly(one, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
-                for wind, one in flights.items()
+                wind: fleet.fly(disturbed, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
+                for wind, disturbed in flights.items()
             }
-            scores = {wind: score(one, benchmark.unit) for wind, one in flown.items()}
+            scores = {wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()}
             delayed = scores[GUST][len(in_time) :].reshape(len(delays), aircraft)
-            found.append(
+            law_results.append(
                 LawResult(
                     name,
                     objective,
                     gains.costs,
-                    {wind: float(one[0]) for wind, one in scores.items()},
+                    {wind: float(costs[0]) for wind, costs in scores.items()},
                     tuple(
-                        Level(level, {wind: _scores(one[part]) for wind, one in scores.items()})
+                        Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()})
                         for level, part in zip(levels, parts, strict=True)
                     ),
-                    {ticks * benchmark.model.period: _lost(one) for ticks, one in zip(delays, delayed, strict=True)},
+                    {ticks * benchmark.model.period: _lost(costs) for ticks, costs in zip(delays, delayed, strict=True)},
                     np.asarray(flown[GUST].rms)[:, 0],
                     np.asarray(flown[GUST].slew)[:, 0],
                 )
             )
-        return found
+        return law_results
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for scored in pool.map(results, tuned):

@@ -225,7 +225,9 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         leg, following = at(number), at(number + 1)
         origin = (leg.origin[0], leg.origin[1])
         line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
-        error = PathError(*(jnp.where(leg.is_line, one, other) for one, other in zip(line, circle, strict=True)))
+        error = PathError(
+            *(jnp.where(leg.is_line, of_line, of_circle) for of_line, of_circle in zip(line, circle, strict=True))
+        )
         wanted = modes.follow(error, leg.entry, partial(entered, leg, following), before.slip, pose, speed, params)
         target = Target(altitude=leg.altitude, V=leg.V)
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)

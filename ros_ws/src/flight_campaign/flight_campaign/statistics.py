@@ -69,11 +69,11 @@ class Figure(Config):
     def quantile(self, share: float) -> float:
         """The upper bound of a share of the flights, to the width of a bin (2.3 %)."""
         wanted, below = share * self.count, 0
-        for place, found in self.bins.items():
-            if below + found >= wanted:
+        for place, number in self.bins.items():
+            if below + number >= wanted:
                 low, high = EDGES[max(place, 0)], EDGES[min(place + 1, len(EDGES) - 1)]
-                return min(float(low * (high / low) ** ((wanted - below) / found)), self.largest)
-            below += found
+                return min(float(low * (high / low) ** ((wanted - below) / number)), self.largest)
+            below += number
         return self.largest
 
 

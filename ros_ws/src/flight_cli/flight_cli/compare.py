@@ -193,8 +193,8 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
         costs.append(f"{aim}: {winds}; u late by {objective.delay * delay:g} ms on {whose}")
     return NOTES.strip().format(
         titles="\n".join(f"{name}: {law.title}" for name, law in laws.items()),
-        unit=", ".join(f"{one * units[name].factor:g} {units[name].unit} of {name}" for name, one in errors),
-        slew=", ".join(f"{one * units[name].factor:g} {units[name].unit}/s of {name}" for name, one in slews),
+        unit=", ".join(f"{error * units[name].factor:g} {units[name].unit} of {name}" for name, error in errors),
+        slew=", ".join(f"{slew * units[name].factor:g} {units[name].unit}/s of {name}" for name, slew in slews),
         costs="\n".join(f"  {cost}" for cost in costs),
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
         level=100.0 * gain_tuning.UNCERTAINTY,

@@ -36,7 +36,7 @@ from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
 from flight_cli.output import COUNT_COLUMNS, new_table, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import SI_PER_UNIT
@@ -253,12 +253,11 @@ def _show_flights_of_model(console: Console, again: _Reflight, units: dict[str, 
 def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) -> Actuation:
     """Lags and delay of a controller's loop, in the airframe's order."""
     require(0.0 <= delay < math.inf, "--delay", delay, "0 s or more")
-    for key, found, expected in (
+    for key, names, expected in (
         ("controller.outputs", controller.outputs, nominal.outputs),
         ("controller.inputs", controller.inputs, tuple(nominal.inputs)),
     ):
-        of = f"the channels of the airframe {nominal.name}: {', '.join(expected)}"
-        require(sorted(found) == sorted(expected), key, ", ".join(found), of)
+        require_channels(key, names, expected, f"the channels of the airframe {nominal.name}")
     lag = dict(zip(controller.inputs, controller.lag, strict=True))
     return Actuation(np.array([lag[name] for name in nominal.inputs]), delay)
 
@@ -308,11 +307,11 @@ def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
         },
         "held_out": {
             model: {
-                "rms": dict(zip(outputs, one.rms.tolist(), strict=True)),
-                "whiteness": dict(zip(outputs, one.whiteness.tolist(), strict=True)),
-                "log_likelihood": one.log_likelihood,
+                "rms": dict(zip(outputs, innovations.rms.tolist(), strict=True)),
+                "whiteness": dict(zip(outputs, innovations.whiteness.tolist(), strict=True)),
+                "log_likelihood": innovations.log_likelihood,
             }
-            for model, one in (("nominal", found.before), ("identified", found.after))
+            for model, innovations in (("nominal", found.before), ("identified", found.after))
         },
         "model": None if path is None else str(path),
     }
@@ -379,10 +378,10 @@ def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
         ("outcome",),
     )
     largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left=("flight",))
-    for title, one in found.flights.items():
-        errors = [f"{one.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
-        flights.add_row(title, *errors, one.outcome)
-        largest.add_row(title, *(f"{one.largest[name]:.2g}" for name in INPUTS))
+    for title, flight in found.flights.items():
+        errors = [f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
+        flights.add_row(title, *errors, flight.outcome)
+        largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
     console.print(flights)
     console.print(largest)
 
@@ -415,6 +414,6 @@ def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
         "lost": found.failure,
         "delay_margin": found.selection.engineering.delay_margin,
         "controller": found.selection.engineering.controller.model_dump(exclude_defaults=True),
-        "flights": {title: one._asdict() for title, one in found.flights.items()},
+        "flights": {title: flight._asdict() for title, flight in found.flights.items()},
         "scenario": str(path),
     }

@@ -211,6 +211,11 @@ def require_length(key: str, values: Sequence[object], names: Sequence[str]) -> 
     require(len(values) == len(names), key, f"{len(values)} values", f"{len(names)}, one for each of {', '.join(names)}")
 
 
+def require_channels(key: str, names: Sequence[str], expected: Sequence[str], owner: str) -> None:
+    """Raise ParameterError unless the names are the channels of `owner`, in any order."""
+    require(sorted(names) == sorted(expected), key, ", ".join(names), f"{owner} in any order: {', '.join(expected)}")
+
+
 def flatten(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Nested mapping -> (dotted name, value) pairs, the parameter names of ROS 2; None values are left out."""
     for key, value in mapping.items():

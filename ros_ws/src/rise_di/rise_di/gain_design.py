@@ -184,11 +184,13 @@ def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, marg
     nominal = model_for(model, controller, noise)
     tuned = _tuned_scenario(scenario)
     results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
-    searched = sorted(((one.cost, law, one) for law, one in results.items() if one is not None), key=lambda one: one[0])
+    searched = sorted(
+        ((result.cost, law, result) for law, result in results.items() if result is not None), key=lambda row: row[0]
+    )
     candidates = [(gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start")]
     if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
         origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
-        of_search = (gains_of_search(one.gains, nominal.total_lag) for _, _, one in searched)
+        of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
         candidates = list(zip(of_search, origins, strict=True))
     selected, refusal = [], None
     for gains, origin in candidates:

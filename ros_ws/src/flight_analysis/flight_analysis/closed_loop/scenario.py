@@ -13,7 +13,7 @@ from flight_core.arguments import FilePath, as_instance, as_path
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, read_file
-from flight_core.parameters import REMOVED, Config, ParameterError, one_of, require
+from flight_core.parameters import REMOVED, Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
 from flight_guidance.params import GuidanceConfig
@@ -205,17 +205,12 @@ def check_together(scenario: Scenario) -> None:
     """Check the channels and rates of the sections together. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
-    for key, found, expected in (
-        ("controller.outputs", controller.outputs, tuple(channels.outputs)),
-        ("controller.inputs", controller.inputs, tuple(channels.inputs)),
-        ("reference_model.outputs", reference.outputs, tuple(channels.outputs)),
+    for key, names, expected in (
+        ("controller.outputs", controller.outputs, channels.outputs),
+        ("controller.inputs", controller.inputs, channels.inputs),
+        ("reference_model.outputs", reference.outputs, channels.outputs),
     ):
-        require(
-            sorted(found) == sorted(expected),
-            key,
-            ", ".join(found),
-            f"the channels of the airframe {scenario.aircraft.airframe} in any order: {', '.join(expected)}",
-        )
+        require_channels(key, names, tuple(expected), f"the channels of the airframe {scenario.aircraft.airframe}")
     control_ns = period_ns(controller.rate, "controller.rate")
     for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):
         divides = control_ns % period_ns(rate, key) == 0

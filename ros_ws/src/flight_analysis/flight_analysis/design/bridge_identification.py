@@ -134,8 +134,10 @@ def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: flo
     y, u = tape["y"].within(spans), tape["u"].within(spans)
     gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape else None
     return [
-        None if output == "V" and gravity is None else fit_channel(y, u, output, name, one, gravity if output == "V" else None)
-        for output, name, one in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
+        None
+        if output == "V" and gravity is None
+        else fit_channel(y, u, output, name, direction, gravity if output == "V" else None)
+        for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
     ]
 
 
@@ -425,7 +427,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
         if isinstance(value, (list, tuple)):
             return [plain(entry) for entry in value]
         if isinstance(value, Mapping):
-            return {key: plain(one) for key, one in value.items()}
+            return {key: plain(entry) for key, entry in value.items()}
         return float(f"{value:.6g}") if isinstance(value, float) else value
 
     return {key: plain(value) for key, value in values.items() if value is not None}

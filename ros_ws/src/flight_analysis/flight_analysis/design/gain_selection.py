@@ -179,7 +179,7 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
         values["outputs"] = airframe.outputs
         values["second_order"] = {key: [row[i] for i in kept] for key, row in values["second_order"].items()}
         for key in ("pulses", "sines"):
-            values[key] = {name: one for name, one in values[key].items() if name in airframe.outputs}
+            values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
     turn = whole.coordinated_turn
     if turn is not None:
         present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs)
@@ -546,7 +546,7 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {yaml_flow(one)}" for key, one in value.items()) + "}"
+        return "{" + ", ".join(f"{key}: {yaml_flow(entry, precision)}" for key, entry in value.items()) + "}"
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

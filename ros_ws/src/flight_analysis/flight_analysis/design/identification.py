@@ -136,9 +136,9 @@ def step_responses(
             responses.append((chord, step, (y[chord.first] + y[chord.last]) / 2.0 / (middle - chord.lag)))
         if not responses:
             raise FlightEnded(f"{output} does not respond to {name}: {'; '.join(rejected)}")
-        steepest, size[j], Omega[:, j] = max(responses, key=lambda one: abs(one[0].slope))
-        lag[j] = max(one.lag for one, *_ in responses)
-        spread[j] = min(abs(one.slope) for one, *_ in responses) / abs(steepest.slope)
+        steepest, size[j], Omega[:, j] = max(responses, key=lambda response: abs(response[0].slope))
+        lag[j] = max(chord.lag for chord, *_ in responses)
+        spread[j] = min(abs(chord.slope) for chord, *_ in responses) / abs(steepest.slope)
     return Responses(Omega, lag, size, spread, tuple(rejected))
 
 
@@ -233,9 +233,9 @@ class IdentifiedAircraft(NamedTuple):
     @property
     def failure(self) -> str:
         """Reason of a failure, or "": every flight completes, and in calm air each error is below its command."""
-        for title, one in self.flights.items():
-            if one.outcome != COMPLETED:
-                return f"{title}: {one.outcome}"
+        for title, flight in self.flights.items():
+            if flight.outcome != COMPLETED:
+                return f"{title}: {flight.outcome}"
         too_large = [name for name, value in self.flights["calm"].rms.items() if not value < HEIGHTS[name]]
         return f"calm: the error of {', '.join(too_large)} is larger than the command" if too_large else ""
 
@@ -368,7 +368,7 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
             "source": "step tests in JSBSim",
             "speed": condition.speed,
             "states": dict(OUTPUTS),
-            "inputs": {name: {"unit": "1", "positive": one.positive} for name, one in INPUTS.items()},
+            "inputs": {name: {"unit": "1", "positive": effect.positive} for name, effect in INPUTS.items()},
             "outputs": list(OUTPUTS),
             "A": np.zeros_like(Omega).tolist(),
             "B": Omega.tolist(),

@@ -17,7 +17,7 @@ from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
 from flight_analysis.design.nominal import nominal_model, sizes
-from flight_core.parameters import require
+from flight_core.parameters import require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
@@ -54,9 +54,8 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     the channels of the airframe, or one shorter than ten times the transient.
     """
     y, u = tape["y"], tape["u"]
-    for topic, found, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
-        of = f"the channels of the airframe {airframe.name}: {', '.join(expected)}"
-        require(sorted(found) == sorted(expected), f"topic {topic}", ", ".join(found), of)
+    for topic, names, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
+        require_channels(f"topic {topic}", names, expected, f"the channels of the airframe {airframe.name}")
     require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
     period_ns = round(float(np.median(np.diff(u.stamp_ns))))
     require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")

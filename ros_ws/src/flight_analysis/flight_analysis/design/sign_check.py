@@ -13,7 +13,7 @@ from autopilot_bridge.params import MOTIONS, ChannelMap, InputRow, OutputRow
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
@@ -53,13 +53,13 @@ def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
 def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
     """Check a channel map against a scenario's controller, for an airframe and optionally a recorded flight."""
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
-    for key, found, expected in (
+    for key, names, expected in (
         (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
         (f"map {channel_map.name}: inputs", tuple(channel_map.inputs), inputs),
         (f"airframe {frame.name}: outputs", frame.outputs, outputs),
         (f"airframe {frame.name}: inputs", tuple(frame.inputs), inputs),
     ):
-        require(sorted(found) == sorted(expected), key, ", ".join(found), f"the controller's: {', '.join(expected)}")
+        require_channels(key, names, expected, "the channels of the controller")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
     measured = None if bag is None else recorded_response(bag, outputs, inputs)

@@ -139,7 +139,7 @@ def tracking_figure(context: PlotContext, flights: Sequence[RecordedFlight]) -> 
     references: dict[str, Signal] = {}
     for label, flight in zip(labels(flights), flights, strict=True):
         y_m = _from_zero(flight.tape["y_m"], flight)
-        equal = next((other for other, reference in references.items() if _same_curve(reference, y_m)), None)
+        equal = next((name for name, reference in references.items() if _same_curve(reference, y_m)), None)
         if equal is None:
             references[label] = y_m
         elif len(y_m.stamp_ns) > len(references[equal].stamp_ns):
