@@ -45,7 +45,8 @@ def measure() -> dict[str, FloatArray]:
     with open_node("receiver") as node:
         subscription = PolledSubscription(node, Y, NEWEST_SAMPLES, raw=True)
         lock = PublisherLock(lambda: (TAKEOVER_NS, TAKEOVER_NS))
-        receiver = Receiver(subscription, Refusals(node), Decoder(parameters.outputs).decode, controller.take_y, lock=lock)
+        decode, max_age_ns = Decoder(parameters.outputs).decode, lambda: TAKEOVER_NS
+        receiver = Receiver(subscription, Refusals(node), decode, controller.take_y, max_age_ns=max_age_ns, lock=lock)
 
         for k in range(REPEATS):  # in turn, since the speed of the host drifts
             for name, message in {RIGHT: encoder.encode(k, np.full(4, 1e-6 * k)), **refused}.items():

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Each event in each mode of the controller: u moves by a step of the law, by the ramp to trim or by the rate limit."""
+"""No event in any mode makes u jump: u of the controller, u that the aircraft applies, and u that a bridge sends.
+
+u of the controller moves by a step of the law, by the ramp to trim or by the rate limit.
+"""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,11 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from tests.maps import named_map
 
+from aircraft_sim.applied_input import AppliedInput
+from autopilot_bridge.bridge import Bridge, Phase
+from autopilot_bridge.channel_map import to_channel
+from autopilot_bridge.params import ChannelMap
 from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
 from flight_core.rates import nanoseconds, seconds
-from flight_core.vectors import FloatArray, StampedVector
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller.controller import Controller
 
 pytestmark = pytest.mark.package("rise_di_controller")
@@ -229,3 +237,180 @@ def test_configuration_engages_the_law_again() -> None:
     assert loop.dt == 0.0
     loop.ticks(1)
     assert loop.dt > 0.0
+
+
+# The aircraft
+
+HELD, RAMP = 0.25, 0.4  # s, of the failsafe of the aircraft; HELD includes the age limit
+STEP = 0.005  # s, of the aircraft
+PUBLISHED = {"first": 0.1, "restarted": -0.1, "standby": 0.05}  # u, constant, by publisher
+LARGEST = 0.1
+FADING = (LARGEST + 2.0 * LARGEST) * STEP / RAMP  # largest step of u: the ramp to trim, and the fading offset of a transfer
+
+
+class Applied:
+    """u that the aircraft applies at each step, of messages at 100 Hz."""
+
+    def __init__(self) -> None:
+        self._input = AppliedInput(1, nanoseconds(HELD), nanoseconds(RAMP))
+        self._publisher, self._number = "", 0
+        self.u: list[float] = []
+
+    def fly(self, duration: float, publisher: str | None = None, u: float | None = None) -> None:
+        """Fly with the messages of a publisher, None: without messages. `u`: in place of the u of PUBLISHED."""
+        for _ in range(round(duration / STEP)):
+            now_ns = nanoseconds(self._number * STEP)
+            if publisher is not None and self._number % 2 == 0:
+                value = np.array([PUBLISHED[publisher] if u is None else u])
+                self._input.take(value, now_ns, transfer=publisher != self._publisher)
+                self._publisher = publisher
+            self.u.append(float(self._input.at(now_ns)[0]))
+            self._number += 1
+
+
+@pytest.mark.parametrize("silence", [0.0, 0.1, 0.3, 0.5, 1.0])  # s: in time, held, in the ramp twice, at trim
+@pytest.mark.parametrize("publisher", ["first", "restarted"])
+def test_u_that_returns_does_not_jump(publisher: str, silence: float) -> None:
+    """A publisher goes on with another u after the ramp has begun, a restarted publisher at any time."""
+    u = PUBLISHED["first" if publisher == "first" and silence < HELD else "restarted"]
+    aircraft = Applied()
+    aircraft.fly(1.0, "first")
+    aircraft.fly(silence)
+    aircraft.fly(1.0, publisher, u)
+    assert np.abs(np.diff(aircraft.u)).max() <= FADING + EXACT
+    assert aircraft.u[-1] == u
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from([None, *PUBLISHED]), st.integers(1, 150)), max_size=20))
+def test_no_sequence_of_publishers_and_silences_makes_applied_u_jump(parts: list[tuple[str | None, int]]) -> None:
+    aircraft = Applied()
+    for publisher, steps in parts:
+        aircraft.fly(steps * STEP, publisher)
+    u = np.array([0.0, *aircraft.u])  # in trim before
+    assert np.abs(np.diff(u)).max(initial=0.0) <= FADING + EXACT
+    assert np.abs(u).max() <= LARGEST + EXACT
+
+
+@pytest.mark.parametrize("duration", [0.05, 0.12, 0.2, 1.0])
+def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
+    """With equal age limit, hold and ramp, u of controller and aircraft are equal within two periods of the ramp."""
+    loop = engaged()
+    before, guard = loop.u, SCENARIO.controller.guard()
+    aircraft = AppliedInput(4, guard.max_age_ns + guard.hold_ns, guard.ramp_ns)
+    aircraft.take(before, 0, transfer=False)
+    loop.overrun(duration)
+    loop.receive(y=False, y_m=False)
+    loop.ticks(1)
+    late = np.abs(before) * 2 * guard.period_ns / guard.ramp_ns
+    assert (np.abs(loop.u - aircraft.at(nanoseconds(duration) + guard.period_ns)) <= late + EXACT).all()
+
+
+# The bridge
+
+TICK = 0.01  # s, of the bridge
+RATE = 4.0  # abs(u_dot) of the controller that the bridge receives, 1/s and rad/s
+COMMANDED = 1.5  # u of the active controller, beyond the limits of each input of the map
+
+
+class Engagement:
+    """A bridge at 100 Hz with y, a controller and a conflicting controller of opposite u, far from trim while ENGAGED.
+
+    The node of the bridge activates the controller at an engagement. Each sent u is checked.
+    """
+
+    def __init__(self) -> None:
+        content = named_map("ardupilot_2024").model_dump()
+        content["silence"] = {"max_age": 0.05, "neutral": 0.1, "release": 0.1}
+        self._map = ChannelMap.validate_mapping(content, "map")
+        self.bridge = Bridge(self._map, dry_run=False)
+        self.receives = {"y": True, "u": True, "conflicting u": False}
+        self._t = 0.0
+        self._u, self._received_t = 0.0, 0.0  # of the controller, and the instant of the last u that the bridge took
+        self._sent: tuple[FloatArray, float] | None = None  # the last u sent while ENGAGED, and the instant of receipt
+
+    def ticks(self, count: int) -> None:
+        """Run ticks."""
+        for _ in range(count):
+            self._t += TICK
+            now_ns = nanoseconds(1000.0 + self._t)
+            if self.receives["y"]:
+                for name in self._map.outputs:
+                    self.bridge.take_output(name, 0.0, now_ns, now_ns)
+            wanted = COMMANDED if self.bridge.phase is Phase.ENGAGED else 0.0
+            self._u += min(max(wanted - self._u, -RATE * TICK), RATE * TICK)
+            if self.receives["u"]:
+                self._receive_u("/controller#1", self._u, now_ns)
+            if self.receives["conflicting u"]:
+                self._receive_u("/controller#2", -self._u, now_ns)
+            self.bridge.step(now_ns)
+            self._check_sent(now_ns)
+
+    def now_ns(self) -> int:
+        """The instant of the last tick."""
+        return nanoseconds(1000.0 + self._t)
+
+    def _receive_u(self, sender: str, u: float, now_ns: int) -> None:
+        """As the receiver of the node."""
+        try:
+            self.bridge.u_lock.check(sender, now_ns)
+        except ChannelError:
+            return
+        self.bridge.take_u(StampedVector(now_ns, np.full(len(self._map.inputs), u), sender), now_ns)
+        self.bridge.u_lock.refresh(sender, now_ns)
+        self._received_t = self._t
+
+    def _check_sent(self, now_ns: int) -> None:
+        rows, phase = list(self._map.inputs.values()), self.bridge.phase
+        assert self.bridge.sends("joy", now_ns) == (phase is not Phase.DISENGAGED)
+        raw = self.bridge.raw()
+        if phase is not Phase.ENGAGED:
+            self._sent = None
+            resting = [row.neutral if phase is Phase.NEUTRAL else row.release for row in rows]
+            np.testing.assert_array_equal(raw, np.array(resting))
+            return
+        u = np.array([to_channel(raw_i, row.line) - row.trim for raw_i, row in zip(raw.tolist(), rows, strict=True)])
+        lower, upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
+        assert ((u >= lower - EXACT) & (u <= upper + EXACT)).all()
+        # From trim at the engagement, and by the controller in the tick after.
+        allowed = self._map.engage_within * np.where(u > 0.0, upper, -lower) + RATE * TICK
+        du = u
+        if self._sent is not None:
+            du, allowed = u - self._sent[0], np.full(len(rows), RATE * (self._received_t - self._sent[1]))
+        assert (np.abs(du) <= allowed + EXACT).all(), f"u sent to the autopilot moves by {du}, above {allowed}"
+        self._sent = u, self._received_t
+
+
+def switch(key: str) -> Callable[[Engagement], None]:
+    def toggle(loop: Engagement) -> None:
+        loop.receives[key] = not loop.receives[key]
+
+    return toggle
+
+
+REQUESTS: Mapping[str, Callable[[Engagement], object]] = {
+    "engage": lambda loop: loop.bridge.engage(loop.now_ns()),
+    "disengage": lambda loop: loop.bridge.disengage("by request", loop.now_ns()),
+    **{key: switch(key) for key in ("y", "u", "conflicting u")},
+}
+
+
+@settings(deadline=None)
+@given(st.lists(st.tuples(st.sampled_from([*REQUESTS]), st.integers(0, 25)), max_size=30))
+@example([("engage", 2), ("u", 3), ("u", 4)])  # u returns within the age limit
+@example([("engage", 3), ("u", 3), ("conflicting u", 9), ("engage", 9)])  # a second publisher at the timeout of u
+def test_no_sequence_of_events_makes_sent_u_jump(events: list[tuple[str, int]]) -> None:
+    loop = Engagement()
+    loop.ticks(1)
+    for name, count in events:
+        REQUESTS[name](loop)
+        loop.ticks(count)
+
+
+def test_engagement_of_sequences_sends_u() -> None:
+    loop = Engagement()
+    loop.ticks(1)
+    assert loop.bridge.engage(loop.now_ns()) == ""
+    loop.ticks(20)
+    assert loop.bridge.phase is Phase.ENGAGED
+    assert loop.bridge.raw().any()

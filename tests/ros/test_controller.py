@@ -214,7 +214,7 @@ def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, p
         ("not a number", to_message(0, OUTPUTS, np.array([math.nan, 0.0, 0.0, 0.0]), "peer"), "y: finite"),
         ("wrong names", to_message(0, ("q", "V", "p", "x"), np.zeros(4), "peer"), "y: name"),
         ("wrong length", JointState(header=Header(frame_id="peer"), name=list(OUTPUTS), position=[1.0]), "y: length"),
-        ("old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "peer"), "y: order"),
+        ("old stamp", to_message(1, OUTPUTS, np.full(4, 99.0), "peer"), "y: old"),
         ("future stamp", to_message(time.time_ns() + 3600 * 10**9, OUTPUTS, np.full(4, 99.0), "peer"), "y: future"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

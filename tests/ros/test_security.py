@@ -78,7 +78,7 @@ def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None
 
     peer_node.until(lambda: "receiving u from" in first.output, each=send)
     replayed = recorded[0]
-    peer_node.until(partial(peer_node.counted, "refused u: order"), each=replay_beside)  # once it is older than max_age
+    peer_node.until(partial(peer_node.counted, "refused u: old"), each=replay_beside)  # once it is older than max_age
     first.interrupt().succeed()
     peer_node.received["/diagnostics"].clear()
     second = aircraft(start_node, "-p", "max_age:=0.1")

@@ -408,7 +408,7 @@ BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # 
     "NaN": (partial(not_finite, (math.nan,)), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
     "wrong length": (wrong_length, "length", "names for"),
-    "past stamps": (partial(wrong_stamp, -1.0), "order", "(after|before) the last one"),
+    "past stamps": (partial(wrong_stamp, -1.0), "old", "stamp [^ ]+ s old"),
     "future stamps": (partial(wrong_stamp, 1.0), "future", "ahead of the clock"),
     "Inf": (partial(not_finite, (-math.inf, math.inf)), "finite", "is not finite"),
 }

@@ -8,12 +8,13 @@ A watchdog measures the age of u. A u that times out gets the failsafe: hold the
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from aircraft_sim.applied_input import AppliedInput
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_core import channels
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
-from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_not_future, require_not_old
+from flight_core.vectors import FloatArray, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, Decoder, instant, stamp_of
 from flight_ros.ticker import Tick
@@ -33,11 +34,13 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def __init__(self) -> None:
         super().__init__("aircraft", AircraftConfig)
         self._simulator = Simulator(self.parameters)
-        self._u = np.zeros(len(self._simulator.inputs))
+        self._u = np.zeros(len(self._simulator.inputs))  # the newest
+        held_ns = nanoseconds(self.parameters.max_age + self.parameters.hold)
+        self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = PublisherLock(self._timeouts_ns)
-        self._u_stamp_ns = 0  # of the last u
         self._timeout_logged = False
-        self._u_receiver = self.receive(U, Decoder(self._simulator.inputs).decode, self._accept_u, lock=self._publisher_lock)
+        decode = Decoder(self._simulator.inputs).decode
+        self._u_receiver = self.receive(U, decode, self._accept_u, max_age_ns=self._max_u_age_ns, lock=self._publisher_lock)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
         self._publish_pose, self._pose_encoder = self.advertise(POSE), self.encoder(channels.POSE)
         self._y_encoder = self.encoder(self._simulator.outputs)
@@ -63,9 +66,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._simulator.retune(parameters)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        scale = self.parameters.failsafe_scale(self._publisher_lock.age_ns(now_ns))
         start_ns = now_ns - tick.number * self.period_ns()
-        for message in self._fly_to(tick.number, start_ns, self._u if scale == 1.0 else scale * self._u):
+        for message in self._fly_to(tick.number, start_ns, self._applied.at(now_ns)):
             self._publish_y(message)
         self._publish_motion(tick.number, start_ns)
         self._take_u(now_ns)
@@ -81,7 +83,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
     def advance(self) -> bool:
-        if not self._u_received and not self._take_u(self._number * self.period_ns()):
+        if not self._u_received and not self._take_u((self._number - 1) * self.period_ns()):
             return False
         self._u_received = True
         if self._finished() or self._ahead_of_log():
@@ -120,10 +122,12 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
         A message without channels is valid: the controller has no output at this instant of a lockstep flight.
         """
-        before = self._publisher_lock.publisher
+        publisher, u = self._publisher_lock.publisher, self._u
         valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
-        if self._publisher_lock.publisher != before:
+        if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")
+        if self._u is not u:
+            self._applied.take(self._u, now_ns, transfer=transfer)
         if self._timed_out(now_ns):
             self.warn_no_publisher(self._u_receiver.subscription)
             if self._publisher_lock.publisher is not None and not self._timeout_logged:
@@ -132,22 +136,14 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return any(valid)
 
     def _accept_u(self, sample: StampedVector, now_ns: int) -> None:
-        """Take a u. Raises ChannelError where its stamp is bad."""
-        if not self.parameters.lockstep:
-            self._require_timely(sample, now_ns)
-        self._u, self._u_stamp_ns, self._timeout_logged = sample.value, sample.stamp_ns, False
+        self._u, self._timeout_logged = sample.value, False
 
-    def _require_timely(self, sample: StampedVector, now_ns: int) -> None:
-        """Raise ChannelError where a u is stamped in the future, or before the last u, by more than the age limit.
+    def _max_u_age_ns(self) -> int:
+        """Age limit of a u by the stamp, the instant of the y from which the controller computed u.
 
-        After a timeout, where it is older than that: the middleware of a controller that was stopped sends its last u when the
-        process continues.
+        The middleware of a controller that was stopped sends the last u when the process continues.
         """
-        require_not_future(sample.stamp_ns, now_ns, self._max_age_ns)
-        if self._timed_out(now_ns):
-            require_not_old(sample.stamp_ns, now_ns, self._max_age_ns)
-        elif (behind_ns := self._u_stamp_ns - sample.stamp_ns) > self._max_age_ns:
-            raise ChannelError("order", f"stamp {seconds(behind_ns):g} s before the last one")
+        return self._max_age_ns + nanoseconds(self.parameters.sensors.delay)
 
     @property
     def _max_age_ns(self) -> int:

@@ -18,7 +18,6 @@ from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
-from flight_core.failsafe import failsafe_scale
 from flight_core.fields import Field
 from flight_core.parameters import Config, NodeConfig, NonNegative, Numbers, ParameterError, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
@@ -254,10 +253,6 @@ class AircraftConfig(NodeConfig):
     def step_ns(self) -> int:
         """The integration step in ns."""
         return nanoseconds(self.step)
-
-    def failsafe_scale(self, age_ns: int) -> float:
-        """Failsafe: scale of the last u at an age. u is held for max_age + hold, then ramped to trim."""
-        return failsafe_scale(age_ns, nanoseconds(self.max_age + self.hold), nanoseconds(self.ramp))
 
     def channels(self) -> AircraftChannels:
         """Outputs and inputs with their units, the effects of the inputs, and the trim speed."""

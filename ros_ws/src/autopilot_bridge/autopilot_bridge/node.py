@@ -80,7 +80,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 _require_field(kind(), name, row)
             self._readers.append((self.subscribe(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
-        self._u = self.receive(U, Decoder(self._bridge.inputs).decode, self._bridge.take_u, lock=self._bridge.u_lock)
+        decode = Decoder(self._bridge.inputs).decode
+        self._u = self.receive(U, decode, self._bridge.take_u, max_age_ns=self._bridge.max_u_age_ns, lock=self._bridge.u_lock)
         self._publish_y, self._publish_would_send = self.advertise(Y), self.advertise(WOULD_SEND)
         self._y_encoder = self.encoder(self._bridge.outputs)
         self._publish_pose = self.advertise(POSE) if self._map.pose else None

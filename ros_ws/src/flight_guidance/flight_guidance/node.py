@@ -30,7 +30,7 @@ from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample
 from flight_ros.rclpy_private import DeserializationError
-from flight_ros.receiver import require_size
+from flight_ros.receiver import Receiver, require_size
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
     GUIDANCE,
@@ -44,6 +44,7 @@ from flight_ros.topics import (
     STATE,
     TARGET,
     U_M,
+    Topic,
     Y,
     publisher_qos,
 )
@@ -73,9 +74,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         super().__init__("guidance", GuidanceConfig)
         self._guidance = Guidance(self.parameters)
         outputs = self.parameters.outputs
-        self._y = self.receive(Y, Decoder(outputs).decode, self._guidance.take_y, lock=PublisherLock(self._timeouts_ns))
+        self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
         self._named = NamedDecoder()
-        self._pose = self.receive(POSE, self._decode_pose, self._guidance.take_pose, lock=PublisherLock(self._timeouts_ns))
+        self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
         # An operator has the system clock, not the flight time of lockstep. A target from before a stop of guidance is void:
         # the operator knows that the target failed.
         max_age_ns = None if self.parameters.lockstep else self._max_age_ns
@@ -92,8 +93,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         else:
             self._controller_mode = ControllerMode.WAITING
             self._guidance.pause(paused=True, forget=False)
-            lock = PublisherLock(self._timeouts_ns)
-            self._internals = self.receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode, lock=lock)
+            self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
         self._odometry, self._path, self._markers = (
             self.create_publisher(topic.type, topic.name, publisher_qos(period))
             for topic, period in ((ODOMETRY, ODOMETRY_PERIOD_NS), (PATH, PATH_PERIOD_NS), (MARKERS, PATH_PERIOD_NS))
@@ -159,6 +159,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self._publish_path(odometry)
 
     # Received messages
+
+    def _receive(
+        self, topic: Topic, decode: Callable[[bytes], StampedVector | None], take: Callable[[StampedVector, int], None]
+    ) -> Receiver[StampedVector]:
+        lock = PublisherLock(self._timeouts_ns)
+        return self.receive(topic, decode, take, max_age_ns=self._max_age_ns, lock=lock)
 
     def _decode_pose(self, raw: bytes) -> StampedVector:
         """A pose in the order of `channels.POSE`, without sideslip where there is none."""

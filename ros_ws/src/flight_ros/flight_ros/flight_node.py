@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import SetParametersResult
@@ -55,7 +55,7 @@ class FlightNode(Node, Generic[P]):
         self.instance = self.get_fully_qualified_name() + process
         self.refusals, self.endpoints = Refusals(self), EndpointMonitor(self)
         self.polled_subscriptions: list[PolledSubscription] = []
-        self._locks: list[PublisherLock] = []  # of the receivers
+        self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
@@ -119,15 +119,15 @@ class FlightNode(Node, Generic[P]):
         decode: Callable[[bytes], S | None],
         take: Callable[[S, int], None],
         *,
+        max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
-        max_age_ns: Callable[[], int] | None = None,
         qos: QoSProfile | None = None,
     ) -> Receiver[S]:
         """Create a subscription with its `Receiver`. Overruns of this node are no silence of the publisher."""
-        if lock is not None:
-            self._locks.append(lock)
         subscription = self.subscribe(topic, qos)
-        return Receiver(subscription, self.refusals, decode, take, lock=lock, max_age_ns=max_age_ns)
+        receiver = Receiver(subscription, self.refusals, decode, take, lock=lock, max_age_ns=max_age_ns)
+        self.receivers.append(receiver)
+        return receiver
 
     def encoder(self, names: Sequence[str]) -> Encoder:
         """Encoder of samples that this node publishes."""
@@ -173,8 +173,9 @@ class FlightNode(Node, Generic[P]):
     def run_tick(self, tick: Tick, now_ns: int) -> None:
         """Run one tick; measure its period, its compute time and its overruns."""
         self._tick_times.begin(tick)
-        for lock in self._locks:
-            lock.overran(tick.missed * self.period_ns())
+        for receiver in self.receivers:
+            if receiver.lock is not None:
+                receiver.lock.overran(tick.missed * self.period_ns())
         self.tick(tick, now_ns)
         self._tick_times.end()
 

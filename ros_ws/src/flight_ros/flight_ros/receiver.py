@@ -82,7 +82,7 @@ class Receiver(Generic[S]):
     A message that is too long, or of a conflicting publisher, is refused without decoding names and values: a flood of these
     messages costs no more than as many right ones. `decode` returns None for a vector without channels. `take` gets a sample
     and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
-    the lead over the clock; None leaves stamps to `take`. All of these raise ChannelError to refuse.
+    the lead over the clock; None is for a sender without the clock of the flight. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -92,8 +92,8 @@ class Receiver(Generic[S]):
         decode: Callable[[bytes], S | None],
         take: Callable[[S, int], None],
         *,
+        max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
-        max_age_ns: Callable[[], int] | None = None,
     ) -> None:
         self.subscription, self.lock = subscription, lock
         self._refusals, self._decode, self._take = refusals, decode, take

@@ -42,8 +42,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
         outputs = self.parameters.outputs
-        self._y = self.receive(Y, Decoder(outputs).decode, self._controller.take_y, lock=self._new_lock())
-        self._y_m = self.receive(Y_M, Decoder(outputs).decode, self._controller.take_y_m, lock=self._new_lock())
+        self._y, self._y_m = (
+            self.receive(topic, Decoder(outputs).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
+            for topic, take in ((Y, self._controller.take_y), (Y_M, self._controller.take_y_m))
+        )
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.inputs)
         self._internals_encoder = self.encoder(self._controller.names)
@@ -105,7 +107,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
-    @property
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
@@ -118,7 +119,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
         Another one may take over once the failsafe has brought u to trim.
         """
-        return self._max_age_ns, self._max_age_ns + nanoseconds(self.parameters.hold + self.parameters.ramp)
+        return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold + self.parameters.ramp)
 
     def _step(self, now_ns: int, late_ns: int) -> bool:
         """One tick of the controller; whether it had an output to publish."""
@@ -129,7 +130,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if output is None or not self._publishes:
             return False
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
-        if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns:
+        if self.parameters.lockstep or self.now_ns() - now_ns <= self._max_age_ns():
             self._publish_u(self._u_encoder.encode(output.stamp_ns, output.u))
         if self._controller.has_internals:
             self._publish_internals(self._internals_encoder.encode(output.stamp_ns, output.internals))

@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""u that the aircraft applies: the received u, the failsafe of a u that times out, and a bumpless return."""
+
+import numpy as np
+
+from flight_core.failsafe import failsafe_scale
+from flight_core.vectors import FloatArray
+
+
+class AppliedInput:
+    """The applied u, shape (m,).
+
+        u_applied(t) = s(t - t_u) u + r(t - t_0) offset,    offset = u_applied(t_0) - u(t_0)
+
+    u is the last received u and t_u the instant of receipt. s is 1 for `hold_ns`, then falls to 0 within `ramp_ns`. t_0 is the
+    instant of the last bumpless transfer: to a new publisher, or to a u after the ramp has begun. r falls from 1 to 0 within
+    `ramp_ns`, so that u_applied does not jump at t_0.
+    """
+
+    def __init__(self, m: int, hold_ns: int, ramp_ns: int) -> None:
+        self._hold_ns, self._ramp_ns = hold_ns, ramp_ns
+        self._u = self._offset = np.zeros(m)
+        self._u_ns = self._transfer_ns = 0
+
+    def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
+        """Take a received u. `transfer`: the publisher is new."""
+        if transfer or self._scale(now_ns) < 1.0:
+            self._offset, self._transfer_ns = self.at(now_ns) - u, now_ns
+        self._u, self._u_ns = u, now_ns
+
+    def at(self, now_ns: int) -> FloatArray:
+        """The applied u at an instant."""
+        scale, rest = self._scale(now_ns), failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
+        u = self._u if scale == 1.0 else scale * self._u
+        return u + rest * self._offset if rest > 0.0 and self._offset.any() else u
+
+    def _scale(self, now_ns: int) -> float:
+        return failsafe_scale(now_ns - self._u_ns, self._hold_ns, self._ramp_ns)
