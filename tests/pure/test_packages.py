@@ -64,6 +64,7 @@ def disagreements(package: Path) -> list[str]:
         "e-mail": email is not None and re.fullmatch(r"[\w.-]+@[\w-]+(\.[\w-]+)+", email.attrib["email"]) is not None,
         "scripts where ros2 run looks": config["install"]["install_scripts"] == f"$base/lib/{name}",
         "resource": (package / "resource" / name).is_file(),
+        "types for users (PEP 561)": (package / name / "py.typed").is_file(),
     }
     return [statement for statement, holds in statements.items() if not holds]
 

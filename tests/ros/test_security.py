@@ -95,7 +95,7 @@ REFUSAL = (
 
 
 @pytest.mark.parametrize("node", ["aircraft_sim", "reference_model", "rise_di_controller"])
-def test_a_node_with_a_key_is_refused(node: str, start_node: Start) -> None:
+def test_node_refuses_key_file(node: str, start_node: Start) -> None:
     process = start_node(node, "-p", "key_file:=flight.key")
     assert process.end() == 2
     assert process.output.startswith("error: ")
@@ -103,7 +103,7 @@ def test_a_node_with_a_key_is_refused(node: str, start_node: Start) -> None:
 
 
 @pytest.mark.parametrize("section", ["aircraft", "reference_model", "controller", "recorder", "guidance", "flight"])
-def test_a_scenario_with_a_key_is_refused(section: str, start: Start, tmp_path: Path) -> None:
+def test_scenario_with_key_file_refused(section: str, start: Start, tmp_path: Path) -> None:
     sections = yaml.safe_load(find_scenario("osprey_route").path.read_text(encoding="utf-8"))
     sections[f"/**/{section}"]["ros__parameters"]["key_file"] = "flight.key"
     path = tmp_path / "keyed.yaml"
@@ -113,7 +113,7 @@ def test_a_scenario_with_a_key_is_refused(section: str, start: Start, tmp_path: 
     assert flight.output == f"error: {section}.key_file: {REFUSAL}"
 
 
-def test_a_map_with_a_key_is_refused(tmp_path: Path) -> None:
+def test_map_with_key_file_refused(tmp_path: Path) -> None:
     path = tmp_path / "keyed.yaml"
     path.write_text("key_file: flight.key\n" + find_map("px4").read_text(encoding="utf-8"), encoding="utf-8")
     with pytest.raises(ParameterError) as refused:
@@ -122,7 +122,7 @@ def test_a_map_with_a_key_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [("target", "altitude=60"), ("watch", "--control")])
-def test_a_command_with_a_key_is_refused(words: tuple[str, ...], start: Start) -> None:
+def test_command_refuses_key_file(words: tuple[str, ...], start: Start) -> None:
     command = start("flight_cli.cli", *words, "--key-file", "flight.key")
     assert command.end() == 2
     assert command.output == f"error: --key-file: {REFUSAL}"
@@ -235,16 +235,17 @@ def on_network(tmp_path: Path) -> tuple[str, ...]:
     return environment(FASTRTPS_DEFAULT_PROFILES_FILE=str(profile), **discovery)
 
 
-def test_by_default_another_host_neither_receives_y_nor_commands_u(
+def test_second_host_has_no_access_by_default(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
+    """No access: neither does the host receive y nor does it command u."""
     node = aircraft(start_node, within=hosts.first)
     assert received(start("tests.ros.attacker", f"{PATIENCE}", within=(*hosts.second, *on_network))) == 0
     assert "receiving u from" not in node.output
     assert "sample refused" not in node.output  # no sample has arrived
 
 
-def test_with_network_profile_another_host_receives_y_and_commands_u(
+def test_second_host_has_access_with_network_profile(
     start: Start, start_node: Start, hosts: Hosts, on_network: tuple[str, ...]
 ) -> None:
     node = aircraft(start_node, within=(*hosts.first, *on_network))

@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["aircraft_sim"],
-    package_data={"aircraft_sim": ["airframes/*.yaml"]},
+    package_data={"aircraft_sim": ["py.typed", "airframes/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/aircraft_sim"]),
         ("share/aircraft_sim", ["package.xml"]),

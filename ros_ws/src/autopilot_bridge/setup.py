@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["autopilot_bridge"],
-    package_data={"autopilot_bridge": ["maps/*.yaml"]},
+    package_data={"autopilot_bridge": ["py.typed", "maps/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/autopilot_bridge"]),
         ("share/autopilot_bridge", ["package.xml"]),

@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["control_laws"],
+    package_data={"control_laws": ["py.typed"]},
     entry_points={
         "rise_di_controller.laws": [
             "pi = control_laws.pi:PiConfig",

@@ -12,7 +12,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_bringup", "flight_bringup.launch"],
-    package_data={"flight_bringup": ["config/*.yaml", "security/*.xml"]},
+    package_data={"flight_bringup": ["py.typed", "config/*.yaml", "security/*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_bringup"]),
         ("share/flight_bringup", ["package.xml"]),

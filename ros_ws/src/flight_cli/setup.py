@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_cli"],
+    package_data={"flight_cli": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_cli"]),
         ("share/flight_cli", ["package.xml"]),

@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_guidance"],
+    package_data={"flight_guidance": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_guidance"]),
         ("share/flight_guidance", ["package.xml"]),

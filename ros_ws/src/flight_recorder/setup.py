@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_recorder"],
+    package_data={"flight_recorder": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_recorder"]),
         ("share/flight_recorder", ["package.xml"]),

@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_ros"],
-    package_data={"flight_ros": ["loopback.xml"]},
+    package_data={"flight_ros": ["py.typed", "loopback.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_ros"]),
         ("share/flight_ros", ["package.xml"]),

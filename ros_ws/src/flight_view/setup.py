@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_view"],
-    package_data={"flight_view": ["page/*.html", "page/*.css", "page/*.js"]},
+    package_data={"flight_view": ["py.typed", "page/*.html", "page/*.css", "page/*.js"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_view"]),
         ("share/flight_view", ["package.xml"]),

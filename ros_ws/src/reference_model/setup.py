@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["reference_model"],
+    package_data={"reference_model": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/reference_model"]),
         ("share/reference_model", ["package.xml"]),

@@ -11,6 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["rise_di_controller"],
+    package_data={"rise_di_controller": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/rise_di_controller"]),
         ("share/rise_di_controller", ["package.xml"]),
