@@ -26,7 +26,7 @@ from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
-from flight_core.units import SI_PER_UNIT
+from flight_core.units import si_per_unit
 from flight_core.vectors import FloatArray
 
 WORLDS = {"paper": "no actuators", "servo": "actuators with lag, rate limits and end stops"}
@@ -96,7 +96,7 @@ def scaled_beta(scenario: Scenario, rates: Mapping[str, float]) -> list[float]:
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     return [
-        rates[name] * SI_PER_UNIT[airframe.inputs[name].unit] / scale
+        rates[name] * si_per_unit(airframe.inputs[name].unit) / scale
         for name, scale in zip(controller.inputs, controller.input_scale, strict=True)
     ]
 

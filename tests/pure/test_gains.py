@@ -17,7 +17,7 @@ import yaml
 from tests.closed_loop import law_params
 from typer.testing import CliRunner, Result
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframe import LIBRARY, load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -525,6 +525,16 @@ def test_smallest_eigenvalue_of_zero_is_no_decay() -> None:
     assert not condition.holds
     assert condition._replace(found=1e-9).holds
     assert condition.sentence(()) == "V2_dot: found 0, expected above 0"
+
+
+def test_command_shows_the_airframe_of_a_file(tmp_path: Path) -> None:
+    """The poles are those that Nelson prints for the Navion: -2.51 +-2.59j and -0.017 +-0.213j, p. 158."""
+    own = tmp_path / "own.yaml"
+    own.write_text((LIBRARY / "navion_longitudinal.yaml").read_text(encoding="utf-8").replace("navion_longitudinal", "mine"))
+    (shown,) = json.loads(rise_di("airframes", str(own), "--json").stdout)
+    assert shown["name"] == "mine"
+    poles = sorted((real, abs(imaginary)) for real, imaginary in shown["poles"])
+    np.testing.assert_allclose(poles[::2], [(-2.51, 2.59), (-0.017, 0.213)], atol=0.021)  # A is printed to 3 digits
 
 
 def test_the_command_lists_the_airframes() -> None:

@@ -20,7 +20,7 @@ from tests.conftest import REPOSITORY
 from aircraft_sim import isolated, jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel, aircraft_names
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel, aircraft_names
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.simulator import Simulator
@@ -28,6 +28,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
+from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]

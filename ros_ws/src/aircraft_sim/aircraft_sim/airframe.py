@@ -3,27 +3,29 @@
 """Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
 
 import os
+from collections.abc import Iterable
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aircraft_sim import identities
 from aircraft_sim.disturbance import AXES
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
 from flight_core.parameters import Config, Names, Numbers, Positive, require
-from flight_core.units import SI_PER_UNIT
+from flight_core.units import quantity, si_per_unit
 from flight_core.vectors import FloatArray
 
 EXPECTED = "an airframe file"
 
 LIBRARY = Path(str(files("aircraft_sim"))) / "airframes"
 
-Unit = Literal["rad", "deg", "crad", "rad/s", "deg/s", "crad/s", "m/s", "ft/s", "1", "%"]
+Unit = str  # of `flight_core.units.quantity`
 Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
@@ -58,9 +60,17 @@ class Airframe(Config):
     speed: Positive = Field(description="the trim speed V0, m/s")
     states: dict[str, Unit] = Field(description="units by state")
     inputs: dict[str, Input] = Field(description="unit and sign by input")
-    outputs: Names = Field(description="the states that y = C x picks")
+    outputs: Names = Field(description="the outputs of y = C x: states, or the rows of C")
     A: Matrix = Field(description="A, a row a state")
     B: Matrix = Field(description="B, a row a state, a column an input")
+    C: tuple[Numbers, ...] = Field(
+        default=(), description="C, a row an output, a column a state; absent: the outputs are states"
+    )
+    D: tuple[Numbers, ...] = Field(default=(), description="the feedthrough of other tools' models; 0 or absent")
+    output_units: dict[str, Unit] = Field(default={}, description="units of the outputs of C that are not states")
+    identities: bool = Field(
+        default=True, description="check what physics fixes, as theta_dot = q; false for a model that differs on purpose"
+    )
     gravity: tuple[Gravity, ...] = Field(default=(), description="sine terms of f")
     inertial_coupling: tuple[Product, ...] = Field(default=(), description="terms of f from products of states")
     gusts: dict[str, dict[str, float]] = Field(
@@ -74,7 +84,10 @@ class Airframe(Config):
             shape = [len(row) for row in getattr(self, key)]
             require(shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}")
         require(len(self.outputs) == m, "outputs", f"{len(self.outputs)} of them", f"{m}, as many as inputs")
-        named = {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
+        for key, unit in (*self._units(), *((f"output_units.{name}", unit) for name, unit in self.output_units.items())):
+            quantity(unit, key)
+        self._check_outputs(n, m)
+        named = {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
         named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
         named |= {f"inertial_coupling[{i}].into": term.into for i, term in enumerate(self.inertial_coupling)}
@@ -87,25 +100,52 @@ class Airframe(Config):
         for key, name in named.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
+    def _units(self) -> list[tuple[str, Unit]]:
+        """Units of states and inputs with their keys."""
+        states = [(f"states.{name}", unit) for name, unit in self.states.items()]
+        return states + [(f"inputs.{name}.unit", given.unit) for name, given in self.inputs.items()]
+
+    def _check_outputs(self, n: int, m: int) -> None:
+        """Check C, D and output_units: shapes, a unit for each output, no feedthrough."""
+        shape = [len(row) for row in self.C]
+        require(shape in ([], [n] * m), "C", f"rows of {shape} values", f"{m} rows of {n}: a row an output, a column a state")
+        largest = max((abs(value) for row in self.D for value in row), default=0.0)
+        way_out = "none: take an output that no input moves at once, such as a speed in place of an acceleration"
+        require(largest == 0.0, "D", f"a feedthrough of {largest:g}", way_out)
+        for name in self.output_units:
+            expected = f"an output of C that is no state: {', '.join(set(self.outputs) - set(self.states)) or 'none'}"
+            require(bool(self.C) and name in self.outputs and name not in self.states, "output_units", f"{name!r}", expected)
+        for name, row in zip(self.outputs, self.C, strict=bool(self.C)):
+            require(name in self.states or name in self.output_units, f"output_units.{name}", "none", "the unit of this output")
+            picked = [state for state, value in zip(self.states, row, strict=True) if value != 0.0]
+            same = name not in self.states or (picked == [name] and row[list(self.states).index(name)] == 1.0)
+            row_of_it = f"the state {name} alone: give another combination another name"
+            require(same, "C", f"a row of {name} with {' and '.join(picked) or 'no state'}", row_of_it)
+
+    def units_of_outputs(self) -> dict[str, Unit]:
+        """Units of the outputs, in their order."""
+        return {name: self.states.get(name) or self.output_units[name] for name in self.outputs}
+
     def index(self, state: str) -> int:
         """Index of a state in x."""
         return list(self.states).index(state)
 
     def matrix_a(self) -> FloatArray:
         """A, shape (n, n), SI: A_ij unit_i / unit_j."""
-        unit: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
+        unit = _si(self.states.values())
         matrix: FloatArray = np.array(self.A)
         return matrix * unit[:, None] / unit[None, :]
 
     def matrix_b(self) -> FloatArray:
         """B, shape (n, m), SI: B_ij unit_i / unit_j."""
-        row: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
-        column: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        row, column = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
         matrix: FloatArray = np.array(self.B)
         return matrix * row[:, None] / column[None, :]
 
     def matrix_c(self) -> FloatArray:
-        """C, shape (m, n): selects the outputs."""
+        """C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
+        if self.C:
+            return np.array(self.C) * _si(self.units_of_outputs().values())[:, None] / _si(self.states.values())
         return np.array([[float(state == output) for state in self.states] for output in self.outputs])
 
     def matrix_gravity(self) -> FloatArray:
@@ -127,16 +167,18 @@ class Airframe(Config):
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
         """A copy with new A, shape (n, n), and B, shape (n, m), given in SI and stored in the units of the file.
 
-        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`.
+        `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries
+        need not meet the identities of physics, so the copy is not checked for these.
         """
-        state: FloatArray = np.array([SI_PER_UNIT[u] for u in self.states.values()])
-        inputs: FloatArray = np.array([SI_PER_UNIT[i.unit] for i in self.inputs.values()])
+        state, inputs = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
         values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
         gusts = {
             axis: {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
             for (axis, direction), factor in zip(self.gusts.items(), wind_factor.T, strict=True)
         }
-        return self.validate_mapping(self.model_dump() | values | {"gusts": gusts}, f"airframe {self.name}")
+        return self.validate_mapping(
+            self.model_dump() | values | {"gusts": gusts, "identities": False}, f"airframe {self.name}"
+        )
 
     def matrix_gusts(self) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""
@@ -149,6 +191,20 @@ class Airframe(Config):
         for state, value in self.gusts[gust].items():
             direction[self.index(state)] = value / self.speed
         return direction
+
+
+def _si(units: Iterable[Unit]) -> FloatArray:
+    """SI values of 1 of each unit."""
+    return np.array([si_per_unit(unit) for unit in units])
+
+
+def check_identities(airframe: Airframe) -> None:
+    """Raise ParameterError for an airframe that contradicts what physics fixes, unless the file says `identities: false`."""
+    if airframe.identities:
+        effects = {name: given.positive for name, given in airframe.inputs.items()}
+        units = tuple(given.unit for given in airframe.inputs.values())
+        A, B, gravity = np.array(airframe.A), np.array(airframe.B), airframe.matrix_gravity()
+        identities.check(identities.Model(airframe.name, airframe.states, effects, units, airframe.speed, A, B, gravity))
 
 
 def airframes() -> list[str]:
@@ -169,4 +225,6 @@ def _parsed(name: str, path: Path, content: bytes) -> Airframe:
     """An airframe from the content of a file, cached: a node that checks a change in flight saves 15 ms."""
     parsed = parse_yaml(content, f"airframe {path}", EXPECTED)
     require(isinstance(parsed, dict), f"airframe {path}", type(parsed).__name__, "a mapping")
-    return Airframe.validate_mapping(parsed, f"airframe {name}")
+    airframe = Airframe.validate_mapping(parsed, f"airframe {name}")
+    check_identities(airframe)
+    return airframe

@@ -16,11 +16,10 @@ from aircraft_sim.airframe import Unit
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.turbulence import Turbulence
 from flight_core.parameters import ParameterError, require
-from flight_core.units import SI_PER_UNIT
+from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
-FOOT = SI_PER_UNIT["ft/s"]  # m, and m/s per ft/s
 
 
 class Command(NamedTuple):

@@ -10,11 +10,12 @@ import numpy as np
 from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
-from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from flight_core.outcome import FlightEnded
 from flight_core.rates import divide, seconds
+from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 POSE = (

@@ -11,9 +11,10 @@ import jsbsim
 import numpy as np
 
 from aircraft_sim import isolated
-from aircraft_sim.jsbsim_aircraft import FOOT, INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim
+from aircraft_sim.jsbsim_aircraft import INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim
 from flight_core.outcome import FlightEnded
 from flight_core.rates import nanoseconds, seconds
+from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 HEADING, HEIGHT, CONTACT = "attitude/psi-rad", "position/h-agl-ft", "forces/fbz-gear-lbs"

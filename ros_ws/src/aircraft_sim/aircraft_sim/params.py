@@ -262,7 +262,7 @@ class AircraftConfig(NodeConfig):
         airframe = load_airframe(self.airframe)
         inputs = {name: given.unit for name, given in airframe.inputs.items()}
         positive = {name: given.positive for name, given in airframe.inputs.items()}
-        return AircraftChannels({name: airframe.states[name] for name in airframe.outputs}, inputs, positive, airframe.speed)
+        return AircraftChannels(airframe.units_of_outputs(), inputs, positive, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
         """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named airframe."""

@@ -88,4 +88,4 @@ def sampled_matrices(
 
 def as_yaml(airframe: Airframe) -> str:
     """An airframe as the text of an airframe file, whose numbers read back as they are to the last bit."""
-    return dump_yaml(airframe.model_dump(mode="json"))
+    return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

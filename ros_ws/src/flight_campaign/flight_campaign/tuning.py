@@ -106,7 +106,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         values = list(limits) or [default] * m
         return np.array([values[column] for column in columns])
 
-    unit = score_units(controller.outputs, airframe.states)
+    unit = score_units(controller.outputs, airframe.units_of_outputs())
     noise = scenario.aircraft.sensor_arrays().noise[rows]
     loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)
     model = nominal_model(airframe, controller.outputs, controller.inputs, np.where(noise > 0.0, noise, unit / 10.0), loop)

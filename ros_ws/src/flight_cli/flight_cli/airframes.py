@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: the assumptions of the theorem, checked on every airframe of the library."""
+"""`rise-di airframes`: the assumptions of the theorem, checked on every airframe of the library, or on your own."""
 
 from typing import Annotated, Any
 
@@ -8,13 +8,22 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, library
+from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library
 from flight_cli.output import new_table, print_json
 
 
-def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False) -> None:
-    """Show the airframes of the library: poles, zeros, the minors of Omega = C B, D as published and what gives D = I."""
-    facts = library()
+def airframes(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[AIRFRAME]...", help="Names, or airframe files (.yaml); by default the library."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
+) -> None:
+    """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
+
+    Exit status: 0, or 2 for a file with a mistake.
+    """
+    facts = [airframe_facts(name) for name in names] if names else library()
     if as_json:
         print_json([_as_json(airframe) for airframe in facts])
         return
@@ -42,9 +51,10 @@ def airframes(as_json: Annotated[bool, typer.Option("--json", help="Print the fa
     console.print(roots)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
     console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)
-    integrated = ", ".join(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
+    integrated = list(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
     if integrated:
-        console.print(f"marginal: {integrated} integrate the outputs and need an outer loop.", soft_wrap=True)
+        verbs = "integrates the outputs and needs" if len(integrated) == 1 else "integrate the outputs and need"
+        console.print(f"marginal: {', '.join(integrated)} {verbs} an outer loop.", soft_wrap=True)
 
 
 def _table(title: str, *headings: str) -> Table:
@@ -58,7 +68,7 @@ def _format_roots(roots: ComplexArray) -> str:
         real, imaginary = (0.0 if abs(part) < 1e-6 else float(part) for part in (root.real, root.imag))
         if imaginary >= 0.0:
             shown.append(f"{real:.3g}" + (f"+-{imaginary:.3g}j" if imaginary else ""))
-    return "  ".join(shown)
+    return "  ".join(shown) or "none"
 
 
 def _as_json(one: AirframeFacts) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
-from flight_core.units import SI_PER_UNIT
+from flight_core.units import si_per_unit
 from flight_log.tape_reader import read_run
 from rise_di.gain_design import observed
 from rise_di_controller.params import ControllerConfig
@@ -280,7 +280,7 @@ def _show_model(console: Console, found: Identification) -> None:
 
 
 def _units(found: Identification) -> dict[str, DisplayUnit]:
-    units = {name: found.airframe.states[name] for name in found.airframe.outputs}
+    units = found.airframe.units_of_outputs()
     return {name: display_unit(unit) for name, unit in units.items()}
 
 
@@ -320,7 +320,7 @@ def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
 def _show(console: Console, found: IdentifiedAircraft) -> None:
     trim, steps = found.trim, found.responses
     states = dict(zip(STATES, trim.states, strict=True))
-    degrees = {name: states[name] / SI_PER_UNIT["deg"] for name in ("alpha", "beta", "phi")}
+    degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     console.print(
         f"{found.condition.title} in trim: V {states['V']:.4g} m/s, altitude {states['altitude']:.5g} m, "
         + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())

@@ -2,24 +2,102 @@
 # SPDX-License-Identifier: Apache-2.0
 """Units of airframe files. Values are converted to SI once, at load; the code uses SI and radians."""
 
-import math
+import re
 from collections.abc import Mapping
+from functools import lru_cache
+from math import pi
 from types import MappingProxyType
+from typing import NamedTuple
+
+from flight_core.parameters import ParameterError, one_of
 
 GRAVITY = 9.81  # standard gravity as rounded in the airframes, m/s^2
+FOOT = 0.3048  # m, exact: the international foot of 1959
+POUND = 0.45359237  # kg, exact: the international pound of 1959
+POUND_FORCE = POUND * 9.80665  # N
 
-SI_PER_UNIT: Mapping[str, float] = MappingProxyType(
+
+class Quantity(NamedTuple):
+    """A unit: the SI value of 1, and the exponents of angle, length, time and mass."""
+
+    si: float
+    angle: int = 0
+    length: int = 0
+    time: int = 0
+    mass: int = 0
+
+    @property
+    def dimension(self) -> tuple[int, int, int, int]:
+        """Exponents of angle, length, time and mass."""
+        return self[1:]
+
+
+ANGLE, LENGTH, SPEED, ANGULAR_RATE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 1, -1, 0), (1, 0, -1, 0)
+
+BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
     {
-        "rad": 1.0,
-        "deg": math.pi / 180.0,
-        "crad": 0.01,
-        "rad/s": 1.0,
-        "deg/s": math.pi / 180.0,
-        "crad/s": 0.01,
-        "m/s": 1.0,
-        "ft/s": 0.3048,  # exact: the international foot of 1959
-        "1": 1.0,
-        "%": 0.01,
+        "1": Quantity(1.0),
+        "%": Quantity(0.01),
+        "rad": Quantity(1.0, angle=1),
+        "deg": Quantity(pi / 180.0, angle=1),
+        "crad": Quantity(0.01, angle=1),
+        "mrad": Quantity(0.001, angle=1),
+        "m": Quantity(1.0, length=1),
+        "km": Quantity(1000.0, length=1),
+        "ft": Quantity(FOOT, length=1),
+        "in": Quantity(FOOT / 12.0, length=1),
+        "mi": Quantity(5280.0 * FOOT, length=1),
+        "nmi": Quantity(1852.0, length=1),
+        "s": Quantity(1.0, time=1),
+        "min": Quantity(60.0, time=1),
+        "h": Quantity(3600.0, time=1),
+        "kt": Quantity(1852.0 / 3600.0, length=1, time=-1),
+        "mph": Quantity(5280.0 * FOOT / 3600.0, length=1, time=-1),
+        "kg": Quantity(1.0, mass=1),
+        "lb": Quantity(POUND, mass=1),
+        "slug": Quantity(POUND_FORCE / FOOT, mass=1),
+        "N": Quantity(1.0, length=1, time=-2, mass=1),
+        "kN": Quantity(1000.0, length=1, time=-2, mass=1),
+        "lbf": Quantity(POUND_FORCE, length=1, time=-2, mass=1),
     }
 )
-"""SI value (rad, rad/s, m/s, 1) of a unit: value_SI = value * SI_PER_UNIT[unit]."""
+"""The units by name. Products, quotients and powers of these are units too: ft/s^2, slug*ft^2, deg/s.
+
+Source: B. N. Taylor, A. Thompson, Guide for the Use of the International System of Units, NIST SP 811, 2008, appendix B.
+"""
+
+
+@lru_cache(maxsize=256)
+def quantity(unit: str, key: str = "unit") -> Quantity:
+    """The SI value and the dimension of a unit, such as "ft/s^2". Raises ParameterError with `key` for an unknown unit."""
+    total = Quantity(1.0)
+    for part in re.findall(r"[*/]?[^*/]*", unit)[:-1] or [""]:
+        read = re.fullmatch(r"[*/]?([^^]*)(?:\^(-?[1-9]))?", part)
+        name, power = read.groups() if read else (part, None)
+        if name not in BASE_UNITS:
+            known = f"{one_of(tuple(BASE_UNITS), name)}, or a product such as ft/s^2"
+            raise ParameterError(f"{key}: found {unit!r}, expected {known}")
+        exponent = (-1 if part.startswith("/") else 1) * int(power or 1)
+        base = BASE_UNITS[name]
+        si = total.si / base.si**-exponent if exponent < 0 else total.si * base.si**exponent
+        total = Quantity(si, *(a + exponent * b for a, b in zip(total.dimension, base.dimension, strict=True)))
+    return total
+
+
+def si_per_unit(unit: str) -> float:
+    """SI value of 1 of a unit, the factor of a value in that unit. Raises ParameterError for an unknown unit."""
+    return quantity(unit).si
+
+
+def in_si(value: str | float, key: str, like: str) -> float:
+    """A number of SI, or a text of a number with a unit ("176 ft/s"), in SI; `like`: an SI unit of the same dimension.
+
+    Raises ParameterError for a text without a finite number, an unknown unit, and a unit of a different dimension.
+    """
+    parsed = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip())
+    if parsed is None:
+        raise ParameterError(f"{key}: found {value!r}, expected a number in {like}, or with a unit")
+    given = quantity(parsed[2] or like, key)
+    if given.dimension != quantity(like).dimension:
+        raise ParameterError(f"{key}: found {value!r}, expected a unit like {like}")
+    return float(parsed[1]) * given.si

@@ -179,7 +179,9 @@ def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, marg
     """
     noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
     by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
-    perfect = sizes(model.states[name] for name in controller.outputs) / 100.0  # noise in place of none, of a perfect sensor
+    perfect = (
+        sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
+    )  # noise in place of none, of a perfect sensor
     noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
     nominal = model_for(model, controller, noise)
     tuned = _tuned_scenario(scenario)

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eig, eigvals
+from scipy.linalg import eig, eigvals, qr
 
 from aircraft_sim.airframe import Airframe, airframes, load_airframe
 from flight_core.arguments import FilePath
+from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, Pairing, coupling, leading_minors, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
@@ -82,7 +83,7 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     """
     airframe = load_airframe(airframe)
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
-    Omega, hidden = C @ B, np.logical_not(C.any(axis=0))
+    Omega, hidden, (_, unseen, _) = C @ B, np.logical_not(C.any(axis=0)), output_coordinates(C)
     zeros = invariant_zeros(A, B, C)
     try:
         D, largest = signs(Omega), coupling(Omega)
@@ -104,7 +105,7 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
         zero_dynamics=zero_dynamics(zeros),
         controllable=controllable(A, B),
         integrated=tuple(
-            state for i, state in enumerate(airframe.states) if hidden[i] and not B[i].any() and not A[i, hidden].any()
+            state for i, state in enumerate(airframe.states) if hidden[i] and not B[i].any() and not (A[i] @ unseen).any()
         ),
     )
 
@@ -126,6 +127,22 @@ def invariant_zeros(A: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray
     numerators, denominators = eig(pencil, weights, right=False, homogeneous_eigvals=True)
     finite = np.abs(numerators) < MAX_FINITE_ZERO * np.abs(denominators)
     return np.sort_complex(numerators[finite] / denominators[finite])
+
+
+def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """P (n, m), N (n, n - m) and H (n, n - m) with x = P y + N eta, eta = H' x: the outputs, and n - m states beside them.
+
+    C (m, n) of full rank, else ParameterError. The states of eta are those that C contains least, by a QR decomposition with
+    pivoting. C that selects states gives P = C', N = H.
+    """
+    m, n = C.shape
+    _, R, pivots = qr(C, pivoting=True)
+    require(
+        abs(R[-1, m - 1]) > RANK_TOLERANCE * abs(R[0, 0]), "C", "rows that depend on each other", f"{m} independent outputs"
+    )
+    H = np.eye(n)[:, np.sort(pivots[m:])]
+    inverse = np.asarray(np.linalg.inv(np.vstack([C, H.T])))
+    return inverse[:, :m], inverse[:, m:], H
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:

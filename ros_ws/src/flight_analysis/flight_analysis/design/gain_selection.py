@@ -31,7 +31,7 @@ from flight_analysis.closed_loop.margins import (
 )
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_conditions
-from flight_analysis.design.airframe_properties import invariant_zeros
+from flight_analysis.design.airframe_properties import invariant_zeros, output_coordinates
 from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix
 from flight_core.arguments import as_instance
@@ -194,7 +194,7 @@ def study_airframe(
 ) -> Study:
     """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
 
-    The ideal control keeps y on y_m. With x = C' y_m + H eta, eta the states that are not outputs:
+    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs (`output_coordinates`):
 
         eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
         u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
@@ -212,7 +212,7 @@ def study_airframe(
     A, B = np.concatenate([A, A[:1]]), np.concatenate([B, B[:1]])
     aircraft = _columns(airframe, manoeuvre.gusts, len(A))
     C, n, m = airframe.matrix_c(), len(airframe.states), len(airframe.outputs)
-    H = np.eye(n)[:, ~C.any(axis=0)]
+    of_y, of_eta, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
     require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
     inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
@@ -224,7 +224,7 @@ def study_airframe(
         return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
 
     def state(k: int, eta: FloatArray) -> FloatArray:
-        return np.asarray((C.T @ y_m[k])[:, None] + H @ eta)
+        return np.asarray((of_y @ y_m[k])[:, None] + of_eta @ eta)
 
     def drift(t: Any, x: FloatArray) -> FloatArray:
         return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
@@ -393,6 +393,10 @@ def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
     lead = lag + delay + half a period, of the controller. Raises ParameterError for an airframe that cannot be the
     model, such as one with a zero in the right half plane.
     """
+    for name in controller.outputs:
+        require(
+            name in airframe.states, "feedforward", f"the output {name}, a row of C", "outputs that are states of its model"
+        )
     _, columns = law_order(airframe, controller)
     gravity = airframe.matrix_gravity()
     model = FeedforwardConfig(

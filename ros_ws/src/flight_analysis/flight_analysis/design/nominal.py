@@ -9,16 +9,17 @@ import numpy as np
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.uncertainty import KINEMATIC
 from control_laws.nominal_model import NominalModel
+from flight_core.units import LENGTH, SPEED, quantity
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import Loop
 
-SPEED_SIZE, ANGLE_SIZE = 1.0, 0.1  # m/s, rad (/s): the units of states in weights, "sizes"
-SPEED_UNITS = frozenset({"m/s", "ft/s"})
+SIZES = {SPEED: 1.0, LENGTH: 1.0}  # m/s, m: the units of states in weights, "sizes"
+ANGLE_SIZE = 0.1  # rad (/s), and of states without a dimension
 
 
 def sizes(units: Iterable[str]) -> FloatArray:
     """Sizes of values with these units."""
-    return np.array([SPEED_SIZE if unit in SPEED_UNITS else ANGLE_SIZE for unit in units])
+    return np.array([SIZES.get(quantity(unit).dimension, ANGLE_SIZE) for unit in units])
 
 
 def nominal_model(

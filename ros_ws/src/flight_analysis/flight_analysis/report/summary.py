@@ -32,7 +32,7 @@ from flight_analysis.report.guided import UNITS, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
-from flight_core.units import SI_PER_UNIT
+from flight_core.units import si_per_unit
 
 NO_VALUE = "-"
 OLD_ORDER = "summarise(scenario, tape, outcome): the order is summarise(tape, scenario, outcome), and summarise(tape) is enough"
@@ -62,7 +62,7 @@ def channel_label(name: str, units: Mapping[str, DisplayUnit]) -> str:
 
 def display_unit(unit: str) -> DisplayUnit:
     """The display unit of a unit of the airframe file: mrad/s for rad/s, otherwise the same unit."""
-    return DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / SI_PER_UNIT[unit])
+    return DisplayUnit("mrad/s", 1e3) if unit == "rad/s" else DisplayUnit(unit, 1.0 / si_per_unit(unit))
 
 
 def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:

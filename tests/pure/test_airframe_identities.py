@@ -1,0 +1,260 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Units, output matrix and identities of an airframe file, against published factors, python-control and wrong files."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from aircraft_sim.airframe import Airframe, airframes, check_identities, load_airframe
+from flight_analysis.design.airframe_properties import airframe_facts, output_coordinates
+from flight_core.parameters import ParameterError
+from flight_core.units import in_si, quantity, si_per_unit
+
+NAVION: dict[str, Any] = {
+    "name": "plane",
+    "source": "R. C. Nelson, Flight Stability and Automatic Control, 2nd ed. (1998), p. 158, in SI",
+    "speed": 53.64,
+    "states": {"V": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
+    "inputs": {"elevator": {"unit": "rad", "positive": "nose down"}, "thrust": {"unit": "1", "positive": "more thrust"}},
+    "outputs": ["q", "V"],
+    "A": [[-0.045, 0.036, 0.0, -9.81], [-0.369, -2.02, 53.64, 0.0], [0.0062, -0.130, -2.948, 0.0], [0.0, 0.0, 1.0, 0.0]],
+    "B": [[0.0, 9.81], [-8.586, 0.0], [-11.044, 0.0], [0.0, 0.0]],
+}
+F4C: dict[str, Any] = {
+    "name": "f4c",
+    "source": "lateral F-4C of M. V. Cook, Flight Dynamics Principles, example 4.3",
+    "speed": 178.0,
+    "states": {"v": "m/s", "p": "rad/s", "r": "rad/s", "phi": "rad", "psi": "rad"},
+    "inputs": {"aileron": {"unit": "rad", "positive": "roll right"}, "rudder": {"unit": "rad", "positive": "nose left"}},
+    "outputs": ["p", "r"],
+    "A": [
+        [-0.0565, 29.072, -175.610, 9.6783, 0.0],
+        [-0.0601, -0.7979, 0.2996, 0.0, 0.0],
+        [0.0093, -0.0179, -0.1339, 0.0, 0.0],
+        [0.0, 1.0, 0.1655, 0.0, 0.0],
+        [0.0, 0.0, 1.0136, 0.0, 0.0],
+    ],
+    "B": [[-0.2678, 2.0092], [4.6982, 0.7703], [0.0887, -1.3575], [0.0, 0.0], [0.0, 0.0]],
+}
+
+
+def airframe(values: Mapping[str, Any]) -> Airframe:
+    """An airframe, checked as a file is."""
+    checked = Airframe.validate_mapping(values, "airframe plane")
+    check_identities(checked)
+    return checked
+
+
+def exchanged(key: str, i: int, j: int, axis: int = 0) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """A change that exchanges two rows or columns of a matrix."""
+
+    def change(values: Mapping[str, Any]) -> dict[str, Any]:
+        matrix = np.array(values[key])
+        order = np.arange(matrix.shape[axis])
+        order[[i, j]] = j, i
+        return {key: np.take(matrix, order, axis).tolist()}
+
+    return change
+
+
+def scaled(key: str, i: int, j: int, factor: float) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """A change that multiplies an entry of a matrix."""
+
+    def change(values: Mapping[str, Any]) -> dict[str, Any]:
+        matrix = np.array(values[key])
+        matrix[i, j] *= factor
+        return {key: matrix.tolist()}
+
+    return change
+
+
+def states(**units: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
+    """A change of units of states."""
+    return lambda values: {"states": values["states"] | units}
+
+
+WRONG: dict[str, tuple[dict[str, Any], Callable[[Mapping[str, Any]], dict[str, Any]], tuple[str, ...]]] = {
+    "transposed": (NAVION, lambda v: {"A": np.transpose(v["A"]).tolist()}, ("A is transposed",)),
+    "rows of A": (NAVION, exchanged("A", 1, 2), ("rows of A", "V, q, w, theta")),
+    "columns of A": (NAVION, exchanged("A", 0, 3, 1), ("columns of A", "theta, w, q, V")),
+    "rows of B": (NAVION, exchanged("B", 2, 3), ("rows of B", "A and B need one order")),
+    "columns of B": (NAVION, exchanged("B", 0, 1, 1), ("columns of B", "thrust, elevator")),
+    "order of states": (NAVION, lambda v: {"states": dict([*v["states"].items()][::-1])}, ("name the states so", "V, w, q")),
+    "no kinematics": (NAVION, scaled("A", 3, 2, 0.0), ("theta_dot = 0 q", "expected 1")),
+    "sign of gravity": (NAVION, scaled("A", 0, 3, -1.0), ("V_dot = 9.81 theta", "sign is reversed")),
+    "g in ft/s^2": (NAVION, scaled("A", 0, 3, 3.28084), ("expected -g = -9.81", "feet and metres")),
+    "no gravity": (NAVION, scaled("A", 0, 3, 0.0), ("V_dot = 0 theta", "missing")),
+    "speed in ft/s": (NAVION, lambda _: {"speed": 176.0}, ("speed", "A fits 53.64 m/s")),
+    "speed in kt": (NAVION, lambda _: {"speed": 104.3}, ("speed", "A fits 53.64 m/s")),
+    "SI declared ft/s": (NAVION, states(V="ft/s", w="ft/s"), ("feet and metres",)),
+    "SI declared kt": (NAVION, states(V="kt", w="kt"), ("knots and m/s",)),
+    "theta in deg": (NAVION, states(theta="deg"), ("degrees and radians",)),
+    "angles in deg": (NAVION, states(theta="deg", q="deg/s"), ("degrees and radians",)),
+    "alpha as w": (NAVION, states(w="rad"), ("states.w: found rad, expected a speed", "alpha perhaps")),
+    "a rate as an angle": (NAVION, states(q="rad"), ("states.q: found rad, expected an angular rate",)),
+    "elevator per rad declared deg": (
+        NAVION,
+        lambda v: {"inputs": v["inputs"] | {"elevator": {"unit": "deg", "positive": "nose down"}}},
+        ("inputs.elevator.unit", "B is per rad, and the unit deg?"),
+    ),
+    "elevator per deg declared rad": (
+        NAVION,
+        lambda v: {"B": (np.array(v["B"]) * [np.pi / 180.0, 1.0]).tolist()},
+        ("inputs.elevator.unit", "B is per deg, and the unit rad?"),
+    ),
+    "sign of the elevator": (NAVION, lambda v: {"B": (np.array(v["B"]) * [-1.0, 1.0]).tolist()}, ("q_dot = 11.04",)),
+    "sign of thrust": (NAVION, scaled("B", 0, 1, -1.0), ("V_dot = -9.81 thrust", "more than 0")),
+    "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]}, ("no input moves theta at once",)),
+    "pitch driven by its rate": (NAVION, scaled("A", 2, 2, -1.0), ("q_dot = 2.948 q", "air damps")),
+    "sign of v and r": (F4C, scaled("A", 0, 2, -1.0), ("v_dot = 175.6 r", "-V0 = -178", "sign is reversed")),
+    "sign of v and phi": (F4C, scaled("A", 0, 3, -1.0), ("v_dot = -9.678 phi", "g = 9.81")),
+    "heading in deg": (F4C, states(psi="deg"), ("psi_dot = 0.01769 r", "degrees and radians")),
+    "beta as v": (F4C, states(v="deg"), ("states.v: found deg", "beta perhaps")),
+    "sign of the rudder": (F4C, lambda v: {"B": (np.array(v["B"]) * [1.0, -1.0]).tolist()}, ("inputs.rudder", "r_dot = 1.357")),
+    "p and r exchanged": (F4C, exchanged("A", 1, 2), ("A:",)),
+    "a state missing": (F4C, lambda v: {"states": {name: v["states"][name] for name in "vpr"}}, ("expected 3 rows of 3",)),
+    "not finite": (F4C, scaled("A", 0, 0, np.nan), ("finite number",)),
+    "B of another shape": (F4C, lambda v: {"B": v["B"][:4]}, ("expected 5 rows of 2",)),
+    "unknown unit": (F4C, states(v="furlong/h"), ("states.v: found 'furlong/h'", "ft/s^2")),
+    "feedthrough": (F4C, lambda _: {"D": [[0.0, 0.0], [0.1, 0.0]]}, ("D: found a feedthrough of 0.1", "take an output")),
+    "output without a unit": (NAVION, lambda _: {"outputs": ["q", "n"], "C": [[0, 0, 1, 0]] * 2}, ("output_units.n",)),
+    "rows of C exchanged": (NAVION, lambda _: {"C": [[1, 0, 0, 0], [0, 0, 1, 0]]}, ("a row of q with V", "the state q alone")),
+    "C of another shape": (NAVION, lambda _: {"C": [[0, 0, 1, 0]]}, ("C: found rows of [4]", "2 rows of 4")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", airframes())
+def test_shipped_airframes_are_not_refused(name: str) -> None:
+    check_identities(load_airframe(name))
+
+
+@pytest.mark.parametrize("values", [NAVION, F4C], ids=["navion", "f4c"])
+def test_textbook_matrices_are_not_refused(values: dict[str, Any]) -> None:
+    assert airframe(values).matrix_a().shape == (len(values["A"]),) * 2
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_wrong_airframe_is_told_in_one_sentence(mistake: str) -> None:
+    values, change, words = WRONG[mistake]
+    with pytest.raises(ParameterError) as refusal:
+        airframe(values | change(values))
+    sentence = str(refusal.value)
+    for word in words:
+        assert word in sentence, sentence
+    assert "\n" not in sentence
+
+
+def test_file_may_differ_on_purpose() -> None:
+    values = NAVION | {"speed": 176.0, "identities": False}
+    assert airframe(values).speed == 176.0
+
+
+def test_multirotor_in_hover_is_not_refused() -> None:
+    """No control surface: the coupling with the speed is absent near hover."""
+    values = {
+        "states": {"q": "rad/s", "w": "m/s", "theta": "rad"},
+        "inputs": {"moment": {"unit": "1", "positive": "nose up"}, "lift": {"unit": "1", "positive": "up"}},
+        "outputs": ["q", "w"],
+        "A": [[-2.0, 0.0, 0.0], [0.0, -0.3, 0.0], [1.0, 0.0, 0.0]],
+        "B": [[80.0, 0.0], [0.0, -20.0], [0.0, 0.0]],
+    }
+    assert airframe({"name": "quad", "source": "made up", "speed": 5.0} | values).name == "quad"
+
+
+def test_height_is_a_state() -> None:
+    """h_dot = V0 (theta - alpha), in ft beside speeds in kt: the units convert at the edge."""
+    kt, ft = 1852.0 / 3600.0, 0.3048
+    V0 = 20.0
+    values = NAVION | {
+        "speed": V0,
+        "states": {"V": "kt", "alpha": "deg", "q": "deg/s", "theta": "deg", "h": "ft"},
+        "A": [
+            [-0.19, 9.4 / kt * np.pi / 180.0, 0.0, -9.81 / kt * np.pi / 180.0, 0.0],
+            [-0.05 * kt * 180.0 / np.pi, -3.0, 0.98, 0.0, 0.0],
+            [0.0, -46.0, -3.6, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0, 0.0],
+            [0.0, -V0 / ft * np.pi / 180.0, 0.0, V0 / ft * np.pi / 180.0, 0.0],
+        ],
+        "B": [[0.0, 12.0 / kt], [-0.2 * 180.0 / np.pi, 0.0], [-60.0 * 180.0 / np.pi, 0.0], [0.0, 0.0], [0.0, 0.0]],
+    }
+    A = airframe(values).matrix_a()
+    expected = [[-0.19, 9.4, 0.0, -9.81, 0.0], [-0.05, -3.0, 0.98, 0.0, 0.0], [0.0, -46.0, -3.6, 0.0, 0.0]]
+    np.testing.assert_allclose(A, [*expected, [0.0, 0.0, 1.0, 0.0, 0.0], [0.0, -V0, 0.0, V0, 0.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        ("ft", 0.3048), ("kt", 0.514444), ("mph", 0.44704), ("km/h", 0.277778), ("nmi", 1852.0), ("slug", 14.5939),
+        ("lb", 0.45359237), ("lbf", 4.448222), ("slug*ft^2", 1.355818), ("slug/ft^3", 515.3788), ("ft/s^2", 0.3048),
+        ("lbf/ft^2", 47.88026), ("deg/s", 0.01745329), ("s^-1", 1.0),
+    ],
+)  # fmt: skip
+def test_factors_are_the_published_ones(unit: str, factor: float) -> None:
+    """NIST SP 811, appendix B.8."""
+    assert si_per_unit(unit) == pytest.approx(factor, rel=2e-6)
+
+
+@pytest.mark.parametrize("unit", ["knots", "ft/sec", "m2", "", "m/", "ft//s", "feet", "m^x", "rad/s/"])
+def test_unknown_unit_is_refused(unit: str) -> None:
+    with pytest.raises(ParameterError, match="or a product such as ft/s"):
+        quantity(unit, "states.V")
+
+
+def test_text_with_a_unit_becomes_si() -> None:
+    assert in_si("176 ft/s", "speed", "m/s") == pytest.approx(53.6448, rel=1e-12)
+    assert in_si(53.6, "speed", "m/s") == 53.6
+    for wrong, like in (("176 ft", "m/s"), ("fast", "m/s"), ("", "kg"), ("3 stone", "kg")):
+        with pytest.raises(ParameterError, match=r"^mass: found"):
+            in_si(wrong, "mass", like)
+
+
+def body_axes(alpha: float = 0.16) -> tuple[dict[str, Any], Airframe]:
+    """The Navion turned by a trim angle of attack to u, w of body axes, with V = u cos + w sin; and the same in V, w."""
+    sine, cosine = np.sin(alpha), np.cos(alpha)
+    turn = np.eye(4)
+    turn[:2, :2] = [[cosine, -sine], [sine, cosine]]  # u, w of body axes from those of stability axes
+    values = NAVION | {
+        "states": {"u": "m/s", "w": "m/s", "q": "rad/s", "theta": "rad"},
+        "A": (turn @ NAVION["A"] @ turn.T).tolist(),
+        "B": (turn @ NAVION["B"]).tolist(),
+        "C": [[0.0, 0.0, 1.0, 0.0], [cosine, sine, 0.0, 0.0]],
+        "output_units": {"V": "m/s"},
+    }
+    return values, airframe(NAVION)
+
+
+def test_output_of_body_axes_has_the_transfer_function_of_stability_axes() -> None:
+    """python-control: C (s I - A)^-1 B at 1 rad/s, and the invariant zeros."""
+    values, stability = body_axes()
+    body = airframe(values)
+    responses = [
+        control.ss(frame.matrix_a(), frame.matrix_b(), frame.matrix_c(), np.zeros((2, 2)))(1j) for frame in (body, stability)
+    ]
+    np.testing.assert_allclose(responses[0], responses[1], rtol=1e-9)
+    plant = control.ss(body.matrix_a(), body.matrix_b(), body.matrix_c(), np.zeros((2, 2)))
+    facts = airframe_facts(body)
+    np.testing.assert_allclose(facts.zeros, np.sort_complex(control.zeros(plant)), atol=1e-6)
+    assert facts.outputs == ("q", "V")
+    assert facts.integrated == ("theta",)
+
+
+def test_coordinates_of_selected_states_are_the_states() -> None:
+    C = load_airframe("osprey").matrix_c()
+    P, N, H = output_coordinates(C)
+    np.testing.assert_array_equal(P, C.T)
+    np.testing.assert_array_equal(N, H)
+    np.testing.assert_array_equal(H, np.eye(8)[:, ~C.any(axis=0)])
+
+
+def test_coordinates_rebuild_the_state() -> None:
+    C = airframe(body_axes()[0]).matrix_c()
+    P, N, H = output_coordinates(C)
+    x = np.array([1.0, -2.0, 0.3, 0.7])
+    np.testing.assert_allclose(P @ (C @ x) + N @ (H.T @ x), x, rtol=1e-12)
+    with pytest.raises(ParameterError, match="independent outputs"):
+        output_coordinates(np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0]]))
