@@ -91,7 +91,7 @@ def test_route_flown_and_ends_in_orbit() -> None:
 def test_small_corner_flown_with_small_bank() -> None:
     """A corner of half a degree takes a bank of about a degree."""
     # Its arc takes 0.07 s, the bank lags by 1.1 s. With the curvature of the arc all that time the osprey banked by 17 deg.
-    points = {"north": [0.0, 400.0, 900.0], "east": [0.0, 0.0, 5.0], "altitude": [0.0, 0.0, 0.0]}
+    points = {"north": [0.0, 400.0, 900.0, 3000.0], "east": [0.0, 0.0, 5.0, 26.0], "altitude": [0.0] * 4}
     phi, xtrack = channels(simulate(calm(22.0, route=points))["guidance"], "pose.phi", "xtrack")
     assert np.degrees(np.abs(phi).max()) < 2.0  # 0.8 deg; half a degree in the 1.1 s asks for 1.2 deg at most
     assert np.abs(xtrack).max() < 1.0  # 0.4 m, in place of 6.9 m
@@ -171,7 +171,9 @@ def test_shorter_route_replaces_one_on_later_leg(command: dict[str, float]) -> N
         made.take_target(command)
     signal = run(made, 2, 3)
     assert signal["mode.lateral"][0] == (modes.Lateral.HEADING if command else modes.Lateral.ROUTE)
-    assert signal["to_go"][0] == (0.0 if command else pytest.approx(900.0, abs=2.0))  # of the first leg
+    assert signal["to_go"][0] == (
+        0.0 if command else pytest.approx(math.sqrt(900.0**2 - 144.0**2), abs=2.0)
+    )  # of the first leg, a tangent
 
 
 def test_route_replaces_commands_before_engagement() -> None:

@@ -149,7 +149,7 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
     with shown(browser, recorded) as address:
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
         assert titles[:5] == ["q: y over y_m", "p: y over y_m", "r: y over y_m", "V: y over y_m", "q: error e"]
-        assert {"elevator", "wind", "altitude", "ticks: lateness"} <= set(titles)
+        assert {"elevator", "gust", "altitude", "ticks: lateness"} <= set(titles)
         for selector in ("#scene", "#horizon", "#timeline", "#charts canvas"):
             assert colours_of(browser, selector) > 5
         hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")

@@ -46,11 +46,20 @@ class Legs(NamedTuple):
     entry: Array  # curvature of the following leg, 1/m; of the orbit its own
     altitude: Array  # m
     V: Array  # m/s
+    start: Array  # where a line or an arc begins
+    start_course: Array  # rad
+    start_curvature: Array  # 1/m
+    turn: (
+        Array  # the circle onto the leg that the leg itself is: the radius of an arc over the radius of the route; 0 of a line
+    )
+    near: Array  # m, from the end, within which the leg counts as flown
+    from_altitude: Array  # m, of the waypoint that the leg leaves
+    from_V: Array  # m/s
 
 
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=("action", "legs", "Phi", "Gamma", "C", "wind"),
+    data_fields=("action", "legs", "radius", "Phi", "Gamma", "C", "wind"),
     meta_fields=("guidance", "outputs", "states", "speed", "period"),
 )
 @dataclass(frozen=True)
@@ -59,6 +68,7 @@ class Mission:
 
     action: Array  # (T,) of guidance at the ticks: HOLD, ENGAGE or STEP
     legs: Legs
+    radius: Array  # of fillets, joining circles and the last orbit, m
     Phi: Array  # (n, n): x_m a tick later, with u_m held
     Gamma: Array  # (n, m)
     C: Array  # (m, n), rows in the law's order
@@ -85,6 +95,8 @@ class MissionState(NamedTuple):
     climb_c: Array
     V_c: Array
     leg: Array
+    joining: Array
+    air: Array  # (2, N) the estimated wind, as in GuidanceState, m/s
     psi: Array  # rad
     position: Array  # (3, N) north, east, up, relative to the air, m
     psi_dot: Array
@@ -94,6 +106,7 @@ class MissionState(NamedTuple):
     xtrack_squares: Array
     altitude_squares: Array
     phi_max: Array
+    missed: Array  # legs
 
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
@@ -137,12 +150,22 @@ def build(scenario: Scenario, course: Course) -> Mission:
     for _ in range(divide(tick_ns, reference_ns, "reference_model.rate", "a tick")):
         Phi, Gamma = stepper.Phi @ Phi, stepper.Phi @ Gamma + held
     order = [reference.outputs.index(name) for name in names]
-    legs = legs_of(guidance.plan(guidance.waypoints()))
+    route = guidance.plan(guidance.waypoints())
     airframe = aircraft.load()[0]
     states = list(airframe.states)
     places = tuple(states.index(name) if name in states else None for name in POSE_STATES)
     shared = (Phi, Gamma, matrices.C[order], np.array(aircraft.wind))
-    return Mission(action, legs, *shared, params, tuple(names), places, float(airframe.speed), seconds(tick_ns))
+    return Mission(
+        action,
+        legs_of(route),
+        np.array(route.radius),
+        *shared,
+        params,
+        tuple(names),
+        places,
+        float(airframe.speed),
+        seconds(tick_ns),
+    )
 
 
 def legs_of(route: Route) -> Legs:
@@ -152,9 +175,10 @@ def legs_of(route: Route) -> Legs:
         return np.array(chosen, dtype=np.float64).T
 
     legs = route.legs
-    following = [*legs[1:], legs[-1]]
     lines: NDArray[np.bool_] = np.array([isinstance(leg, Line) for leg in legs])
     ends = [leg.end is not None for leg in legs]
+    starts = [route.start(number) for number in range(len(legs))]
+    curvature = np.array([0.0 if isinstance(leg, Line) else 1.0 / leg.radius for leg in legs])
     return Legs(
         lines,
         points([leg.start if isinstance(leg, Line) else leg.centre for leg in legs]),
@@ -163,9 +187,16 @@ def legs_of(route: Route) -> Legs:
         points([leg.end or (0.0, 0.0) for leg in legs]),
         np.array([path.end_course(leg) if leg.end is not None else 0.0 for leg in legs]),
         np.array(ends),
-        np.array([0.0 if isinstance(leg, Line) else 1.0 / leg.radius for leg in following]),
+        np.append(curvature[1:], curvature[-1]),
         np.array(route.altitude),
         np.array(route.V),
+        points([start for start, _ in starts]),
+        np.array([course for _, course in starts]),
+        curvature,
+        np.sign(curvature),
+        np.array([route.near(number) for number in range(len(legs))]),
+        np.array(route.from_altitude),
+        np.array(route.from_V),
     )
 
 
@@ -187,10 +218,12 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
         none,
         jnp.zeros(count, dtype=np.int64),
         none,
+        jnp.zeros((2, count)),
+        none,
         jnp.zeros((3, count)),
         none,
         velocity,
-        *(none,) * 5,
+        *(none,) * 6,
     )
 
 
@@ -210,7 +243,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
     pose, params = _pose(state, x, segment.t, mission), mission.guidance
     y_of = dict(zip(mission.outputs, y, strict=True))
     speed = modes.true_airspeed(y_of["V"], params)
-    position = (pose["north"], pose["east"])
+    position, course = (pose["north"], pose["east"]), jnp.atan2(pose["v_east"], pose["v_north"])
 
     def at(numbers: Array) -> Legs:
         return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], mission.legs)
@@ -221,18 +254,34 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
     def entered(leg: Legs, following: Legs, place: path.Point) -> Array:
         return passed(leg, place) & (following.is_line | ~passed(following, place))
 
-    def fly(before: GuidanceState, number: Array) -> MissionState:
-        leg, following = at(number), at(number + 1)
-        origin = (leg.origin[0], leg.origin[1])
+    def joins(leg: Legs) -> Array:
+        """Side of the circle onto a leg, 0 near the leg."""
+        start = (leg.start[0], leg.start[1])
+        side = path.joining(start, leg.start_course, mission.radius, leg.near, position, course)
+        return jnp.where(leg.has_end, jnp.where(leg.is_line, side, jnp.abs(side) * leg.turn), 0.0)
+
+    def onto(leg: Legs, place: path.Point) -> Array:
+        return path.joined((leg.start[0], leg.start[1]), leg.start_course, leg.near, place, course)
+
+    def fly(before: GuidanceState, number: Array, joining: Array, missed: Array) -> MissionState:
+        leg, following, joins_leg = at(number), at(number + 1), joining != 0.0
+        origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
         line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
-        error = PathError(
-            *(jnp.where(leg.is_line, of_line, of_circle) for of_line, of_circle in zip(line, circle, strict=True))
-        )
-        wanted = modes.follow(error, leg.entry, partial(entered, leg, following), before.slip, pose, speed, params)
-        target = Target(altitude=leg.altitude, V=leg.V)
+        radius = jnp.where(joins_leg, joining, 1.0) * mission.radius
+        way = path.circle_error(path.joining_centre(start, leg.start_course, radius), radius, position)
+        on_leg = [jnp.where(leg.is_line, *pair) for pair in zip(line, circle, strict=True)]
+        error = PathError(*(jnp.where(joins_leg, *pair) for pair in zip(way, on_leg, strict=True)))
+
+        def begins(place: path.Point) -> Array:
+            return jnp.where(joins_leg, onto(leg, place), entered(leg, following, place))
+
+        entry = jnp.where(joins_leg, leg.start_curvature, leg.entry)
+        wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
+        altitude = jnp.where(joins_leg, leg.from_altitude, leg.altitude)
+        target = Target(altitude=altitude, V=jnp.where(joins_leg, leg.from_V, leg.V))
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
-        off = pose["altitude"] - leg.altitude
+        off, counts = pose["altitude"] - altitude, leg.has_end & ~joins_leg
         return state._replace(
             u_m=jnp.stack(after.u_m),
             alpha=after.alpha,
@@ -241,15 +290,18 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             climb_c=after.climb_c,
             V_c=after.V_c,
             leg=number,
-            samples=state.samples + leg.has_end,
-            xtrack_max=jnp.maximum(state.xtrack_max, jnp.where(leg.has_end, jnp.abs(error.e), 0.0)),
-            xtrack_squares=state.xtrack_squares + jnp.where(leg.has_end, error.e**2, 0.0),
-            altitude_squares=state.altitude_squares + jnp.where(leg.has_end, off**2, 0.0),
+            joining=joining,
+            air=jnp.stack(after.wind),
+            samples=state.samples + counts,
+            xtrack_max=jnp.maximum(state.xtrack_max, jnp.where(counts, jnp.abs(error.e), 0.0)),
+            xtrack_squares=state.xtrack_squares + jnp.where(counts, error.e**2, 0.0),
+            altitude_squares=state.altitude_squares + jnp.where(counts, off**2, 0.0),
             phi_max=jnp.maximum(state.phi_max, jnp.abs(pose["phi"])),
+            missed=state.missed + missed,
         )
 
     def begin() -> MissionState:
-        return fly(modes.holding(0, pose, speed, params), 0 * state.leg)
+        return fly(modes.holding(0, pose, speed, params), 0 * state.leg, joins(at(0 * state.leg)), 0.0 * state.missed)
 
     def step() -> MissionState:
         before = modes.holding(0, pose, speed, params)._replace(
@@ -259,8 +311,14 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             climb_c=state.climb_c,
             V_c=state.V_c,
             u_m=tuple(state.u_m),
+            wind=(state.air[0], state.air[1]),
         )
-        return fly(before, jnp.where(passed(at(state.leg), position), state.leg + 1, state.leg))
+        leg, joins_leg = at(state.leg), state.joining != 0.0
+        ends = passed(leg, position) & ~joins_leg
+        missed = ends & (jnp.hypot(position[0] - leg.end[0], position[1] - leg.end[1]) > leg.near)
+        number = jnp.where(ends, state.leg + 1, state.leg)
+        still = jnp.where(joins_leg & ~onto(leg, position), state.joining, 0.0)
+        return fly(before, number, jnp.where(missed, joins(at(number)), still), missed)
 
     return jax.lax.switch(action, (lambda: state, begin, step))
 
@@ -310,4 +368,5 @@ def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
         "rms.xtrack": jnp.sqrt(state.xtrack_squares / samples),
         "rms.altitude": jnp.sqrt(state.altitude_squares / samples),
         "max.phi": state.phi_max,
+        "missed": state.missed,
     }

@@ -13,6 +13,9 @@ from flight_guidance.modes import LARGEST
 from flight_guidance.path import Leg, Line
 from flight_guidance.route_file import Waypoint
 
+HEADWIND = 1.2
+"""Least ratio of the airspeed to the wind: against the wind the aircraft still goes ahead by a sixth of the airspeed."""
+
 
 class Performance(NamedTuple):
     """Performance of the aircraft, and the largest wind."""
@@ -38,9 +41,10 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Raises ParameterError for a waypoint not finite or beyond LARGEST, a speed below the floor, a period below the rule, a
-    radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for the fillets, and an altitude out of reach of the climb or
-    sink along the straight part of the leg, with the wind from behind. phi_max is the largest bank at V for the stall speed.
+    Raises ParameterError for a waypoint not finite or beyond LARGEST, a speed below the floor or not above HEADWIND times the
+    wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for the fillets, and an
+    altitude out of reach of the climb or sink along the straight part of the leg, with the wind from behind. phi_max is the
+    largest bank at V for the stall speed.
     """
     for k, (north, east, altitude, _) in enumerate(waypoints):
         known = all(abs(value) <= LARGEST for value in (north, east, altitude))
@@ -49,6 +53,9 @@ def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, ca
     floor, flown = protection.speed_floor(can.stall_speed), speeds(waypoints, can.speed)
     for k, speed in enumerate(flown):
         require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
+        expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
+        found = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
+        require(speed > HEADWIND * can.wind, f"route[{k}].V", found, expected)
     least, slowest = 0.0, 0.0
     for speed in flown:
         bank = protection.bank_limit(can.bank, can.stall_speed, speed)

@@ -15,7 +15,7 @@ import numpy as np
 from flight_core.channels import POSE
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
-from flight_guidance import modes
+from flight_guidance import modes, path
 from flight_guidance.modes import (
     TARGETS,
     Begin,
@@ -29,10 +29,11 @@ from flight_guidance.modes import (
     Vertical,
 )
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.path import Route
+from flight_guidance.path import Line, Route
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
+WIND = ("north", "east")
 
 
 class GuidanceOutput(NamedTuple):
@@ -40,17 +41,20 @@ class GuidanceOutput(NamedTuple):
 
     u_m: FloatArray  # the commands in the order of the parameters' outputs, then ATTITUDE
     log: FloatArray  # in the order of `names`
+    notices: tuple[str, ...] = ()
 
 
 def names(outputs: Sequence[str]) -> tuple[str, ...]:
     """Channels of the log."""
     return (
         *("mode", "mode.lateral", "mode.vertical", "leg", "route", "xtrack", "to_go"),
+        *("joining", "track", "missed"),
         *("phi_c", "theta_c", "climb_c", "V_c"),
         *(f"limited.{name}" for name in LIMITED),
         *("age.pose", "begin", "given"),
         *(f"target.{name}" for name in TARGETS),
         *(f"state.{name}" for name in STATE),
+        *(f"wind.{name}" for name in WIND),
         *(f"pose.{name}" for name in POSE),
         *(f"y.{name}" for name in outputs),
         *(f"u_m.{name}" for name in outputs),
@@ -68,11 +72,13 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) ->
     return np.array(
         [
             *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
+            *(state.joining, commands.track, commands.missed),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
             *(seconds(inputs.pose_age_ns), inputs.begin, given),
             *state.target,
             *(getattr(state, name) for name in STATE),
+            *state.wind,
             *inputs.pose,
             *inputs.y,
             *state.u_m,
@@ -107,6 +113,8 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
         logged["climb_c"],
         logged["V_c"],
         group("u_m", outputs),
+        logged["joining"],
+        (logged["wind.north"], logged["wind.east"]),
     )
     return inputs, state
 
@@ -132,6 +140,7 @@ class Guidance:
         self._route_waits = self.route is not None  # no step has flown it yet
         self._state: GuidanceState | None = None
         self._engaged, self._paused, self._begin = True, False, Begin.HOLD
+        self._notices = parameters.notices()
 
     @property
     def mode(self) -> Mode:
@@ -195,13 +204,25 @@ class Guidance:
         return True
 
     def skip(self) -> bool:
-        """Fly the next leg of the route; False while none is flown, and on the last leg."""
+        """Leave the waypoint ahead out and fly to the next waypoint; False while no route is flown, and on the last leg."""
         state, route = self._state, self.route
         if self.mode is not Mode.ENGAGED or state is None or state.lateral is not Lateral.ROUTE or route is None:
             return False
-        if state.leg + 1 >= len(route.legs):
+        later = range(state.leg + 1, len(route.legs))
+        leg = next((k for k in later if isinstance(route.legs[k], Line) or route.legs[k].end is None), None)
+        if leg is None:
             return False
-        self.take_target({"leg": state.leg + 1.0})
+        self.take_target({"leg": float(leg), "along": path.length(route.legs[leg])})
+        return True
+
+    def resume(self) -> bool:
+        """Fly the last leg again from the nearest point; False while the route is flown, and without a route."""
+        state, route = self._state, self.route
+        if self.mode is not Mode.ENGAGED or state is None or state.lateral is Lateral.ROUTE or route is None:
+            return False
+        pose = self.pose()
+        along = path.nearest(route.legs[state.leg], (pose["north"], pose["east"]))
+        self.take_target({"leg": float(state.leg), "along": along})
         return True
 
     def engage(self, *, engaged: bool) -> None:
@@ -256,4 +277,6 @@ class Guidance:
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
         self._begin, self._given, self._route_waits = Begin.NO, {}, False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
-        return GuidanceOutput(u_m(self._state), row(inputs, self._state, commands, self._digest))
+        log = row(inputs, self._state, commands, self._digest)
+        notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))
+        return GuidanceOutput(u_m(self._state), log, tuple(notice.text for notice in notices))

@@ -48,9 +48,11 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
     """Acceleration to the right to follow a path, m/s^2:
 
         x       = min(abs(e) / (v_g P zeta), 1),  look-ahead angle l = pi/2 (1 - x)^2
-        bearing = track - sign(e) min(pi/2 - l, capture)
+        bearing = track - sign(e) min(pi/2 - l, max(capture, acos(1 / max(1 - kappa e, 1))))
         a = (4 pi zeta / P) v_g turn_towards(bearing - course) + sin(l)^2 kappa / (1 - kappa e) v_g^2 cos(course - track)
 
+    Outside a circle of radius R, at the distance d from the centre, 1 - kappa e = d / R: acos(R / d) is the angle between the
+    tangent to the circle and the track, so an aircraft from afar flies along the tangent.
     Near a line e'' + 2 zeta w e' + w^2 e = 0 with w = 2 pi / P. The velocity is over ground, so a wind changes nothing.
     On the inner side of an arc, e is limited to half of the radius.
     Source: PX4-Autopilot, src/lib/npfg/DirectionalGuidance.cpp, without the adaptation to wind.
@@ -59,7 +61,8 @@ def path_acceleration(error: PathError, course: Scalar, ground_speed: Scalar, pa
     xp = array_namespace(e)
     x = xp.minimum(abs(e) / (ground_speed * params.period * params.damping), 1.0)
     look_ahead = math.pi / 2.0 * (1.0 - x) ** 2
-    bearing = track - xp.copysign(xp.minimum(math.pi / 2.0 - look_ahead, params.capture), e)
+    tangent = xp.acos(1.0 / xp.maximum(1.0 - kappa * e, 1.0))
+    bearing = track - xp.copysign(xp.minimum(math.pi / 2.0 - look_ahead, xp.maximum(tangent, params.capture)), e)
     feedback = 4.0 * math.pi * params.damping / params.period * ground_speed * turn_towards(bearing - course)
     bend = kappa / (1.0 - xp.minimum(kappa * e, 0.5))
     return feedback + xp.sin(look_ahead) ** 2 * bend * ground_speed**2 * xp.cos(course - track)
@@ -91,6 +94,11 @@ def least_period(speed: float, bank: float, roll_rate: float) -> float:
     for.
     """
     return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 11.0 * bank / roll_rate)
+
+
+def largest_wind(speed: float, wind: float, bank: float) -> float:
+    """Wind in which a circle of `least_radius` for `wind` takes the whole bank, m/s: (V + W) sqrt(tan(b) / tan(0.8 b)) - V."""
+    return (speed + wind) * math.sqrt(math.tan(bank) / math.tan(0.8 * bank)) - speed
 
 
 def least_radius(speed: float, wind: float, bank: float) -> float:

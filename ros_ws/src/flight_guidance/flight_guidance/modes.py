@@ -24,6 +24,7 @@ from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
 from flight_guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
 from flight_guidance.path import Arc, Leg, Point, Route
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
+from flight_guidance.wind import Wind, wind_estimate, wind_of
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
@@ -71,8 +72,9 @@ class Target(NamedTuple):
     leg: float = 0.0  # number of the leg of the route
     theta: float = 0.0  # rad
     climb: float = 0.0  # m/s
-    altitude: float = 0.0  # m
-    V: float = 0.0  # airspeed, m/s, absolute
+    altitude: Scalar = 0.0  # m
+    V: Scalar = 0.0  # airspeed, m/s, absolute
+    along: float = 0.0  # m along a line of the route from the start, where the aircraft joins the line
 
 
 TARGETS = Target._fields
@@ -81,7 +83,7 @@ LATERAL: Mapping[str, Lateral] = {
     "heading": Lateral.HEADING,
     "course": Lateral.COURSE,
     **dict.fromkeys(("north", "east", "radius"), Lateral.ORBIT),
-    "leg": Lateral.ROUTE,
+    **dict.fromkeys(("leg", "along"), Lateral.ROUTE),
 }
 VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
 
@@ -149,6 +151,8 @@ class GuidanceState(NamedTuple):
     climb_c: float  # m/s
     V_c: float  # m/s
     u_m: tuple[float, ...]
+    joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
 
 
 class Commands(NamedTuple):
@@ -157,7 +161,9 @@ class Commands(NamedTuple):
     phi_c: float = 0.0
     theta_c: float = 0.0
     xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
-    to_go: float = 0.0  # m, to the end of the leg
+    to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
+    track: float = 0.0  # course of the path at the nearest point, rad
+    missed: float = 0.0  # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
     bank_limited: bool = False
     theta_limited: bool = False
     climb_limited: bool = False
@@ -190,11 +196,20 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, route: Rout
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
+    if "along" in values and "leg" not in values:
+        raise ChannelError("name", f"{what}: found along without leg, expected the leg of the route too")
     if "leg" in values and route is None:
         raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
     if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
         expected = f"a whole number from 0 to {len(route.legs) - 1}"
         raise ChannelError("bounds", f"{what}.leg: found {values['leg']:g}, expected {expected}")
+    if (
+        "along" in values
+        and route is not None
+        and not 0.0 <= values["along"] <= (longest := path.length(route.legs[int(values["leg"])]))
+    ):
+        expected = f"0 to {longest:.6g} m, the length of the leg; 0 for an arc"
+        raise ChannelError("bounds", f"{what}.along: found {values['along']:g} m, expected {expected}")
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
@@ -221,6 +236,7 @@ def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: Guidan
         pose["climb"],
         speed,
         (0.0,) * len(params.outputs),
+        wind=_measured_wind(pose, speed),
     )
 
 
@@ -232,7 +248,12 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
     if state is None or inputs.begin is Begin.HOLD:
         return held
     again = held._replace(
-        mode=state.mode, lateral=state.lateral, vertical=state.vertical, target=state.target, leg=state.leg
+        mode=state.mode,
+        lateral=state.lateral,
+        vertical=state.vertical,
+        target=state.target,
+        leg=state.leg,
+        joining=state.joining,
     )  # the mode, since after a lost pose the wings are levelled
     # Up to the age limit of u_m the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
@@ -255,18 +276,20 @@ def step(
 
     1. Attitude: phi and theta of pose. While pose is stale: Euler's kinematics with p, q, r of y (`Mode.DEAD_RECKONING`). After
        `hold` the attitude is unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
-    2. Commands: the next leg at the end of a leg, then the commands given.
+    2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a circle that touches the leg at
+       the start, unless the aircraft is near; a leg whose end the aircraft passes far away is missed.
     3. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
     4. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     state = begin(state, inputs, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
-    state = _with_commands(state, inputs, route)
     pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
+    state, missed = _with_commands(state, inputs.given, pose, route)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
     state, commands = command(state, pose, y, wanted, dt, params)
-    return state._replace(t_ns=inputs.t_ns), commands._replace(xtrack=error, to_go=to_go)
+    commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
+    return state._replace(t_ns=inputs.t_ns), commands
 
 
 def command(
@@ -288,7 +311,7 @@ def command(
         flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
         rolling = abs(y["p"]) / params.attitude.roll_rate
         slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
-        state = state._replace(alpha=alpha, slip=slip)
+        state = state._replace(alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt))
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
@@ -341,58 +364,106 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
     )
 
 
-def _with_commands(state: GuidanceState, inputs: Inputs, route: Route | None) -> GuidanceState:
+def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
+    return wind_of(pose["v_north"], pose["v_east"], pose["climb"], pose["psi"] + pose["beta"], speed)
+
+
+def _with_commands(
+    state: GuidanceState, given: Mapping[str, float], pose: Mapping[str, float], route: Route | None
+) -> tuple[GuidanceState, float]:
     """The modes and commands in force: of the next leg once a leg is passed, then the commands given.
 
-    A lateral command ends the leg: the command may come with a new route, and so with new legs.
+    A lateral command ends the leg: the command may come with a new route, and so with new legs. Returns further the distance
+    from the end of a leg that ends here and is missed, m.
     """
-    position = (inputs.pose[POSE.index("north")], inputs.pose[POSE.index("east")])
-    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & inputs.given.keys()
-    if on_route and route is not None and path.passed(route.legs[state.leg], position):
-        state = _on_leg(state, state.leg + 1, route)
-    if not inputs.given:
-        return state
-    state = state._replace(target=state.target._replace(**inputs.given))
-    for name in inputs.given:
+    missed, on_route = 0.0, state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & given.keys()
+    if on_route and route is not None:
+        state, missed = _along_route(state, pose, route)
+    if not given:
+        return state, missed
+    state = state._replace(target=state.target._replace(**given))
+    for name in given:
         state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
-    if "leg" in inputs.given and route is not None:
-        state = _on_leg(state, int(inputs.given["leg"]), route)
-        state = state._replace(target=state.target._replace(**inputs.given))
-        named = [VERTICAL[name] for name in inputs.given if name in VERTICAL]
+    if "leg" in given and route is not None:
+        state = _joining(state, int(given["leg"]), given.get("along", 0.0), pose, route)
+        state = state._replace(target=state.target._replace(**given))
+        named = [VERTICAL[name] for name in given if name in VERTICAL]
         state = state._replace(vertical=named[0] if named else Vertical.ALTITUDE)
-    return state
+    return state, missed
+
+
+def _along_route(state: GuidanceState, pose: Mapping[str, float], route: Route) -> tuple[GuidanceState, float]:
+    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and the distance missed by, m."""
+    position, leg, near = (pose["north"], pose["east"]), route.legs[state.leg], route.near(state.leg)
+    if state.joining:
+        at, course = route.start(state.leg, state.target.along)
+        if path.joined(at, course, near, position, _over_ground(pose)[0]):
+            state = _on_leg(state, state.leg, route)
+        return state, 0.0
+    if leg.end is None or not path.passed(leg, position):
+        return state, 0.0
+    distance = math.dist(leg.end, position)
+    if distance > near:
+        return _joining(state, state.leg + 1, 0.0, pose, route), distance
+    return _on_leg(state, state.leg + 1, route), 0.0
 
 
 def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
     """The state on a leg of the route, with the leg's altitude and airspeed."""
-    leg = min(leg, len(route.legs) - 1)
-    target = state.target._replace(altitude=route.altitude[leg], V=route.V[leg])
-    return state._replace(leg=leg, target=target, vertical=Vertical.ALTITUDE)
+    target = state.target._replace(altitude=route.altitude[leg], V=route.V[leg], along=0.0)
+    return state._replace(leg=leg, target=target, vertical=Vertical.ALTITUDE, joining=0.0)
+
+
+def _joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route) -> GuidanceState:
+    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg where the point is near."""
+    state, flown = _on_leg(state, leg, route), route.legs[leg]
+    if flown.end is None:  # the law of circles leads to an orbit from afar
+        return state
+    at, course = route.start(leg, along)
+    position = (pose["north"], pose["east"])
+    side = path.joining(at, course, route.radius, route.near(leg), position, _over_ground(pose)[0])
+    if isinstance(flown, Arc) and side:  # the circle of the arc itself
+        side = math.copysign(1.0, flown.radius)
+    if side and not along and route.from_altitude:
+        state = state._replace(target=state.target._replace(altitude=route.from_altitude[leg], V=route.from_V[leg]))
+    return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))
 
 
 def _bank(
     state: GuidanceState, pose: Mapping[str, float], speed: float, route: Route | None, params: GuidanceParams
-) -> tuple[float, float, float]:
-    """Bank asked for by the lateral mode, rad; cross-track error and distance to the end of the leg, m."""
+) -> tuple[float, PathError, float]:
+    """Bank asked for by the lateral mode, rad; error beside the path, and distance to the end of the leg, m."""
+    nowhere = PathError(0.0, 0.0, 0.0)
     if state.mode is not Mode.ENGAGED:
-        return 0.0, 0.0, 0.0
-    target, gamma = state.target, path_angle(pose["climb"], speed)
+        return 0.0, nowhere, 0.0
+    target, gamma, over_ground = state.target, path_angle(pose["climb"], speed), _over_ground(pose)
     if state.lateral is Lateral.PHI:
-        return target.phi, 0.0, 0.0
+        return target.phi, nowhere, 0.0
     if state.lateral is Lateral.HEADING:
-        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, STEEPEST), 0.0, 0.0
+        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, STEEPEST), nowhere, 0.0
     if state.lateral is Lateral.COURSE:
-        return bank_for(course_acceleration(target.course, *_over_ground(pose), params.k_chi), gamma, STEEPEST), 0.0, 0.0
+        return bank_for(course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST), nowhere, 0.0
     leg: Leg = Arc((target.north, target.east), target.radius)
-    following = None
+    following, position = None, (pose["north"], pose["east"])
     if state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
+        if state.joining:
+            at, course = route.start(state.leg, target.along)
+            radius = state.joining * route.radius
+            error = path.circle_error(path.joining_centre(at, course, radius), radius, position)
+            onto = partial(_joins, at, course, route.near(state.leg), over_ground[0])
+            wanted = follow(error, path.error(leg, at).curvature, onto, state.slip, pose, speed, params)
+            return wanted, error, path.joining_length(at, course, radius, position, over_ground[0])
         following = route.legs[state.leg + 1] if leg.end is not None else None
-    position = (pose["north"], pose["east"])
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
     wanted = follow(error, entry, partial(path.entered, leg, following), state.slip, pose, speed, params)
-    return wanted, error.e, path.to_go(leg, position)
+    return wanted, error, path.to_go(leg, position)
+
+
+def _joins(at: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
+    """`path.joined` by the position, for `follow`."""
+    return path.joined(at, course, near, position, flown)
 
 
 def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:

@@ -139,6 +139,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._target.poll(now_ns, MAX_TARGETS)
         self._take_routes()
         output = self._guidance.step(now_ns, t_ns)
+        for notice in () if output is None else output.notices:
+            self.get_logger().warning(notice)
         if (mode := self._guidance.mode) is not self._mode:
             sentence = f"{self._mode.name} -> {mode.name}: {SENTENCES[mode]}"
             if mode is Mode.ENGAGED:

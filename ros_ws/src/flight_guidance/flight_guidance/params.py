@@ -25,8 +25,9 @@ from flight_core.units import GRAVITY
 from flight_guidance import protection
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable_legs, speeds
-from flight_guidance.lateral import PathParams, least_period, least_radius
+from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.modes import TARGETS, GuidanceParams, Limits, read_target
+from flight_guidance.notices import Notices
 from flight_guidance.path import Route, leads
 from flight_guidance.route_file import Waypoint
 from flight_guidance.vertical import VerticalParams, path_lag
@@ -181,6 +182,10 @@ class GuidanceConfig(NodeConfig):
         """Least radius of fillets and orbits, m."""
         return least_radius(self.speed, self.wind, self.bank)
 
+    def notices(self) -> Notices:
+        """What the notices of a flight depend on."""
+        return Notices(self.wind, lambda speed: largest_wind(speed, self.wind, self.bank))
+
     def climb_limits(self) -> tuple[float, float]:
         """Largest climb and sink rate, m/s: 0.4 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0."""
         down, up = self.throttle_authority or (math.inf, math.inf)
@@ -240,7 +245,15 @@ class GuidanceConfig(NodeConfig):
         radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)
         legs = flyable_legs(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
         numbers = leads(legs)
-        return Route(legs, tuple(waypoints[k].altitude for k in numbers), tuple(flown[k] for k in numbers))
+        # Fillets have the altitude of the waypoint that they lead to; a leg leaves the waypoint before.
+        altitude, before = [waypoint.altitude for waypoint in waypoints], [max(k - 1, 0) for k in numbers]
+        return Route(
+            legs,
+            tuple(altitude[k] for k in numbers),
+            tuple(flown[k] for k in numbers),
+            tuple(altitude[k] for k in before),
+            tuple(flown[k] for k in before),
+        )
 
     def program_steps(self) -> list[tuple[float, dict[str, float]]]:
         """The targets of the program by instant, in order: (s, {channel: value})."""

@@ -4,10 +4,11 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.vectors import Scalar, array_namespace
 from flight_guidance.lateral import PathError
 
@@ -15,6 +16,15 @@ Point = tuple[Scalar, Scalar]  # north, east, m
 
 SHARPEST = math.radians(150.0)
 """Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
+
+JOINED = math.radians(30.0)
+"""Largest difference between the course flown and that of a leg where an aircraft leaves the joining circle for the leg."""
+
+OPPOSITE = math.radians(120.0)
+"""Difference of courses beyond which an aircraft near the start of a leg turns onto the leg by the joining circle too."""
+
+SLACK = 0.1
+"""rad. A tangent that touches the joining circle by less beyond the point of the leg needs no further turn of 360 deg."""
 
 SHORTEST = 1e-3
 """m. A fillet with ends nearer to the waypoint is left out: waypoints on a straight line have a fillet by rounding alone."""
@@ -44,6 +54,38 @@ class Route(NamedTuple):
     legs: tuple[Leg, ...]
     altitude: tuple[float, ...]  # m
     V: tuple[float, ...]  # m/s
+    from_altitude: tuple[float, ...] = ()  # m, of the waypoint that the leg leaves
+    from_V: tuple[float, ...] = ()  # m/s, likewise
+
+    @property
+    def radius(self) -> float:
+        """Radius of the last orbit and of the fillets, m."""
+        return abs(self.legs[-1].radius) if isinstance(self.legs[-1], Arc) else 0.0
+
+    def near(self, leg: int) -> float:
+        """Distance from the end of a leg within which the leg counts as flown, m: the radius, at least 1 s of flight."""
+        return max(self.radius, self.V[leg])
+
+    def start(self, leg: int, along: float = 0.0) -> tuple[Point, float]:
+        """The start of a leg, of a line the point at a distance along, m, and the course there, rad; the centre of an orbit."""
+        flown = self.legs[leg]
+        if isinstance(flown, Line):
+            course = course_of(flown.start, flown.end)
+            return _along(flown.start, course, along), course
+        if flown.end is None:
+            return flown.centre, 0.0
+        before = self.legs[leg - 1]  # an arc follows a line
+        return before.end or flown.centre, end_course(before)
+
+
+def length(leg: Leg) -> float:
+    """Length of a line, m; 0 for an arc."""
+    return math.dist(leg.start, leg.end) if isinstance(leg, Line) else 0.0
+
+
+def nearest(leg: Leg, position: Point) -> float:
+    """Distance along a line from the start to the point nearest to a position, m, from 0 to the length; 0 for an arc."""
+    return min(max(length(leg) - to_go(leg, position), 0.0), length(leg)) if isinstance(leg, Line) else 0.0
 
 
 def course_of(start: Point, end: Point) -> float:
@@ -108,6 +150,50 @@ def to_go(leg: Leg, position: Point) -> float:
     return leg.radius * math.remainder(turn, 2.0 * math.pi)
 
 
+# Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point, and round the circle onto it.
+
+
+def joining_centre(at: Point, course: Scalar, radius: Scalar) -> Point:
+    """Centre of the circle that touches a course, rad, at a point; the radius is positive to the right, m."""
+    xp = array_namespace(course)
+    return at[0] - radius * xp.sin(course), at[1] + radius * xp.cos(course)
+
+
+def joining_length(at: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar) -> Scalar:
+    """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
+
+    turn: from the course flown to the tangent; d: distance from the centre of the joining circle; sweep: from the point where
+    the tangent touches the circle to the point of the leg. `flown` and `course` in rad.
+    """
+    xp = array_namespace(radius)
+    centre = joining_centre(at, course, radius)
+    north, east = position[0] - centre[0], position[1] - centre[1]
+    side, R, d = xp.copysign(1.0, radius), abs(radius), xp.hypot(north, east)
+    touch = xp.atan2(east, north) + side * xp.acos(R / xp.maximum(d, R))  # bearing from the centre
+    turn = touch + side * math.pi / 2.0 - flown
+    sweep = (side * (course - touch) - math.pi / 2.0 + SLACK) % (2.0 * math.pi) - SLACK
+    turned = xp.atan2(xp.sin(turn), xp.cos(turn))
+    return R * abs(turned) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
+
+
+def joining(at: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar) -> Scalar:
+    """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the left, 0 needs none.
+
+    None is needed within `near`, m, and within OPPOSITE of the course.
+    """
+    right, left = (joining_length(at, course, side * radius, position, flown) for side in (1.0, -1.0))
+    xp = array_namespace(right)
+    far = (xp.hypot(position[0] - at[0], position[1] - at[1]) > near) | (xp.cos(flown - course) < math.cos(OPPOSITE))
+    return xp.where(far, xp.where(right <= left, 1.0, -1.0), 0.0)
+
+
+def joined(at: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
+    """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the course of the leg."""
+    xp = array_namespace(course)
+    is_near = xp.hypot(position[0] - at[0], position[1] - at[1]) <= near
+    return is_near & beyond(at, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+
+
 def outline(leg: Leg, start: Point) -> list[Point]:
     """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is a full turn."""
     if isinstance(leg, Line):
@@ -137,14 +223,26 @@ def leads(legs: Sequence[Leg]) -> list[int]:
 
 
 def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:
-    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint.
+    """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint, clockwise.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. Raises ParameterError for fewer than two
-    waypoints, a radius below `least` (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for the fillets.
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. The last line touches the orbit; a line too
+    short for a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius below `least`
+    (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for the fillets.
     Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
+    before, last = waypoints[-2:]
+    orbit, distance = Arc(last, radius), math.dist(before, last)
+    if distance > radius:
+        course = course_of(before, last) - math.asin(radius / distance)  # the centre is on the right
+        with suppress(ParameterError):
+            return (*_filleted([*waypoints[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))], radius), orbit)
+    return (*_filleted(waypoints, radius), orbit)
+
+
+def _filleted(waypoints: Sequence[Point], radius: float) -> list[Leg]:
+    """Lines through waypoints, and the fillets in the corners. Raises ParameterError as `route`."""
     turns = [0.0]
     for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), 1):
         turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
@@ -168,7 +266,7 @@ def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg,
             legs.append(Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start))
         else:
             start = there
-    return (*legs, Arc(waypoints[-1], radius))
+    return legs
 
 
 def _along(point: Point, course: float, distance: float) -> Point:

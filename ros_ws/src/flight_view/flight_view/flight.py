@@ -44,7 +44,21 @@ IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from t
 GROUPS = {
     "internals": ("mode", "late", "y", "y_m", "e", "u_free", "u", "limited"),
     "truth": ("actuator", "gust", "x.phi", "x.theta"),
-    "guidance": ("mode", "leg", "xtrack", "to_go", "phi_c", "theta_c", "climb_c", "V_c", "limited", "target"),
+    "guidance": (
+        "mode",
+        "leg",
+        "joining",
+        "missed",
+        "xtrack",
+        "to_go",
+        "phi_c",
+        "theta_c",
+        "climb_c",
+        "V_c",
+        "limited",
+        "target",
+        "wind",
+    ),
 }
 """Channels and groups of channels that are kept; of the other topics all."""
 

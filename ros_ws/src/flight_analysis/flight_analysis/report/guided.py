@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from flight_analysis.metrics import SETTLING_DWELL, error_metrics, settling_time
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from flight_guidance.guidance import WIND
 from flight_guidance.modes import TARGETS, Lateral, Vertical
+from flight_guidance.params import GuidanceConfig
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),
@@ -41,6 +43,17 @@ class Held(NamedTuple):
     settling: float | None  # s from the start of the segment; None: not settled by its end
 
 
+class FlownLeg(NamedTuple):
+    """A leg of a route in the flight."""
+
+    leg: int  # number of the leg, from 0 as in `target`
+    start: float  # s, from then on the aircraft is under way to the leg
+    joined: float | None  # s, from then on the aircraft is on the leg; None: never
+    stop: float  # s
+    result: str  # "flown", "missed", or "not ended": by another command, or by the end of the flight
+    missed: float  # m, distance from the end of a missed leg; else 0
+
+
 class Segment(NamedTuple):
     """A part of the flight with the same modes, commands and leg."""
 
@@ -56,7 +69,8 @@ def segments(tape: Tape) -> list[Segment]:
     """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin a single segment."""
     t, errors = tape.time("guidance"), control_errors(tape)
     log = tape["guidance"]
-    named = ["mode.lateral", "mode.vertical", "leg", *(f"target.{name}" for name in TARGETS)]
+    targets = [name for name in (f"target.{name}" for name in TARGETS) if name in log.names]
+    named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
     changes = np.any(np.diff(np.column_stack([log[name] for name in named]), axis=0) != 0.0, axis=1)
     starts = [0]
     for k in np.flatnonzero(changes) + 1:
@@ -72,6 +86,30 @@ def segments(tape: Tape) -> list[Segment]:
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
         found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
     return found
+
+
+def flown_legs(tape: Tape) -> list[FlownLeg]:
+    """The legs of a guided flight in order, from `guidance`: flown, missed, or not ended.
+
+    Empty for a log of a version without the channels.
+    """
+    t, log = tape.time("guidance"), tape["guidance"]
+    if "missed" not in log.names:
+        return []
+    legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
+    given = log["given"].astype(np.int64) & (1 << TARGETS.index("leg"))  # a leg chosen again begins anew
+    edges = np.flatnonzero((np.diff(legs) != 0.0) | (given[1:] != 0)) + 1
+    flown = []
+    for first, after in zip([0, *edges], [*edges, len(t)], strict=True):
+        if legs[first] < 0.0 or first == after:
+            continue
+        on_leg, ends = np.flatnonzero(log["joining"][first:after] == 0.0), after < len(t) and not given[after]
+        ends = ends and legs[after] == legs[first] + 1.0
+        missed = float(log["missed"][after]) if ends else 0.0
+        result = "not ended" if not ends else "missed" if missed else "flown"
+        joined = float(t[first + on_leg[0]]) if len(on_leg) else None
+        flown.append(FlownLeg(int(legs[first]), float(t[first]), joined, float(t[min(after, len(t) - 1)]), result, missed))
+    return flown
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:
@@ -103,6 +141,15 @@ def _held(quantity: str, t: FloatArray, error: FloatArray) -> Held:
     return Held(quantity, *metrics, beyond, settling_time(t, error, BANDS[quantity], math.inf))
 
 
+def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
+    """The notices of a guided flight with their times."""
+    if section is None or "guidance" not in tape:
+        return []
+    log = tape["guidance"]
+    notices = section.notices().of_log(tape.time("guidance"), {name: log[name] for name in log.names})
+    return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
+
+
 def guidance_summary(tape: Tape) -> dict[str, Any] | None:
     """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without guidance."""
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
@@ -114,10 +161,18 @@ def guidance_summary(tape: Tape) -> dict[str, Any] | None:
             segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
             for segment in segments(tape)
         ],
+        "legs": [leg._asdict() for leg in flown_legs(tape)],
+        "wind": _mean_wind(tape),
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),
         "limited": {name: float(np.mean(limited[name] != 0.0)) for name in limited.names},
     }
+
+
+def _mean_wind(tape: Tape) -> dict[str, float] | None:
+    """Mean of the estimated wind to the north and to the east, m/s; None for a log of a version without the channels."""
+    log = tape["guidance"]
+    return {name: float(np.mean(log[f"wind.{name}"])) for name in WIND} if "wind.north" in log.names else None
 
 
 def _largest(values: NDArray[np.float64]) -> float:

@@ -27,6 +27,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.modes import Lateral, Mode, Vertical
 from flight_guidance.path import Route, route_outline
+from flight_guidance.wind import wind_of
 
 TRACK_POINTS = 2400
 TRACK_HEIGHT = 560  # pixels
@@ -102,10 +103,8 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
     """
     log = tape["guidance"]
-    airspeed, heading = speed + log["y.V"], log["pose.psi"] + log["pose.beta"]
-    level = np.sqrt(np.maximum(airspeed**2 - log["pose.climb"] ** 2, 0.0))
-    through_air = np.column_stack([level * np.cos(heading), level * np.sin(heading)])
-    wind = np.column_stack([log["pose.v_north"], log["pose.v_east"]]) - through_air
+    pose, heading = log.group("pose"), log["pose.psi"] + log["pose.beta"]
+    wind = np.column_stack(wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, speed + log["y.V"]))
     return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
 
 
@@ -146,6 +145,8 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     log = context.tape["guidance"]
     lateral = log["mode.lateral"]
     on_path = np.isin(lateral, [Lateral.ORBIT, Lateral.ROUTE])
+    if "joining" in log.names:  # the way to a leg has no line to be beside
+        on_path &= log["joining"] == 0.0
     if not on_path.any():
         return None
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)

@@ -28,7 +28,7 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
-from flight_analysis.report.guided import UNITS, guidance_summary
+from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
@@ -140,7 +140,7 @@ def summarise(tape: Tape, scenario: Scenario | None = None, outcome: str | None 
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "guidance": guidance_summary(tape),
-        "notes": list(tape.notes),
+        "notes": [*tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
 

@@ -73,7 +73,7 @@ export function chartsOf(flight, ghost) {
   const winds = flight.get("truth")?.group("gust") ?? [];
   if (winds.length) {
     const colours = ["--plant", "--ghost", "--error"];
-    charts.push({title: "wind", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
+    charts.push({title: "gust", unit: "m/s", lines: winds.map((name, k) => line("truth", `gust.${name}`, name, colours[k % 3], 1.2))});
   }
   if (flight.get("pose")?.channels.includes("altitude")) {
     const lines = [line("pose", "altitude", "altitude", "--plant", 1.4)];
@@ -96,6 +96,10 @@ function guidanceCharts(flight, line) { // attitude over its command, and the di
     const lines = [line("guidance", `${name}_c`, "command", "--reference", 4, {factor: degrees})];
     if (flight.get("pose")?.channels.includes(name)) lines.push(line("pose", name, name, "--plant", 1.4, {factor: degrees}));
     charts.push({title: `${name} over its command`, unit: "deg", lines});
+  }
+  if (guidance.channels.includes("wind.north")) {
+    const lines = [line("guidance", "wind.north", "to the north", "--plant", 1.4), line("guidance", "wind.east", "to the east", "--error", 1.4)];
+    charts.push({title: "wind, estimated", unit: "m/s", lines});
   }
   if (guidance.channels.includes("xtrack")) charts.push({title: "cross-track", unit: "m", lines: [line("guidance", "xtrack", "cross-track", "--error", 1.2)]});
   return charts;

@@ -243,6 +243,11 @@ function drawReadouts() {
     const value = guidance.at(name, clock.t);
     values[label] = flight.info.modes[name]?.[value] ?? shown(value, name === "leg" ? 0 : 1, name === "leg" ? "" : "m");
   }
+  const toNorth = guidance?.at("wind.north", clock.t), toEast = guidance?.at("wind.east", clock.t);
+  if (Number.isFinite(toNorth) && Number.isFinite(toEast)) { // as a pilot reads a wind: where the air comes from
+    const from = String((Math.round(Math.atan2(-toEast, -toNorth) * degrees) + 360) % 360).padStart(3, "0");
+    values.wind = `${Math.hypot(toNorth, toEast).toFixed(1)} m/s from ${from} deg`;
+  }
   const node = $("readouts"), names = Object.keys(values);
   if (node.children.length !== 2 * names.length) {
     node.replaceChildren(...names.flatMap(name => [Object.assign(document.createElement("dt"), {textContent: name}), document.createElement("dd")]));

@@ -299,7 +299,7 @@ export class Scene {
     ctx.fillStyle = colour("--bad");
     ctx.font = "12px system-ui, sans-serif";
     ctx.textAlign = "center";
-    ctx.fillText(`wind ${Math.hypot(...gust).toFixed(1)} m/s`, at[0], at[1] - 6);
+    ctx.fillText(`gust ${Math.hypot(...gust).toFixed(1)} m/s`, at[0], at[1] - 6);
   }
 }
 

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Notices of guidance: a missed leg, a ground speed along the leg below 0, a wind far from `guidance.wind`.
+
+The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from flight_core.vectors import Array, Scalar, array_namespace
+from flight_guidance.modes import Lateral
+
+DWELL = 10.0
+"""Time for which a condition lasts before the notice, and ends before a second notice, s."""
+
+
+class Notice(NamedTuple):
+    """A sentence and the flight time."""
+
+    t: float  # s
+    text: str
+
+
+def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
+    """Whether an aircraft that flies ahead along a path through the air goes back along the path over ground.
+
+    `log`: channels of `guidance`, values or arrays.
+    """
+    track, lateral = log["track"], log["mode.lateral"]
+    xp = array_namespace(track)
+    along, wind = (
+        log[north] * xp.cos(track) + log[east] * xp.sin(track)
+        for north, east in (("pose.v_north", "pose.v_east"), ("wind.north", "wind.east"))
+    )
+    on_path = (lateral == float(Lateral.ROUTE)) | (lateral == float(Lateral.ORBIT))
+    return on_path & (along < 0.0) & (along > wind)
+
+
+class _Lasting:
+    """Whether a condition has lasted for DWELL; due once, and again after the condition has been away for DWELL."""
+
+    def __init__(self) -> None:
+        self._holds, self._since, self._said = False, -math.inf, False
+
+    def due(self, t: float, *, holds: bool) -> bool:
+        """Whether a notice is due at the flight time t, s."""
+        if holds != self._holds:
+            self._holds, self._since = holds, t
+        if t - self._since < DWELL:
+            return False
+        before, self._said = self._said, holds
+        return holds and not before
+
+
+class Notices:
+    """The notices of a flight, sample by sample of the log of guidance.
+
+    `wind`: guidance.wind, m/s; `largest_wind`: of the airspeed command, m/s, the wind up to which circles fit into the bank.
+    """
+
+    CHANNELS = ("leg", "missed", "mode.lateral", "track", "V_c", "pose.v_north", "pose.v_east", "wind.north", "wind.east")
+
+    def __init__(self, wind: float, largest_wind: Callable[[float], float]) -> None:
+        self._wind, self._largest_wind = wind, largest_wind
+        self._blown, self._strong, self._leg = _Lasting(), _Lasting(), 0
+
+    def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
+        """The notices of a sample at the flight time t, s, from the CHANNELS of the log."""
+        before, self._leg, texts = self._leg, int(log["leg"]), []
+        if log["missed"] > 0.0:
+            texts.append(f"leg {before} missed by {log['missed']:.0f} m")
+        wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
+        if self._blown.due(t, holds=bool(is_blown_back(log))):
+            texts.append(f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of {wind:.1f} m/s")
+        if self._strong.due(t, holds=wind > largest):
+            beyond = f"above {largest:.1f} m/s circles of the least radius take more than the largest bank"
+            texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {beyond}")
+        return [Notice(t, text) for text in texts]
+
+    def of_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
+        """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""
+        if not has_channels([*log]):
+            return []
+        columns = [log[name].tolist() for name in self.CHANNELS]
+        samples = (dict(zip(self.CHANNELS, row, strict=True)) for row in zip(*columns, strict=True))
+        return [notice for at, sample in zip(t.tolist(), samples, strict=True) for notice in self.take(at, sample)]
+
+
+def has_channels(names: Sequence[str]) -> bool:
+    """Whether a log of guidance has the channels of the notices."""
+    return set(Notices.CHANNELS) <= set(names)

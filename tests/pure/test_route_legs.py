@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Legs of a route are flown or said to be missed: joining circles, tangents, the wind, against closed forms of geometry."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+
+from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import ChannelError, StampedVector
+from flight_guidance import guidance, path
+from flight_guidance.guidance import Guidance
+from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
+from flight_guidance.modes import Lateral, Mode
+from flight_guidance.notices import Notices
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.path import Arc, Line
+from flight_guidance.route_file import Waypoint
+from flight_guidance.wind import WIND_TIME, wind_estimate, wind_of
+
+pytestmark = pytest.mark.package("flight_guidance")
+
+SPEED, R = 25.0, 144.0  # m/s and m, of the osprey by rule
+FOLLOW = PathParams(period=16.5, damping=0.75, capture=math.radians(30.0))
+SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": SPEED, "throttle_authority": [3.0, 3.0]}
+CONFIG = GuidanceConfig.validate_mapping(SECTION, "guidance")
+MS = 1_000_000  # ns
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(2000.0, 150.0), (2000.0, -150.0), (20e3, 150.0)])
+def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) -> None:
+    """The way to a circle is the tangent and an arc, with a turn to the tangent at the start."""
+
+    def derivative(_: float, z: Any) -> list[float]:
+        north, east, course = map(float, z)
+        a = path_acceleration(path.error(Arc((distance, 0.0), radius), (north, east)), course, SPEED, FOLLOW)
+        limit = GRAVITY * math.tan(math.radians(30.0))
+        return [SPEED * math.cos(course), SPEED * math.sin(course), min(max(a, -limit), limit) / SPEED]
+
+    times = np.arange(0.0, distance / SPEED + 60.0, 0.25)
+    north, east, course = solve_ivp(derivative, (0.0, times[-1]), [0.0, 0.0, 0.0], t_eval=times, max_step=0.25).y
+    off = np.hypot(north - distance, east) - abs(radius)
+    joined = int(np.flatnonzero(np.abs(off) < 0.05 * abs(radius))[0])
+    tangent = math.sqrt(distance**2 - radius**2)
+    # 2 s for the turn by asin(R / d), and the last metres of an exponential approach.
+    assert times[joined] == pytest.approx(tangent / SPEED, abs=4.0)
+    bearings = np.unwrap(np.arctan2(east, north - distance))[: joined + 1]
+    assert math.degrees(abs(bearings[-1] - bearings[0])) < 90.0  # acos(R / d) of the tangent
+    assert off[joined:].max() < 0.05 * abs(radius)
+    assert off[joined:].min() > -0.02 * abs(radius)  # no overshoot
+    assert math.sin(course[-1] - math.atan2(east[-1], north[-1] - distance)) == pytest.approx(
+        math.copysign(1.0, radius), abs=1e-3
+    )
+
+
+@pytest.mark.parametrize("last", [(2000.0, 1500.0), (-700.0, 400.0), (1000.0, -600.0)])
+def test_last_line_touches_orbit(last: path.Point) -> None:
+    before = (1000.0, 0.0)
+    legs = path.route([(0.0, 0.0), before, last] if last[0] > 0.0 else [before, last], 200.0, 100.0)
+    line, orbit = legs[-2:]
+    assert isinstance(line, Line)
+    assert isinstance(orbit, Arc)
+    error = path.error(line, orbit.centre)
+    assert error.e == pytest.approx(200.0)  # the centre is one radius to the right of the line: a clockwise orbit
+    touching = path.error(orbit, line.end)
+    assert touching.e == pytest.approx(0.0, abs=1e-9)
+    assert math.cos(touching.track - error.track) == pytest.approx(1.0)
+
+
+def test_short_line_leads_to_last_waypoint() -> None:
+    (line, orbit) = path.route([(0.0, 0.0), (150.0, 0.0)], 200.0, 100.0)
+    assert (line, orbit) == (Line((0.0, 0.0), (150.0, 0.0)), Arc((150.0, 0.0), 200.0))
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
+    """Lengths of the way onto a course to the north at the origin."""
+    at, north = (0.0, 0.0), 0.0
+
+    def length(position: path.Point, flown: float) -> float:
+        return float(path.joining_length(at, north, side * R, position, flown))
+
+    assert length((-1000.0, 0.0), 0.0) == pytest.approx(1000.0)  # straight behind
+    # On the opposite course beside the circle: down the tangent, and half of the circle.
+    assert length((1000.0, side * 2.0 * R), math.pi) == pytest.approx(1000.0 + math.pi * R)
+    # Across: the circle is touched at the point behind the centre, and a quarter of it is left.
+    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(1000.0 + R * math.pi / 2.0)
+    # A turn to the tangent costs R times the angle.
+    assert length((-1000.0, 0.0), 0.5) == pytest.approx(1000.0 + 0.5 * R)
+
+
+def test_shorter_side_joins_leg() -> None:
+    def side(position: path.Point, flown: float) -> float:
+        return float(path.joining((0.0, 0.0), 0.0, R, R, position, flown))
+
+    assert side((1000.0, 2.0 * R), math.pi) == 1.0
+    assert side((1000.0, -2.0 * R), math.pi) == -1.0
+    assert side((-R / 2.0, 10.0), 0.5) == 0.0  # near, and nearly on course
+    assert abs(side((-10.0, 0.0), math.pi)) == 1.0  # near, on the opposite course
+
+
+def test_leg_is_joined_near_its_start_on_course() -> None:
+    def joined(position: path.Point, flown: float) -> bool:
+        return bool(path.joined((0.0, 0.0), 0.0, R, position, flown))
+
+    assert joined((1.0, 5.0), math.radians(29.0))
+    assert not joined((1.0, 5.0), math.radians(31.0))
+    assert not joined((-1.0, 5.0), 0.0)  # before the start
+    assert not joined((1.0, R + 1.0), 0.0)  # beside the start
+
+
+def test_wind_is_velocity_over_ground_less_through_air() -> None:
+    # 3-4-5: climbing at 3 m/s of 5 m/s, 4 m/s remain level, to the east.
+    assert wind_of(1.0, -2.0, 3.0, math.pi / 2.0, 5.0) == pytest.approx((1.0, -6.0))
+    wind = (0.0, 0.0)
+    for _ in range(250):  # a time constant of a step of 20 ms
+        wind = wind_estimate(wind, (10.0, -5.0), WIND_TIME / 250)
+    assert wind == pytest.approx((10.0 * (1.0 - math.exp(-1.0)), -5.0 * (1.0 - math.exp(-1.0))))
+
+
+def test_largest_wind_takes_whole_bank() -> None:
+    bank, wind = math.radians(30.0), 3.0
+    largest = largest_wind(SPEED, wind, bank)
+    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == pytest.approx(GRAVITY * math.tan(bank))
+
+
+@pytest.mark.parametrize(
+    ("wind", "V", "sentence"),
+    [
+        (
+            30.0,
+            (),
+            r"route\[0\].V: found 25 m/s in a wind of 30 m/s, expected more than 36 m/s, or a guidance.wind below 20.8 m/s",
+        ),
+        (22.0, (30.0, 25.0), r"route\[1\].V: found 25 m/s in a wind of 22 m/s, expected more than 26.4 m/s"),
+    ],
+)
+def test_wind_that_airspeed_cannot_beat_refused(wind: float, V: tuple[float, ...], sentence: str) -> None:
+    route = {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": V}
+    with pytest.raises(ParameterError, match=sentence):
+        GuidanceConfig.validate_mapping(SECTION | {"wind": wind, "route": route}, "guidance")
+
+
+class Flown:
+    """Guidance on a route, with poses as given."""
+
+    def __init__(self, *waypoints: tuple[float, float, float], start: path.Point = (0.0, 0.0)) -> None:
+        self.made, self._k = Guidance(CONFIG), 0
+        self.made.take_route(CONFIG.plan([Waypoint(*waypoint) for waypoint in waypoints]))
+        self.at(*start)
+
+    def at(self, north: float, east: float, course: float = 0.0) -> dict[str, float]:
+        """The log of a step at a position, on a course through calm air, rad."""
+        now, v = 20 * MS * self._k, (SPEED * math.cos(course), SPEED * math.sin(course))
+        self.made.take_pose(StampedVector(now, np.array([0.0, 0.0, course, north, east, 100.0, *v, 0.0, 0.0])), now)
+        self.made.take_y(StampedVector(now, np.zeros(4)), now)
+        output = self.made.step(now, now)
+        assert output is not None
+        self._k, self.notices = self._k + 1, output.notices
+        return dict(zip(self.made.names, output.log.tolist(), strict=True))
+
+
+def test_first_waypoint_has_to_be_reached() -> None:
+    """A route behind the aircraft is not passed at the start: the aircraft joins the first leg."""
+    flown = Flown((2500.0, 0.0, 150.0), (1200.0, 0.0, 100.0), (1200.0, 1200.0, 100.0))
+    log = flown.at(10.0, 0.0)
+    assert (log["leg"], log["missed"], abs(log["joining"])) == (0.0, 0.0, 1.0)
+    assert log["target.altitude"] == 150.0  # of the first waypoint
+    # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the tangent, and an arc of pi + 2 b.
+    assert log["to_go"] == pytest.approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
+    log = flown.at(2499.0, 3.0, math.pi)
+    assert (log["leg"], log["joining"], log["target.altitude"]) == (0.0, 0.0, 100.0)
+
+
+def test_leg_passed_far_away_is_missed() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0))
+    assert flown.at(990.0, 600.0)["leg"] == 0.0
+    log = flown.at(1010.0, 600.0)
+    end = flown.made.route.legs[0].end if flown.made.route else None
+    assert end is not None
+    assert log["missed"] == pytest.approx(math.dist(end, (1010.0, 600.0)))
+    assert (log["leg"], abs(log["joining"])) == (1.0, 1.0)
+    assert flown.notices == (f"leg 0 missed by {log['missed']:.0f} m",)
+    assert flown.at(1011.0, 600.0)["missed"] == 0.0
+
+
+def test_leg_passed_near_is_flown() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (1000.0, 2000.0, 100.0))
+    flown.at(5.0, 0.0)
+    route = flown.made.route
+    assert route is not None
+    end = route.legs[0].end
+    assert end is not None
+    log = flown.at(end[0] + 1.0, 0.9 * R)
+    assert (log["leg"], log["missed"], log["joining"]) == (1.0, 0.0, 0.0)
+
+
+def test_leg_joined_at_a_point_along_it() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    flown.made.take_target({"leg": 0.0, "along": 900.0})
+    log = flown.at(0.0, 500.0)
+    assert (log["target.along"], abs(log["joining"])) == (900.0, 1.0)
+    assert flown.at(905.0, 10.0)["joining"] == 0.0
+    for values, sentence in (
+        ({"leg": 0.0, "along": 2500.0}, "target.along: found 2500 m, expected 0 to 1[0-9.]* m, the length of the leg"),
+        ({"along": 10.0}, "found along without leg"),
+    ):
+        with pytest.raises(ChannelError, match=sentence):
+            flown.made.take_target(values)
+
+
+def test_skip_leaves_waypoint_ahead_out() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0))
+    assert flown.made.skip()
+    log, route = flown.at(100.0, 0.0), flown.made.route
+    assert route is not None
+    assert log["leg"] == 2.0  # the line after the fillet
+    assert log["target.along"] == pytest.approx(path.length(route.legs[2]))
+
+
+def test_resume_flies_last_leg_from_nearest_point() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    assert not flown.made.resume()  # the route is flown
+    assert flown.made.hold()
+    assert flown.at(700.0, 400.0)["mode.lateral"] == Lateral.HEADING
+    assert flown.made.resume()
+    log = flown.at(701.0, 400.0)
+    assert (log["mode.lateral"], log["leg"], log["target.along"]) == (Lateral.ROUTE, 0.0, 700.0)
+
+
+def log_of(count: int, **channels: ArrayLike) -> Tape:
+    """A log of guidance on a route to the north, a sample a second; `_` stands for a dot."""
+    names = guidance.names(CONFIG.outputs)
+    level: dict[str, Any] = dict.fromkeys(names, 0.0) | {
+        "mode": Mode.ENGAGED,
+        "mode.lateral": Lateral.ROUTE,
+        "V_c": SPEED,
+        "pose.v_north": SPEED,
+    }
+    level |= {name.replace("__", "."): value for name, value in channels.items()}
+    values = np.column_stack([np.broadcast_to(np.asarray(level[name], dtype=float), count) for name in names])
+    return Tape({"guidance": Signal(np.arange(count) * nanoseconds(1.0), names, values)}, 0)
+
+
+def test_summary_says_which_legs_were_flown() -> None:
+    tape = log_of(
+        10, leg=[0, 0, 0, 1, 1, 2, 2, 2, 2, 2], joining=[1, 1, 0, 0, 0, 0, 0, 0, 0, 0], missed=[0] * 5 + [321.0] + [0] * 4
+    )
+    assert flown_legs(tape) == [
+        FlownLeg(0, 0.0, 2.0, 3.0, "flown", 0.0),
+        FlownLeg(1, 3.0, 3.0, 5.0, "missed", 321.0),
+        FlownLeg(2, 5.0, 5.0, 9.0, "not ended", 0.0),
+    ]
+    assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
+
+
+def test_flight_carried_back_is_noticed_once() -> None:
+    ahead = np.where(np.arange(60) < 20, SPEED, -5.0)  # from 20 s on in a wind of 30 m/s from ahead
+    tape = log_of(60, pose__v_north=ahead, wind__north=ahead - SPEED)
+    beyond = "above 3.5 m/s circles of the least radius take more than the largest bank"
+    assert guidance_notices(tape, CONFIG) == [
+        "guidance at t = 30.0 s: the ground speed along the path is below 0 for 10 s, in a wind of 30.0 m/s",
+        f"guidance at t = 30.0 s: wind 30.0 m/s, guidance.wind 0 m/s: {beyond}",
+    ]
+    # An aircraft that turns back flies back through the air too.
+    assert guidance_notices(log_of(60, pose__v_north=-SPEED), CONFIG) == []
+
+
+def test_log_without_channels_has_no_notices() -> None:
+    old = Tape({"guidance": Signal(np.array([0]), ("leg", "given"), np.zeros((1, 2)))}, 0)
+    assert (flown_legs(old), guidance_notices(old, CONFIG)) == ([], [])
+    assert Notices(0.0, lambda speed: speed).of_log(np.array([0.0]), {"leg": np.array([0.0])}) == []
