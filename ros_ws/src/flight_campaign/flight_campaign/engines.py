@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice
 from typing import Any
 
@@ -14,6 +14,10 @@ from flight_core.parameters import ParameterError
 
 CONNECT, RECONNECT = 10.0, 60.0
 """s to wait for a scheduler at the start, and after its loss."""
+
+LOST_WORKER_TIMEOUT = {"distributed.deploy.lost-worker-timeout": "10 minutes"}
+"""After the default, 15 s, a cluster gives up a dead worker that starts again. On a busy host a start may take longer, and the
+campaign would wait for ever for a cluster without workers."""
 
 AHEAD = 2  # queued chunks a worker: enough to keep it busy, few enough for constant memory
 
@@ -53,7 +57,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
     """
 
     def fly(work: Work, jobs: Iterable[Job]) -> Iterator[tuple[Job, Any]]:
-        from distributed import CancelledError, Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415 - half a second
+        from distributed import CancelledError, Client, KilledWorker, as_completed  # noqa: PLC0415 - half a second
         from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
         waiting, count, patience = iter(jobs), workers or os.cpu_count() or 1, CONNECT
@@ -65,9 +69,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
             with ExitStack() as stack:
                 try:
                     if scheduler is None:
-                        cluster = stack.enter_context(
-                            LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None)
-                        )
+                        cluster = stack.enter_context(_local_cluster(count))
                     client = stack.enter_context(Client(scheduler or cluster, timeout=f"{patience:g}s"))
                     ahead = AHEAD * max(count, len(client.scheduler_info()["workers"]))
                 except (OSError, ValueError) as error:  # ValueError: no address at all
@@ -96,3 +98,18 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     return
 
     return fly
+
+
+@contextmanager
+def _local_cluster(workers: int) -> Iterator[Any]:
+    """Processes of this machine."""
+    import dask  # noqa: PLC0415 - half a second
+    from distributed import LocalCluster  # noqa: PLC0415 - as above
+
+    with dask.config.set(LOST_WORKER_TIMEOUT):
+        cluster = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+        try:
+            yield cluster
+        finally:
+            with suppress(TimeoutError):  # of a worker that is just starting again; its outcome is no outcome of the campaign
+                cluster.close()
