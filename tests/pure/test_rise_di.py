@@ -180,7 +180,7 @@ def test_a_varied_flight_leaves_its_scenario_in_the_log(run: rise_di.RecordedRun
 
 
 def test_a_log_has_the_samples_of_the_flight(run: rise_di.RecordedRun, tape: rise_di.Tape) -> None:
-    assert run.tape.outcome == "unknown"
+    assert run.tape.outcome == tape.outcome
     for topic in ("y", "y_m", "u", "internals"):
         assert np.ascontiguousarray(run.tape[topic].values).tobytes() == tape[topic].values.tobytes()
 

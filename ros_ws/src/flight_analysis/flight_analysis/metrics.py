@@ -29,6 +29,9 @@ MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal noise stay within 4 with a
 probability of 97 %."""
 
+LONGEST_INTERVAL = 1.0
+"""s. A sample stands for no longer time: a longer interval is a gap of the log, over which no figure is taken."""
+
 TRUE_ERROR, MEASURED_ERROR = "true error", "measured error"  # names that `best_error` returns
 
 PARTS_LEGEND = (
@@ -159,7 +162,7 @@ def noise_floor(tape: Tape) -> dict[str, float]:
         if noise is not None and name in noise.names:
             rms = float(np.sqrt(np.mean(noise[name] ** 2)))
         else:
-            rms = float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5) if len(y) > 2 else 0.0
+            rms = float(np.median(np.abs(np.diff(y, 2)))) / (0.6745 * 6.0**0.5) if len(y) > 2 else math.nan
         largest = np.max(np.abs(y), initial=0.0)
         floor[name] = max(rms, float(np.spacing(largest)) if largest > 0.0 else 0.0)
     return floor
@@ -247,13 +250,30 @@ def part_masks(t: FloatArray, transients: Sequence[Transient], settle: float = S
     return {"whole": np.ones(len(t), dtype=bool), "calm": free, **{kind: parts[kind] for kind in (*commands, "gust")}}
 
 
-def error_metrics(errors: ArrayLike) -> ErrorMetrics:
-    """Root mean square sqrt(mean e^2) and max abs(e) of samples of shape (N,); NaN where N = 0. Raises ParameterError."""
+def sample_times(stamp_ns: NDArray[np.int64]) -> FloatArray:
+    """Time that a sample stands for, s, shape (N,): half of the intervals to both neighbours, each at most LONGEST_INTERVAL.
+
+    The first and the last sample stand for a whole interval, so that equal intervals give equal times.
+    """
+    if len(stamp_ns) < 2:
+        return np.ones(len(stamp_ns))
+    intervals = np.minimum(np.diff(stamp_ns) / 1e9, LONGEST_INTERVAL)
+    times: FloatArray = (np.concatenate([intervals[:1], intervals]) + np.concatenate([intervals, intervals[-1:]])) / 2.0
+    return times
+
+
+def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMetrics:
+    """Root mean square and max abs(e) of samples of shape (N,); NaN where N = 0.
+
+    rms = sqrt(sum t e^2 / sum t) with the `times` t of the samples, (N,), of equal times sqrt(mean e^2). Raises ParameterError.
+    """
     e = as_array(errors, "errors", expected := "samples of one channel, (N,)")
     require(e.ndim == 1, "errors", f"an array of shape {e.shape}", expected)
     if len(e) == 0:
         return ErrorMetrics(float("nan"), float("nan"))
-    return ErrorMetrics(float(np.sqrt(np.mean(e**2))), float(np.max(np.abs(e))))
+    weighted = times is not None and np.ptp(times) > 0.0
+    square = np.average(e**2, weights=times) if weighted else np.mean(e**2)
+    return ErrorMetrics(float(np.sqrt(square)), float(np.max(np.abs(e))))
 
 
 def errors_by_part(
@@ -265,7 +285,8 @@ def errors_by_part(
     """
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
-    return {name: {part: error_metrics(error[name][mask]) for part, mask in masks.items()} for name in error.names}
+    times = sample_times(error.stamp_ns)
+    return {name: {part: error_metrics(error[name][mask], times[mask]) for part, mask in masks.items()} for name in error.names}
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
@@ -346,13 +367,13 @@ def inputs_by_part(
     if "u" not in tape:
         return {}
     u, t = tape["u"], tape.time("u")
-    masks = part_masks(t, transients, settle)
+    masks, times = part_masks(t, transients, settle), sample_times(u.stamp_ns)
 
     def metrics(values: FloatArray, mask: NDArray[np.bool_]) -> InputMetrics:
         steps = mask[1:]
         time = float(np.diff(t)[steps].sum())
         rate = float(np.abs(np.diff(values))[steps].sum()) / time if time > 0 else float("nan")
-        return InputMetrics(*error_metrics(values[mask]), rate)
+        return InputMetrics(*error_metrics(values[mask], times[mask]), rate)
 
     return {name: {part: metrics(u[name], mask) for part, mask in masks.items()} for name in u.names}
 

@@ -154,7 +154,10 @@ def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
             writer.write(signals)
 
     with writing("", run, EXPECTED), TapeWriter(run, attachments_for(scenario, run)) as writer, handle_signals(interrupt):
-        return fly(scenario, record, lambda t: progress(t, "in one process"))
+        outcome = fly(scenario, record, lambda t: progress(t, "in one process"))
+        with interrupt.deferred():
+            writer.add_outcome(outcome)
+    return outcome
 
 
 def fly_and_report(

@@ -23,10 +23,12 @@ from flight_analysis.report.summary import (
     columns_of,
     display_units,
     finite_or_null,
+    format_seconds,
     format_value,
     input_rows,
     parts_legend,
     table_rows,
+    taken_over,
 )
 from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError
@@ -38,11 +40,11 @@ LATEST = Path("runs/latest")  # the run of a command that is given none
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
     summary, units = flight.summary, display_units(flight.scenario)
-    title = f"Tracking error ({summary['error']}), {summary['duration']:.1f} s flown"
+    title = f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
     console.print(grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)))
     if rows := input_rows(summary, units):
-        title = "Inputs about trim, and mean abs(u_dot) per second"
+        title = f"Inputs about trim, and mean abs(u_dot) per second{taken_over(summary, 'inputs')}"
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         console.print(grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
@@ -118,8 +120,9 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
     if (ticks := summary["ticks"]) is not None:
         ms = {key: f"{value * 1e3:.3f}" for key, value in ticks.items()}
         lines.append(
-            f"ticks: {ticks['ticks']}, {ticks['without_new_y']} without a new y; period mean {ms['period_mean']} ms,"
-            f" p99 {ms['period_p99']}, max {ms['period_max']}; late p99 {ms['late_p99']} ms, max {ms['late_max']}"
+            f"ticks{taken_over(summary, 'ticks')}: {ticks['ticks']}, {ticks['without_new_y']} without a new y;"
+            f" period mean {ms['period_mean']} ms, p99 {ms['period_p99']}, max {ms['period_max']};"
+            f" late p99 {ms['late_p99']} ms, max {ms['late_max']}"
         )
     if (latency := summary["latency"]) is not None:
         median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from flight_analysis.report.run_folder import PARAMETERS
-from flight_core.files import display_path, parse_yaml
+from flight_core.files import display_path
 from flight_core.parameters import ParameterError
 from flight_core.rates import seconds
 from flight_core.text import printable
@@ -47,12 +46,6 @@ def _missing_at_end(run: Path, last: FileRepair) -> str:
     except ParameterError:
         return "it is unknown how much is missing at its end"
     end = max(float(recorded.tape.time(name)[-1]) for name in recorded.tape.signals)
-    for stored in recorded.attachments:
-        if stored.name == PARAMETERS:
-            try:
-                parameters = parse_yaml(stored.content, PARAMETERS, "a scenario file")
-                duration = float(parameters["/**/flight"]["ros__parameters"]["duration"])
-            except (ParameterError, LookupError, OverflowError, TypeError, ValueError):
-                continue  # an attachment of this name may hold anything
-            return f"the log ends at t = {end:.3f} s of the {duration:g} s of the scenario"
+    if recorded.tape.duration is not None:
+        return f"the log ends at t = {end:.3f} s of the {recorded.tape.duration:g} s of the scenario"
     return f"the log ends at t = {end:.3f} s; it is unknown how much is missing"

@@ -17,6 +17,7 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
+from flight_analysis.report.run_folder import log_account
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_core.files import parse_yaml
 from flight_core.parameters import require
@@ -53,13 +54,17 @@ def replay(
     require(bool(result.checked.any()), str(run), "no tick that could be checked", "a log with two successive ticks")
     if csv_file is not None:
         _write_csv(csv_file, result, parameters.inputs)
-    notes = (*recorded.tape.notes, *result.notes, *_parameter_notes(result, open_loop=others is not None))
+    of = log_account(recorded)
+    lacks = () if of is None else tuple(f"the log lacks {lack}" for lack in of.lacks)
+    ticks = max(len(result.number), 0 if of is None else of.topics["internals"].expected or 0)
+    notes = (*recorded.tape.notes, *lacks, *result.notes, *_parameter_notes(result, open_loop=others is not None))
     notes += () if guided is None else guided.notes
     if as_json:
         of_guidance = None if guided is None else _guidance_as_json(guided)
-        print_json({**_as_json(result, notes, parameters.inputs, settings or []), "guidance": of_guidance})
+        found = _as_json(result, notes, parameters.inputs, settings or [])
+        print_json({**found, "expected": ticks, "guidance": of_guidance})
     else:
-        _show(result, notes, parameters.inputs, open_loop=others is not None)
+        _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
         if guided is not None:
             _show_guidance(guided)
     raise typer.Exit(0 if result.equal() and (guided is None or guided.equal()) else DIFFERS)
@@ -104,9 +109,9 @@ def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:
     return [f"{since}, flew with other parameters than the log holds: {why}"]
 
 
-def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], *, open_loop: bool) -> None:
+def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], ticks: int, *, open_loop: bool) -> None:
     console = Console(soft_wrap=True, highlight=False)
-    first, checked, ticks = result.first(), int(result.checked.sum()), len(result.number)
+    first, checked = result.first(), int(result.whole.sum())
     of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
     if first is None:
         console.print(f"{of}, every bit equal" + (", yet with other parameters" if result.other_parameters.any() else ""))
@@ -153,7 +158,7 @@ def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ..
         "open_loop": bool(settings),
         "set": settings,
         "ticks": len(result.number),
-        "checked": int(result.checked.sum()),
+        "checked": int(result.whole.sum()),
         "equal": result.equal(),
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),

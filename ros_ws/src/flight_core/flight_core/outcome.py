@@ -6,6 +6,8 @@ from flight_core.text import bounded
 
 COMPLETED = "completed"
 INTERRUPTED = "interrupted"
+INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
+NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 

@@ -3,7 +3,8 @@
 """The tape: the in-memory log of a flight, from a single process, over topics or read from a bag."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,12 +64,26 @@ class Signal:
         return Signal(self.stamp_ns, names, self.values[:, slice(columns[0], columns[-1] + 1) if adjacent else columns])
 
 
+class Recording(NamedTuple):
+    """Stamps of the messages of a topic in the order of the recording.
+
+    The samples from a step of the clock of the stamps on, and the samples with a zero stamp, are absent in the signal.
+    """
+
+    found: int  # messages
+    unset: int = 0  # zero stamps
+    repeated: int = 0  # stamps equal to the stamp of the message before
+    step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
+    step_at_ns: int = 0  # the last stamp before the step
+    left_out: int = 0  # messages after the step
+
+
 @dataclass(frozen=True)
 class Tape:
     """A flight: signals by topic name.
 
     `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. `scenario` is the scenario that `simulate`
-    flew, None on the tape of a log.
+    flew, None on the tape of a log. Of a log: `recording` by topic, and `duration`, s, of a whole flight where the log has it.
     """
 
     signals: Mapping[str, Signal]
@@ -76,6 +91,8 @@ class Tape:
     notes: tuple[str, ...] = ()
     outcome: str = COMPLETED
     scenario: object = None
+    recording: Mapping[str, Recording] = field(default_factory=dict)
+    duration: float | None = None
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""

@@ -4,7 +4,8 @@
 
 import re
 import shlex
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -15,14 +16,15 @@ from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from numpy.typing import NDArray
 
 from flight_core.arguments import FilePath, as_path
-from flight_core.files import is_file, is_folder, read_file
+from flight_core.files import is_file, is_folder, parse_yaml, read_file
 from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.scenario import A_SCENARIO
-from flight_core.tape import Signal, Tape
+from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
-from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
+from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE
+from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
@@ -42,10 +44,12 @@ from flight_log.open_log import A_RUN, NAMED, log_files, missing_parts, open_sca
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import MessageBatch
 
+PARAMETERS = "parameters.yaml"  # attachment with every parameter of the flight
 A_FLIGHT = f"a recorded flight: y, y_m and u as {JOINT_STATE}"
 ROUTE = "route"
 BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
+RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
 T = TypeVar("T", bound=np.generic)
@@ -112,19 +116,28 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     run = as_path(run, "run", A_RUN)
     given = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     log = _read(run)
-    filled = {topic: signal for topic, samples in log.topics.items() if (signal := samples.signal()) is not None}
+    filled = {
+        topic: signal
+        for topic, samples in log.topics.items()
+        if (signal := samples.signal(rests=topic.rpartition("/")[2] in RESTING)) is not None
+    }
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
-    require(bool(filled), str(run), "; ".join([nothing, *log.notes_at(None)]), A_FLIGHT)
+    without = [f"no stamp of {topic}" for topic, samples in log.topics.items() if samples.recording().unset]
+    require(bool(filled), str(run), "; ".join([nothing, *without, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
     signals = {printable(name): filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
+    stamped = names_within(aircraft, log.topics).items()
+    recording = {printable(name): of for topic, name in stamped if (of := log.topics[topic].recording()).found}
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     told = [log.topics[topic].note(name) for topic, name in names.items()]
+    told += [recording_note(name, of, start_ns) for name, of in recording.items()]
     told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, told)]
-    tape = Tape(signals, start_ns, tuple(map(printable, notes)), UNKNOWN)
+    outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
+    tape = Tape(signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments))
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
     stored = given or log.scenario
@@ -196,23 +209,34 @@ class _TopicSamples:
 
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode, self._expected = decode, expected
-        self._batch: list[Table] = []  # of one length
+        self._batch: list[tuple[Table, NDArray[np.int64]]] = []  # of one length, and their log times
         self._batched = 0  # messages
+        self._clock = StampClock()
+        self._unset = 0  # samples with a zero stamp, left out at the end
         self._samples: dict[tuple[str, ...], _Collected] = {}  # by names
         self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
-    def add(self, table: Table) -> None:
-        if self._batched >= BATCH or (self._batch and self._batch[0].shape[1] != table.shape[1]):
-            self._decode_batch()
-        self._batch.append(table)
+    def add(self, table: Table, log_ns: NDArray[np.int64]) -> None:
+        alike = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
+        if self._batched >= BATCH or not alike:
+            self._decode_batch(more=alike)
+        self._batch.append((table, log_ns))
         self._batched += len(table)
 
-    def _decode_batch(self) -> None:
+    def _decode_batch(self, *, more: bool = False, end: bool = False) -> None:
         if not self._batch:
             return
-        decoded = self._decode(np.concatenate(self._batch))
+        table, log_ns = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
         self._batch, self._batched = [], 0
+        if table.shape[1] >= STAMP.stop:
+            keep, count = self._clock.usable(stamps_of(table), log_ns, more=more, end=end)
+            if count < len(table):
+                self._batch, self._batched = [(table[count:], log_ns[count:])], len(table) - count
+            table = table[:count] if keep.all() else table[:count][keep]
+        if not len(table):
+            return
+        decoded = self._decode(table)
         self._refused += decoded.unreadable
         for received, stamp_ns, unordered, sender in decoded.samples:
             if unordered.shape[1] == len(received):
@@ -236,13 +260,23 @@ class _TopicSamples:
                 return known, values[:, [names.index(name) for name in known]]
         return names, values
 
-    def signal(self) -> Signal | None:
-        """The samples in the order of the stamps; None without samples."""
-        self._decode_batch()
+    def signal(self, *, rests: bool) -> Signal | None:
+        """The samples in the order of the stamps; None without samples that have a stamp.
+
+        `rests`: equal stamps may follow on another, so that a stamp of 0 may be flight time.
+        """
+        self._decode_batch(end=True)
         if not self._samples:
             return None
         names = self._names()
         stamps, values = self._samples[names].stamp_ns.all(), self._samples[names].values.all()
+        zero = stamps == 0
+        zeros, least = int(np.count_nonzero(zero)), len(stamps) - 1 if rests else 1
+        if zeros and (zeros > max(least, 1) or stamps.max() > SINCE_EPOCH_NS):
+            self._unset = zeros
+            stamps, values = stamps[~zero], values[~zero]
+            if not len(stamps):
+                return None
         if np.any(stamps[1:] < stamps[:-1]):
             order = np.argsort(stamps, kind="stable")
             stamps, values = stamps[order], values[order]
@@ -262,6 +296,10 @@ class _TopicSamples:
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
             return ""
         return f"{name}: samples of {', '.join(sorted(self._spans))}: the figures are of all, the nodes refuse all but one"
+
+    def recording(self) -> Recording:
+        """The stamps in the order of the recording; after `signal`."""
+        return self._clock.recording(self._unset)
 
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
@@ -293,7 +331,7 @@ class _Log:
             times = self.sent.setdefault(topic, [])
 
             def take(batch: MessageBatch) -> None:
-                samples.add(batch.data)
+                samples.add(batch.data, batch.log_ns)
                 if batch.data.shape[1] >= STAMP.stop:
                     self.times = Times(stamps_of(batch.data), batch.sent_ns)
                     if batch.publish_ns.all():
@@ -301,7 +339,7 @@ class _Log:
 
             return take
         if samples is not None:
-            return lambda batch: samples.add(batch.data)
+            return lambda batch: samples.add(batch.data, batch.log_ns)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(
@@ -400,6 +438,16 @@ def _read_file(file: Path, log: _Log) -> None:
     if scan.damaged:
         log.notes.append(f"{file.name} is damaged: {scan.damaged} of its parts left out")
     log.known_end_ns = max(log.known_end_ns, scan.known_end_ns)
+
+
+def _duration(attachments: Sequence[StoredFile]) -> float | None:
+    """The duration of the whole flight by the attached parameters, s; None for a log without them."""
+    for stored in attachments:
+        if stored.name == PARAMETERS:
+            with suppress(ParameterError, LookupError, OverflowError, TypeError, ValueError):
+                tree = parse_yaml(stored.content, PARAMETERS, "parameters")
+                return float(tree["/**/flight"]["ros__parameters"]["duration"])
+    return None
 
 
 def _start_ns(signals: Mapping[str, Signal]) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from flight_core.files import writing
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
-from flight_log.bag import BagChannel, BagWriter, LogAttachments
+from flight_log.bag import OUTCOME, BagChannel, BagWriter, LogAttachments
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
 
 EXPECTED = "a folder and a disk that can"
@@ -64,6 +64,10 @@ class TapeWriter:
         due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in joined.items()}
         self._waiting = {topic: signal.where(~due[topic]) for topic, signal in joined.items()}
         self._write({topic: signal.where(due[topic]) for topic, signal in joined.items()})
+
+    def add_outcome(self, outcome: str) -> None:
+        """Store the outcome of the flight in the log."""
+        self._bag.add_metadata(OUTCOME, {"outcome": outcome})
 
     def _write(self, signals: Mapping[str, Signal]) -> None:
         for topic in signals:

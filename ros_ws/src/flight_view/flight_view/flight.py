@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_scenario_sections
 from flight_analysis.metrics import settling_bands
+from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
@@ -33,6 +35,7 @@ from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
+from flight_log.tape_reader import read_run
 from flight_view.series import Series
 
 RATE = 50.0  # Hz
@@ -123,6 +126,8 @@ class Flight:
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
+        self._account: Thread | None = None  # counts the samples of an ended log
+        self._lacks: list[str] = []
 
     @property
     def start_ns(self) -> int:
@@ -157,6 +162,7 @@ class Flight:
         refused = {name: samples.refused for name, samples in self.samples.items() if samples.refused}
         return [
             *self.notes,
+            *self._lacks,
             *([f"the log cannot be read further: {_text(follower.fault)}"] if follower.fault else []),
             *([f"{follower.damaged} damaged parts of the log are left out"] if follower.damaged else []),
             *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
@@ -186,7 +192,23 @@ class Flight:
                 self._decode(topic)
             self._changed = self._now()
             self._update_bands()
+        elif self._account is None and self.state() in {"ended", "interrupted"}:
+            self._account = Thread(target=self._count, daemon=True)
+            self._account.start()
         return news
+
+    def counted(self) -> None:
+        """Wait until the samples of an ended log are counted."""
+        if self._account is not None:
+            self._account.join()
+
+    def _count(self) -> None:
+        """What an ended log lacks. The page reads a part of the samples; this reads the whole log."""
+        with suppress(ParameterError, OSError):
+            recorded = read_run(self.run, self._namespace)
+            of = log_account(recorded)
+            lacks = () if of is None else (f"the log lacks {lack}" for lack in of.lacks)
+            self._lacks = [_text(sentence) for sentence in (*recorded.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:
         if (topic, type_name) in ((LOG, LOG_TYPE), (PARAMETER_EVENTS, PARAMETER_EVENT)):

@@ -29,6 +29,9 @@ def show(flight: Flight) -> None:
             flight.update()
             live.update(picture(flight))
             if flight.state() == "ended":
+                flight.update()
+                flight.counted()
+                live.update(picture(flight))
                 break
             time.sleep(1.0 / REFRESH)
 

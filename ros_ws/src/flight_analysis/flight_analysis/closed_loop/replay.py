@@ -64,6 +64,12 @@ class ReplayResult(NamedTuple):
     checked: NDArray[np.bool_]  # (N,), whether the state before the tick is known
     other_parameters: NDArray[np.bool_]  # (N,), whether the recorded controller had other parameters
     notes: tuple[str, ...]
+    published: NDArray[np.bool_] | None = None  # (N,), whether y and u of the tick are on their topics
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """Mask of the ticks whose y, state and u are compared, shape (N,)."""
+        return self.checked if self.published is None else self.checked & self.published
 
     def different(self) -> NDArray[np.bool_]:
         """Mask of the values with a different bit, shape (N, k)."""
@@ -185,7 +191,11 @@ def _replay(
         if others is None and computed[k].tobytes() != ticks.values[k].tobytes():
             state = ticks.state(k, in_force.limits, in_force.law, state)
     notes = (() if others is None else (OPEN_LOOP,)) + tuple(in_force.notes) + tuple(_coverage_notes(ticks, checked))
-    return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes)
+    # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the topic is not compared.
+    missing = np.flatnonzero(~ticks.u_found)
+    computed[missing, -ticks.m :] = ticks.values[missing, -ticks.m :]
+    published = ticks.u_found & (ticks.y_found | ~ticks.flies)
+    return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes, published)
 
 
 def _recorded(
@@ -277,7 +287,7 @@ class _Ticks:
         self._offset_ns = np.round(signal["y_m_offset"] * NANOSECONDS).astype(np.int64)
         self._groups = {name: signal.group(name).values for name in groups}
         self._y, self.y_found = _as_published(tape, "y", parameters.outputs, self.stamp_ns, self._groups["y"])
-        u, _ = _as_published(tape, "u", parameters.inputs, self.stamp_ns, self._groups["u"])
+        u, self.u_found = _as_published(tape, "u", parameters.inputs, self.stamp_ns, self._groups["u"])
         self.values = np.column_stack([signal.values, u])
         self.names = (*names, *(f"published.{name}" for name in parameters.inputs))
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
@@ -353,6 +363,8 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{unchecked} ticks not checked: the log does not hold the state before them"
     if without := int((ticks.flies & ~ticks.y_found).sum()):
         yield f"{without} ticks have no sample on the topic y: y taken from internals"
+    if without := int((~ticks.u_found).sum()):
+        yield f"{without} ticks have no sample on the topic u: what was sent is not compared"
 
 
 def _bits(values: FloatArray) -> NDArray[np.int64]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.metrics import SETTLING_DWELL, error_metrics, settling_time
+from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times, settling_time
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
@@ -67,7 +67,7 @@ class Segment(NamedTuple):
 
 def segments(tape: Tape) -> list[Segment]:
     """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin a single segment."""
-    t, errors = tape.time("guidance"), control_errors(tape)
+    t, errors, times = tape.time("guidance"), control_errors(tape), sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
     targets = [name for name in (f"target.{name}" for name in TARGETS) if name in log.names]
     named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
@@ -82,7 +82,7 @@ def segments(tape: Tape) -> list[Segment]:
         lateral, vertical = Lateral(int(log["mode.lateral"][last])), Vertical(int(log["mode.vertical"][last]))
         on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
         quantities = (on_path, vertical.name.lower(), "V")
-        held = [_held(name, t[first:after], errors[name][first:after]) for name in quantities]
+        held = [_held(name, t[first:after], errors[name][first:after], times[first:after]) for name in quantities]
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
         found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
     return found
@@ -133,8 +133,8 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
     return errors | {"xtrack": log["xtrack"], "V": log["y.V"] - log["u_m.V"]}
 
 
-def _held(quantity: str, t: FloatArray, error: FloatArray) -> Held:
-    metrics, first = error_metrics(error), float(error[0])
+def _held(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> Held:
+    metrics, first = error_metrics(error, times), float(error[0])
     if abs(first) <= BANDS[quantity]:
         return Held(quantity, *metrics, None, None)
     beyond = float(np.max(-error * math.copysign(1.0, first), initial=0.0))

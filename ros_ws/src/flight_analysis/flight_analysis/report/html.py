@@ -22,6 +22,7 @@ from flight_analysis.report.summary import (
     RecordedFlight,
     display_units,
     finite_or_null,
+    format_seconds,
     format_value,
     parts_legend,
 )
@@ -126,7 +127,7 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
 
 def _description(flight: RecordedFlight) -> str:
     controller = flight.scenario.controller
-    return f"{flight.summary['duration']:.1f} s flown at {controller.rate:g} Hz with the {controller.summary()}"
+    return f"{format_seconds(flight.summary['duration'])} flown at {controller.rate:g} Hz with the {controller.summary()}"
 
 
 def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:

@@ -13,9 +13,10 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
+from flight_analysis.report.account import Account, account, flown
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
 from flight_core.files import dump_yaml, read_file, write_file, writing
-from flight_core.outcome import COMPLETED
+from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario import A_SCENARIO
@@ -25,10 +26,10 @@ from flight_log.bag import LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.tape_reader import RecordedRun, read_run
+from flight_log.tape_reader import PARAMETERS, RecordedRun, read_run
 
 SUMMARY, REPORT = "summary.json", "report.html"
-AIRFRAME, PARAMETERS, PROVENANCE = "airframe.yaml", "parameters.yaml", "provenance.yaml"  # attachments of the log
+AIRFRAME, PROVENANCE = "airframe.yaml", "provenance.yaml"  # attachments of the log
 
 
 class FlightResult(NamedTuple):
@@ -84,18 +85,32 @@ def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
 def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
     folder, scenario = _folder(run), _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
-    tape = _until_last_input(replace(recorded.tape, signals=signals))
-    flown = recorded.engagements
-    if outcome == COMPLETED and "internals" not in tape and flown is None:
-        outcome = "the controller never engaged"
+    log = replace(recorded.tape, signals=signals)
+    outcome = outcome or _previous_outcome(folder / SUMMARY, recorded.tape.outcome)
+    engagements = recorded.engagements
+    if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
+        outcome = f"{NEVER_FLEW}: the controller never engaged"
+    tape, of = flown(log), account(log, scenario, outcome, simulated=engagements is None)
     name = printable(folder.name if run.is_dir() else run.stem)
-    engaged = _engaged(tape, flown or [])
+    engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
-    summary = summarise(engaged if has_figures else tape, scenario, outcome or _previous_outcome(folder / SUMMARY))
-    if flown is not None:
-        summary["engagements"] = [_engagement(tape, engagement) for engagement in flown]
+    summary = summarise(engaged if has_figures else tape, scenario, outcome, of)
+    if engagements is not None:
+        summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
         summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
     return RecordedFlight(name, scenario, tape, summary)
+
+
+def log_account(recorded: RecordedRun) -> Account | None:
+    """What a log lacks; None for a log without a scenario that can be read."""
+    try:
+        scenario = parse_recorded_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
+    except ParameterError:
+        return None
+    simulated = recorded.engagements is None
+    folder = None if recorded.path is None else _folder(recorded.path)
+    outcome = recorded.tape.outcome if folder is None else _previous_outcome(folder / SUMMARY, recorded.tape.outcome)
+    return account(recorded.tape, scenario, outcome, simulated=simulated)
 
 
 def _engaged(tape: Tape, flown: Sequence[Engagement]) -> Tape:
@@ -174,19 +189,12 @@ def _folder(run: Path) -> Path:
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
-def _previous_outcome(summary: Path) -> str:
+def _previous_outcome(summary: Path, of_log: str) -> str:
+    """The outcome in the run's summary, else the outcome in the log."""
     try:
         return printable(str(json.loads(summary.read_text(encoding="utf-8"))["outcome"]))
     except (OSError, ValueError, TypeError, KeyError):
-        return "unknown: the run has no summary"
-
-
-def _until_last_input(tape: Tape) -> Tape:
-    """The tape up to the controller's last u. Later samples belong to the shutdown of the processes."""
-    if "u" not in tape:
-        return tape
-    end_ns = tape["u"].stamp_ns[-1]
-    return replace(tape, signals={name: signal.until(end_ns) for name, signal in tape.signals.items()})
+        return of_log if of_log != UNKNOWN else f"{UNKNOWN}: neither the run nor the log has one"
 
 
 def link_latest(run: Path) -> None:

@@ -13,6 +13,7 @@ from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_analysis.metrics import (
     GUIDED_LEGEND,
     PARTS_LEGEND,
+    TRUE_ERROR,
     Transient,
     best_error,
     engagements,
@@ -28,6 +29,7 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
+from flight_analysis.report.account import Account, account, account_of_json, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
@@ -110,11 +112,14 @@ class RecordedFlight(NamedTuple):
         return period_ns(self.scenario.controller.rate, "controller.rate")
 
 
-def summarise(tape: Tape, scenario: Scenario | None = None, outcome: str | None = None) -> dict[str, Any]:
+def summarise(
+    tape: Tape, scenario: Scenario | None = None, outcome: str | None = None, of: Account | None = None
+) -> dict[str, Any]:
     """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys.
 
-    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. Raises ParameterError for
-    a tape without y and y_m. The order `summarise(scenario, tape, outcome)` of version 0.2 works with a warning.
+    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `of` is the account of
+    the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
+    The order `summarise(scenario, tape, outcome)` of version 0.2 works with a warning.
     """
     if isinstance(tape, Scenario):
         warnings.warn(OLD_ORDER, FutureWarning, stacklevel=2)
@@ -124,12 +129,14 @@ def summarise(tape: Tape, scenario: Scenario | None = None, outcome: str | None 
     scenario = as_scenario(flown)
     outcome = tape.outcome if outcome is None else outcome
     for topic in ("y", "y_m"):
-        require(topic in tape, "the log", f"no sample of {topic}", "a flight with y and y_m")
+        unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
+        require(topic in tape, "the log", f"no sample of {topic}{unset}", "a flight with y and y_m")
+    of = account(tape, scenario, outcome) if of is None else of
     events = transients(scenario, tape)
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_metrics(tape)
-    summary = empty_summary(scenario, outcome) | {
-        "duration": float(tape.time("y")[-1]) if len(tape["y"].stamp_ns) else 0.0,
+    summary = empty_summary(scenario, final_outcome(outcome, of)) | {
+        "duration": _duration(tape, of),
         "error": best_error(tape)[0],
         "errors": _errors(tape, events),
         "inputs": _inputs(tape, events),
@@ -140,9 +147,33 @@ def summarise(tape: Tape, scenario: Scenario | None = None, outcome: str | None 
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "guidance": guidance_summary(tape),
+        "account": of.as_json(),
         "notes": [*tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def _duration(tape: Tape, of: Account) -> float | None:
+    """Flight time of the last y, s; of a log that lacks y, the end of the flight."""
+    if not len(tape["y"].stamp_ns):
+        return None
+    return max(float(tape.time("y")[-1]), of.end) if of.over("y") else float(tape.time("y")[-1])
+
+
+FIGURES = {
+    "errors": ("y", "y_m", "internals", "u_m", "guidance"),
+    "inputs": ("u", "internals", "u_m", "guidance"),
+    "ticks": ("internals",),
+}
+"""Topics of the tables of figures beside the error: the values, and the parts of the flight."""
+
+
+def taken_over(summary: Mapping[str, Any], table: str) -> str:
+    """The part of the flight over which the figures of a table are taken, after a comma; empty for the whole flight."""
+    of = account_of_json(summary)
+    truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
+    part = "" if of is None else of.over(*truth, *FIGURES[table])
+    return f", {part}" if part else ""
 
 
 def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -> list[str]:
@@ -161,7 +192,7 @@ def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
     return {
         "scenario": scenario.name,
         "outcome": outcome,
-        "duration": 0.0,
+        "duration": None,
         "error": None,
         "errors": {},
         "inputs": {},
@@ -169,6 +200,7 @@ def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
         "ticks": None,
         "latency": None,
         "guidance": None,
+        "account": None,
         "notes": [],
     }
 
@@ -269,6 +301,11 @@ def metric(summary: Mapping[str, Any], *path: str) -> float | None:
 def format_value(value: float | None, factor: float = 1.0) -> str:
     """A value with three digits, or NO_VALUE."""
     return NO_VALUE if value is None else f"{value * factor:#.3g}".rstrip(".")
+
+
+def format_seconds(time: float | None) -> str:
+    """A time in s with a digit, or that it is not known."""
+    return "an unknown time" if time is None else f"{time:.1f} s"
 
 
 def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:

@@ -25,6 +25,7 @@ from flight_analysis.report.summary import (
     parts_legend,
     slowest_settling,
     table_rows,
+    taken_over,
 )
 from flight_core.tape import Tape
 from rise_di_controller.internals import Saturation
@@ -99,7 +100,7 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]
     tables = (
         _error_table(summary, units),
-        Table("Inputs", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
+        Table(f"Inputs{taken_over(summary, 'inputs')}", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
         Table("Events", times, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]),
         _guidance_table(summary),
         _tick_table(summary),
@@ -114,7 +115,7 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
         [*row, *(slowest_settling(summary, channel, kind) for kind in settling)]
         for channel, row in zip(summary["errors"], table_rows(summary["errors"], columns, units), strict=True)
     ]
-    caption = f"Tracking error ({summary['error']})"
+    caption = f"Tracking error ({summary['error']}){taken_over(summary, 'errors')}"
     legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
     return Table(caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend)
 
@@ -156,4 +157,4 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
         ]
         if latency is not None:
             rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
-    return Table("Ticks of the controller", [Column("", "")], rows)
+    return Table(f"Ticks of the controller{taken_over(summary, 'ticks')}", [Column("", "")], rows)

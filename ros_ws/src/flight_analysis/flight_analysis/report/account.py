@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The account of a flight: the samples that its log should hold and holds, by topic, and the outcome that follows."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.pose import every
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.modes import Mode
+from flight_core.outcome import COMPLETED, INCOMPLETE, UNKNOWN
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
+from flight_core.tape import Recording, Signal, Tape
+
+WHOLE = 0.99  # least share of the samples of a topic without a remark
+SILENCE = 1.0  # s: a longer gap is named, also where the share is large
+REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
+LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
+STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
+TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
+
+
+class TopicAccount(NamedTuple):
+    """The samples of a topic. Times in s of flight time; None without a sample."""
+
+    expected: int | None  # None: unknown, as in a log without the rates or the begin of its flight
+    found: int
+    first: float | None
+    last: float | None
+    gap: float | None  # longest interval between two samples
+    gap_at: float | None  # begin of the interval
+    repeated: int  # samples with the stamp of the sample before, except in a failsafe; not among `found`
+    unset: int  # samples with a zero stamp, left out
+    step: float  # of the clock of the stamps, s; 0 without a step
+    left_out: int  # samples after the step
+
+    @property
+    def share(self) -> float | None:
+        """Share of the expected samples, at most 1; None where the number is unknown."""
+        return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
+
+
+class Account(NamedTuple):
+    """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for the outcome."""
+
+    end: float  # s, flight time of the end
+    topics: dict[str, TopicAccount]
+    lacks: tuple[str, ...]
+
+    def over(self, *topics: str) -> str:
+        """The part of these topics that a figure is taken over; empty for whole topics."""
+        shares = {name: self.topics[name].share for name in topics if name in self.topics}
+        parts = [
+            f"{math.floor(100.0 * share)} % of {name}" for name, share in shares.items() if share is not None and share < WHOLE
+        ]
+        return f"over {', '.join(parts)}" if parts else ""
+
+    def as_json(self) -> dict[str, Any]:
+        """The account for `summary.json`."""
+        topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
+        return {"end": self.end, "topics": topics, "lacks": list(self.lacks)}
+
+
+def final_outcome(outcome: str, account: Account) -> str:
+    """The outcome with what the log lacks: "completed, log incomplete: ...". An early end stays as it is."""
+    base = outcome.partition(f", {INCOMPLETE}")[0]
+    if not account.lacks or not base.startswith((COMPLETED, UNKNOWN)):
+        return base
+    return f"{base}, {INCOMPLETE}: {'; '.join(account.lacks)}"
+
+
+def flown(tape: Tape) -> Tape:
+    """The tape up to the controller's last u: later samples belong to the shutdown of the processes.
+
+    A u that ends much earlier than y and y_m, or before the end of a whole flight, is a gap of the log: nothing is cut there.
+    """
+    lasts = [int(tape[name].stamp_ns[-1]) for name in ("y", "y_m", "u") if name in tape and len(tape[name].stamp_ns)]
+    if "u" not in tape or not len(tape["u"].stamp_ns):
+        return tape
+    end_ns, planned_ns = lasts[-1], _planned_ns(tape)
+    if planned_ns is not None and end_ns < planned_ns - LATE_TICK_NS and min(lasts) == end_ns < max(lasts) - LATE_TICK_NS:
+        end_ns = planned_ns
+    elif min(lasts[:-1], default=end_ns) - end_ns > nanoseconds(SILENCE):
+        return tape
+    return Tape(
+        {name: signal.until(end_ns) for name, signal in tape.signals.items()},
+        tape.start_ns, tape.notes, tape.outcome, tape.scenario, tape.recording, tape.duration,
+    )  # fmt: skip
+
+
+def _planned_ns(tape: Tape) -> int | None:
+    """Stamp of the planned end; None where the log does not have it."""
+    planned = tape.scenario.flight.duration if isinstance(tape.scenario, Scenario) else tape.duration
+    return None if planned is None else tape.start_ns + nanoseconds(planned)
+
+
+def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, simulated: bool = True) -> Account:
+    """The account of a flight.
+
+    The expected number of samples is rate times time, from t = 0 to the planned end where the log knows both, else from the
+    first sample of the topic to the last sample of any. Ticks of the controller count from the first, without the ticks
+    that a busy host left out. `simulated`: the aircraft of the scenario flew, no autopilot.
+    """
+    lasts = [int(signal.stamp_ns.max()) for name, signal in tape.signals.items() if name in RATED and len(signal.stamp_ns)]
+    planned_ns, end_ns = _planned_ns(tape), max(lasts, default=tape.start_ns)
+    from_start = planned_ns is not None and simulated
+    if planned_ns is not None and simulated and outcome.startswith((COMPLETED, UNKNOWN)):
+        end_ns = planned_ns
+    expected = {} if scenario is None else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
+    names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
+    topics = {name: _topic(tape, name, expected.get(name), end_ns) for name in names}
+    end = seconds(end_ns - tape.start_ns)
+    failsafe = 0
+    if "internals" in tape and "mode" in tape["internals"].names:
+        failsafe = int(np.count_nonzero(tape["internals"]["mode"] != Mode.ENGAGED))
+    for name, topic in topics.items():
+        # Stamps rest during a failsafe. Further equal stamps are of a clock that stands, and no sample is known to be new.
+        repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
+        topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
+    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end))]
+    return Account(end, topics, (*_lost_parts(tape.notes), *lacks))
+
+
+RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
+
+
+def _lost_parts(notes: Iterable[str]) -> list[str]:
+    return [note.partition(";")[0] for note in notes if "and missing; the log is a part" in note]
+
+
+def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
+    """The number of samples by topic that the log of a flight should hold, where this is known."""
+    aircraft, sensors = scenario.aircraft, scenario.aircraft.sensors
+    y_ns = period_ns(aircraft.rate, "aircraft.rate")
+    periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
+    if simulated:
+        periods |= {"y": y_ns} | {name: y_ns for name in ("truth",) if name in tape or name in tape.recording}
+        periods |= {"pose": every(aircraft.rate) * y_ns} if "pose" in tape or "pose" in tape.recording else {}
+    expected = {}
+    for name, step_ns in periods.items():
+        first_ns = tape.start_ns
+        if not from_start and name in tape:
+            first_ns = int(tape[name].stamp_ns[0])
+        delay_ns = nanoseconds(sensors.delay) if name == "y" else 0
+        count = max((end_ns - delay_ns - first_ns) // step_ns + 1, 0)
+        if name == "y" and sensors.dropout:
+            mean = count * (1.0 - sensors.dropout)
+            count = max(math.floor(mean - 4.0 * math.sqrt(mean * sensors.dropout)), 0)
+        expected[name] = count
+    if not simulated:  # the controller is inactive until the bridge engages
+        return expected
+    ticks, engaged = _ticks(tape, period_ns(scenario.controller.rate, "controller.rate"), end_ns)
+    expected |= dict.fromkeys(TICKS, ticks)
+    if scenario.guidance is not None:
+        steps = max(math.floor(engaged * scenario.guidance.rate / scenario.controller.rate) - 2, 0)
+        expected |= dict.fromkeys(("guidance", "u_m"), steps)
+    return expected
+
+
+def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
+    """The number of ticks of the controller up to the end, and the number of engaged ticks."""
+    begins = [int(tape[name].stamp_ns[0]) for name in TICKS if name in tape and len(tape[name].stamp_ns)]
+    if not begins:
+        return max((end_ns - tape.start_ns) // step_ns + 1, 0), 0.0
+    begin_ns = min(begins)
+    count = max((end_ns - begin_ns) // step_ns + 1, 1)
+    if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
+        return count, float(count)
+    log = tape["internals"]
+    steps = np.diff(log["number"])
+    numbered = float(log["number"][0]) + float(np.where(steps > 0, steps, 1.0).sum())
+    begin_ns = min(begin_ns, int(log.stamp_ns[0]) - (int(log["number"][0]) - 1) * step_ns)
+    last_ns = int(log.stamp_ns[-1] + round(float(log["age"][-1]) * NANOSECONDS))
+    slow = max((last_ns - int(log.stamp_ns[0])) // step_ns + log["number"][0] - numbered, 0.0)
+    ticks = max((end_ns - begin_ns) // step_ns + 1 - math.ceil(slow), 1)
+    return int(ticks), float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
+
+
+def _topic(tape: Tape, name: str, expected: int | None, end_ns: int) -> TopicAccount:
+    of = tape.recording.get(name, Recording(0))
+    signal = tape.signals.get(name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))).until(end_ns)
+    count, t = len(signal.stamp_ns), (signal.stamp_ns - tape.start_ns) / NANOSECONDS
+    gaps = np.diff(t)
+    longest = int(np.argmax(gaps)) if len(gaps) else None
+    return TopicAccount(
+        expected, count,
+        float(t[0]) if count else None, float(t[-1]) if count else None,
+        None if longest is None else float(gaps[longest]), None if longest is None else float(t[longest]),
+        of.repeated if of.found else int(np.count_nonzero(gaps == 0.0)), of.unset, seconds(of.step_ns), of.left_out,
+    )  # fmt: skip
+
+
+def _lack(name: str, topic: TopicAccount, end: float) -> str:
+    """What a topic lacks, as a sentence without a verb; empty for a whole topic."""
+    facts = []
+    if topic.step and topic.last is not None:
+        facts.append(f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s")
+    if topic.unset:
+        facts.append(f"{topic.unset} samples without a stamp")
+    elif topic.repeated > REPEATS * topic.found:
+        facts.append(f"{topic.repeated} samples with the stamp of the sample before")
+    missing = topic.share is not None and topic.share < WHOLE
+    if missing or name in STEADY:
+        tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
+        if tail > min((1.0 - WHOLE) * end, SILENCE):
+            facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
+        if topic.gap is not None and topic.gap_at is not None and topic.gap > SILENCE:
+            facts.append(f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s")
+    if not (facts or missing):
+        return ""
+    if topic.expected is None:
+        return f"{name}: {', '.join(facts)}"
+    return ", ".join([f"{name} {topic.found} of {topic.expected} samples", *facts])
+
+
+def account_of_json(summary: Mapping[str, Any]) -> Account | None:
+    """The account in a summary; None for a summary of an earlier version."""
+    content = summary.get("account")
+    if content is None:
+        return None
+    keys = TopicAccount._fields
+    topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
+    return Account(content["end"], topics, tuple(content["lacks"]))

@@ -1,0 +1,182 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The account of a flight: every command says what a log lacks, and no figure stands for more than was recorded."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from tests.damaged import DAMAGES, damage
+from tests.recordings import EPOCH
+
+from flight_analysis.metrics import error_metrics, sample_times
+from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
+from flight_analysis.report.summary import taken_over
+from flight_bringup.fly import fly_and_report
+from flight_bringup.scenarios import find_scenario
+from flight_cli.replay import replay
+from flight_cli.report import report
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_log.clock import StampClock
+from flight_log.rosbag2_metadata import METADATA, bag_files
+from flight_view.flight import Flight
+
+pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+
+TOPICS = ("y", "y_m", "u", "internals", "truth", "pose")
+TABLES = ("errors", "inputs", "ticks")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a flight of two seconds in one process, with the first command of the scenario."""
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 2.0})
+    return fly_and_report(scenario, tmp_path_factory.mktemp("runs")).mcap
+
+
+@pytest.fixture(scope="module")
+def figures(whole: Path) -> dict[str, Any]:
+    """The summary of the whole log."""
+    return read_flight(whole.parent).summary
+
+
+def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What `rise-di replay --json` prints."""
+    with pytest.raises(typer.Exit) as end:
+        replay(log, as_json=True)
+    assert end.value.exit_code in {0, 1}
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
+
+
+def test_whole_log_lacks_nothing(whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends included."""
+    assert (figures["outcome"], figures["notes"], figures["account"]["lacks"]) == ("completed", [], [])
+    counts = {name: topic["expected"] for name, topic in figures["account"]["topics"].items()}
+    assert counts == {"y": 1001, "y_m": 1001, "truth": 1001, "u": 201, "internals": 201, "pose": 101}
+    assert [taken_over(figures, table) for table in TABLES] == ["", "", ""]
+    result = replayed(whole, capsys)
+    assert (result["checked"], result["ticks"], result["expected"], result["notes"]) == (201, 201, 201, [])
+
+
+@pytest.mark.parametrize("since", [0, EPOCH], ids=["flight time", "time of day"])
+@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize("topic", TOPICS)
+def test_every_command_says_what_log_lacks(
+    topic: str,
+    name: str,
+    since: int,
+    whole: Path,
+    figures: dict[str, Any],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = damage(whole, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name], from_ns=since)
+    if topic in {"y", "y_m"} and (name == "stamps are zero" or (since and name == "stamps are zero to the middle")):
+        with pytest.raises(ParameterError, match=f"found no sample of {topic} with a stamp, expected a flight with y and y_m"):
+            read_flight(log)
+        return
+    summary = read_flight(log).summary
+    assert summary["outcome"].startswith(f"completed, log incomplete: {topic} ")
+    for table in TABLES:
+        if json.dumps(summary[table]) != json.dumps(figures[table]):
+            assert taken_over(summary, table).startswith(", over ")
+    flight = Flight(log)
+    while flight.update():
+        pass
+    flight.counted()
+    assert any(topic in sentence for sentence in flight.faults())
+    if since or (topic == "internals" and "zero" in name):
+        return  # a replay takes its time, and needs the times of the ticks
+    result = replayed(log, capsys)
+    assert any(note.startswith(f"the log lacks {topic} ") for note in result["notes"])
+    if topic in {"u", "internals"}:
+        assert result["checked"] < result["expected"] == 201
+
+
+def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
+    report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
+    output = " ".join(capsys.readouterr().out.split())
+    assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
+    assert "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in output
+    assert "over 33 % of truth" in (log.parent / "report.html").read_text(encoding="utf-8")
+
+
+def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/u", DAMAGES["ends at a third"])
+    with pytest.raises(typer.Exit):
+        replay(log)
+    output = capsys.readouterr().out
+    assert output.startswith("67 of 201 ticks checked, every bit equal\n")
+    assert "note: 134 ticks have no sample on the topic u: what was sent is not compared" in output
+
+
+def test_outcome_survives_lost_summary(whole: Path, tmp_path: Path) -> None:
+    for kept, expected in ((True, "completed"), (False, "completed")):
+        run = shutil.copytree(whole.parent, tmp_path / str(kept), dirs_exist_ok=True)
+        if not kept:
+            (run / SUMMARY).unlink()
+        assert write_report(run).flight.summary["outcome"] == expected
+
+
+def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(whole.parent, tmp_path / "run")
+    metadata = (run / METADATA).read_text(encoding="utf-8")
+    name = bag_files(run)[0].name
+    (run / METADATA).write_text(
+        metadata.replace(f"relative_file_paths:\n  - {name}", f"relative_file_paths:\n  - {name}\n  - part_1.mcap"),
+        encoding="utf-8",
+    )
+    assert "part_1.mcap" in (run / METADATA).read_text(encoding="utf-8")
+    summary = read_flight(run).summary
+    assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
+    assert summary["outcome"] == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+
+
+def stamps(*parts: range) -> Iterator[Any]:
+    """Stamps of 100 Hz in ns by their numbers."""
+    yield from (np.array(part, dtype=np.int64) * (NANOSECONDS // 100) for part in parts)
+
+
+def test_stray_messages_are_no_step_of_clock() -> None:
+    """A second publisher with old stamps beside the first; a step is of successive messages."""
+    first, second = stamps(range(1000, 1200), range(200))
+    stamp_ns = np.stack([first, second], axis=1).ravel()
+    clock = StampClock()
+    keep, count = clock.usable(stamp_ns, np.repeat(first, 2), more=False, end=True)
+    assert keep.all()
+    assert (count, clock.recording().step_ns) == (400, 0)
+
+
+def test_clock_step_is_found_across_batches() -> None:
+    stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
+    log_ns = np.concatenate([*stamps(range(1000, 1200))])
+    clock, taken, usable = StampClock(), 0, 0
+    while taken < len(stamp_ns):
+        end = min(taken + 15, len(stamp_ns))
+        more = end < len(stamp_ns)
+        keep, count = clock.usable(stamp_ns[taken:end], log_ns[taken:end], more=more, end=not more)
+        taken, usable = taken + count, usable + int(keep.sum())
+    of = clock.recording()
+    assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
+
+
+def test_rms_is_weighted_by_time() -> None:
+    """Of a second with e = 3, nine tenths are missing after a second with e = 1: by hand sqrt((1 + 9) / 2)."""
+    t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
+    e = np.where(t < 1.0, 1.0, 3.0)
+    times = sample_times(np.round(t * 1e9).astype(np.int64))
+    assert error_metrics(e, times).rms == pytest.approx(5.0**0.5, rel=5e-3)
+    assert error_metrics(e).rms < 1.4
+
+
+def test_equal_intervals_change_no_bit() -> None:
+    e = np.random.default_rng(1).standard_normal(1001)
+    assert error_metrics(e, sample_times(EPOCH + np.arange(1001) * 2_000_000)) == error_metrics(e)
