@@ -319,7 +319,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _find_conflicts(self) -> None:
         """Tell the bridge which topics have two publishers: of two autopilots y would be mixed, and both would be flown.
 
-        They are those that are read and those of setpoints. Transmitters may override in any number, others may request a mode.
+        Checked are the topics that the bridge reads, and the topics of setpoints. Several transmitters may override, and any
+        node may request a mode.
         """
         read = {
             subscription.name

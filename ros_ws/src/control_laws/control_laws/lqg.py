@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Linear-quadratic Gaussian control (LQG): the trim corrected by the observer, and no further feedback."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from control_laws.nominal_model import NominalModel, saturate
 from flight_core.parameters import require
@@ -23,7 +23,7 @@ class LqgState(NamedTuple):
 def _limited(
     state: LqgState, measured: Measurements, dt: Array, params: LqgParams, limits: Limits
 ) -> tuple[LqgState, Array, Array]:
-    """U = u_trim, u_o of the observer included."""
+    """U = u_trim, shape (m,), saturated. u_trim contains u_o of the observer."""
     u, _ = saturate(measured.u_trim, measured, dt, limits)
     return state, measured.u_trim, u
 
@@ -53,6 +53,6 @@ class LqgConfig(ControllerConfig):
         """The law extended by the observer."""
         return CONTROL_LAW
 
-    def law_params(self) -> Any:
-        """The law has none."""
+    def law_params(self) -> LqgParams:
+        """The empty parameters of the law."""
         return LqgParams()

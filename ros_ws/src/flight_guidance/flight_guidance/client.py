@@ -10,7 +10,7 @@ import numpy as np
 
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
-from flight_guidance.modes import TARGETS
+from flight_guidance.modes import bits
 from flight_ros.client import Client
 from flight_ros.messages import Encoder, NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
@@ -46,9 +46,9 @@ class TargetClient(Client):
             self._sent = time.monotonic()
             encoder = Encoder([*values], self._node.get_fully_qualified_name())
             self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
-        taken = sum(1 << TARGETS.index(name) for name in values)
+        given = bits(values)
         return any(
-            int(sample.get("given", 0.0)) & taken == taken
+            int(sample.get("given", 0.0)) & given == given
             and all(sample.get(f"target.{name}") == value for name, value in values.items())
             for sample in self._received()
         )

@@ -68,14 +68,13 @@ def u_m(state: GuidanceState) -> FloatArray:
 
 def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) -> FloatArray:
     """A sample of the log, in the order of `names`: inputs, state after the step, commands. `route`: a `digest`."""
-    given = sum(1 << k for k, name in enumerate(TARGETS) if name in inputs.given)
     return np.array(
         [
             *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
             *(state.joining, commands.track, commands.missed),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), inputs.begin, given),
+            *(seconds(inputs.pose_age_ns), inputs.begin, modes.bits(inputs.given)),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,

@@ -8,7 +8,7 @@ a sample of the log can be computed again from the sample before.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from enum import IntEnum
 from functools import partial, reduce
 from operator import or_
@@ -169,6 +169,11 @@ class Commands(NamedTuple):
     climb_limited: bool = False
     V_limited: bool = False
     slew_limited: bool = False
+
+
+def bits(names: Collection[str]) -> int:
+    """The names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
+    return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
 
 
 def read_target(values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target") -> None:

@@ -44,8 +44,8 @@ def stepper(dt: float, params: Model) -> Stepper:
     x = np.eye(n, n + 3 * m)
     u: FloatArray = np.eye(3 * m, n + 3 * m, n).reshape(3, m, n + 3 * m)
 
-    def driven(time: Any, x: Array, u: Array, model: Model) -> Array:
-        return dt * x_m_dot(time, x, u[round(2.0 * time)], model)  # time 0, 1/2, 1 of a step of length 1
+    def driven(t: Any, x: Array, u: Array, params: Model) -> Array:
+        return dt * x_m_dot(t, x, u[round(2.0 * t)], params)  # t = 0, 1/2, 1 of a step of length 1
 
     columns = rk4(driven, 0.0, x, u, params, 1.0)
     return Stepper(columns[:, :n], columns[:, n:])

@@ -23,8 +23,8 @@ from rise_di_controller.feedforward import ZERO_REAL_PART
 ComplexArray = NDArray[np.complex128]
 
 MAX_FINITE_ZERO = 1e4
-"""1/s. Larger zeros are the pencil's infinite ones. They are double, so rounding may make them finite, but not less than about
-1e7 (the inverse root of 2e-16). The largest finite one in the library is 7.2."""
+"""1/s. The pencil has double zeros at infinity. Rounding may make these finite, but not less than about 1e7, the inverse
+root of 2e-16. The largest finite zero in the library is 7.2."""
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one are zero: rounding gives 1e-15, published data have five digits."""

@@ -13,7 +13,7 @@ from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times,
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
-from flight_guidance.modes import TARGETS, Lateral, Vertical
+from flight_guidance.modes import TARGETS, Lateral, Vertical, bits
 from flight_guidance.params import GuidanceConfig
 
 UNITS: Mapping[str, str] = {
@@ -97,7 +97,7 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
     if "missed" not in log.names:
         return []
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    given = log["given"].astype(np.int64) & (1 << TARGETS.index("leg"))  # a leg chosen again begins anew
+    given = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins anew
     edges = np.flatnonzero((np.diff(legs) != 0.0) | (given[1:] != 0)) + 1
     flown = []
     for first, after in zip([0, *edges], [*edges, len(t)], strict=True):

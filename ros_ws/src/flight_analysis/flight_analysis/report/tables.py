@@ -122,11 +122,11 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
 
 def _guidance_table(summary: Mapping[str, Any]) -> Table:
     guidance = summary["guidance"] or {"segments": ()}
-    held = ("rms", "max", "overshoot", "settling")
+    metrics = ("rms", "max", "overshoot", "settling")
     columns = [Column("", head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
-        columns += [Column(group, head) for head in ("held", *held[:-1], "settling (s)")]
-    columns += [Column("V (m/s)", head) for head in held[:2]]
+        columns += [Column(group, head) for head in ("held", *metrics[:-1], "settling (s)")]
+    columns += [Column("V (m/s)", head) for head in metrics[:2]]
     rows = []
     for segment in guidance["segments"]:
         name = segment["lateral"]["quantity"] if segment["leg"] is None else f"leg {segment['leg']}"
@@ -134,8 +134,8 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
         for quantity in (segment["lateral"], segment["vertical"]):
             unit, factor = QUANTITY_UNITS[quantity["quantity"]]
             factors = (factor, factor, factor, 1.0)
-            row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in held), factors)]
-        rows.append([*row, *(format_value(segment["V"][name]) for name in held[:2])])
+            row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in metrics), factors)]
+        rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
     return Table("Guidance by segment", columns, rows, GUIDANCE_LEGEND if rows else "")
 
 
