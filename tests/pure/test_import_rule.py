@@ -34,6 +34,7 @@ IMPORTS: dict[str, set[str]] = {
         "rise_di_controller",
     },
     "flight_analysis.metrics": {"flight_core", "rise_di_controller"},
+    "flight_analysis.c_export": {"flight_analysis.closed_loop", "flight_core", "flight_log", "rise_di_controller"},
     "flight_analysis.design": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.metrics",
         "flight_core", "flight_log", "reference_model", "rise_di_controller",
@@ -59,9 +60,9 @@ IMPORTS: dict[str, set[str]] = {
         "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "rise_di_controller",
     },
     "flight_cli": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop", "flight_analysis.design",
-        "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
-        "flight_view", "flight_guidance", "rise_di", "rise_di_controller",
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.c_export", "flight_analysis.closed_loop",
+        "flight_analysis.design", "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign",
+        "flight_core", "flight_log", "flight_view", "flight_guidance", "rise_di", "rise_di_controller",
     },
 }  # fmt: skip
 """Which units of the stack a unit imports; nodes, executables and clients import flight_ros beside these."""

@@ -10,8 +10,23 @@ setup(
     description="Flights without ROS: the closed loop in one process, metrics, gain design, the report page.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
-    packages=["flight_analysis", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.report"],
-    package_data={"flight_analysis": ["py.typed", "report/*.jinja", "report/*.js", "report/scene/*", "report/vendor/*"]},
+    packages=[
+        "flight_analysis",
+        "flight_analysis.c_export",
+        "flight_analysis.closed_loop",
+        "flight_analysis.design",
+        "flight_analysis.report",
+    ],
+    package_data={
+        "flight_analysis": [
+            "py.typed",
+            "c_export/source/*",
+            "report/*.jinja",
+            "report/*.js",
+            "report/scene/*",
+            "report/vendor/*",
+        ]
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_analysis"]),
         ("share/flight_analysis", ["package.xml"]),

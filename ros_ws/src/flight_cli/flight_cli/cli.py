@@ -30,6 +30,7 @@ COMMANDS = MappingProxyType(
         "play": "Publish the topics of a recorded flight again with their timing.",
         "watch": "See a flight on a page, live while it is recorded, or again later.",
         "repair": "Rebuild the log of a run whose recorder was killed, or that is damaged.",
+        "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
         "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
         "gains": "Select gains for an airframe, and check every condition on them.",
         "airframes": "Show the airframes of the library, and what the theorem asks of each.",

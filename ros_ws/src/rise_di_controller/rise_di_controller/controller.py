@@ -20,6 +20,7 @@ class ControlOutput(NamedTuple):
 
     stamp_ns: int  # of y, the source of u
     u: FloatArray  # (m,) in the order of the parameters' inputs
+    inputs: guard.TickInputs
     log: Callable[[], FloatArray]
 
     @property
@@ -46,6 +47,11 @@ class Controller:
     def mode(self) -> Mode:
         """Mode of the guard."""
         return self._state.mode
+
+    @property
+    def state(self) -> guard.ControllerState:
+        """State of the guard and the law after the last tick."""
+        return self._state
 
     @property
     def has_internals(self) -> bool:
@@ -103,7 +109,7 @@ class Controller:
         age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard.limits, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
-        return ControlOutput(inputs.stamp_ns, self._state.u, log)
+        return ControlOutput(inputs.stamp_ns, self._state.u, inputs, log)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
         """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago than the age limit.

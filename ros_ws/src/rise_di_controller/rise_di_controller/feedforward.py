@@ -30,13 +30,15 @@ class Nominal(NamedTuple):
     path_A: Array  # (n, n), path A
     path_gravity: Array  # (n, n), path gravity
     lead: Array  # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
+    sine_states: tuple[int, ...]  # indices of the states with a sine term
 
 
 def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array) -> Nominal:
     """The nominal model with the products for a tick. Omega = C B is regular."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
-    return Nominal(A, B, C, gravity, inverse, path, product(path, A), product(path, gravity), lead)
+    angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
+    return Nominal(A, B, C, gravity, inverse, path, product(path, A), product(path, gravity), lead, angles)
 
 
 class FeedforwardState(NamedTuple):
@@ -71,10 +73,10 @@ def x_dot(t: Array, x: Array, forced: Array, nominal: Nominal) -> Array:
 
 
 def sines(x: FloatArray, nominal: Nominal) -> FloatArray:
-    """Sine of the states with a sine term, 0 for the remaining states, shape (n,). NumPy arrays only."""
+    """Sine of the states with a sine term, 0 for the remaining states, shape (n,) or (n, N). NumPy arrays only."""
     values = np.zeros_like(x)
-    for j in np.flatnonzero(nominal.gravity.any(axis=0)).tolist():
-        values[j] = sine(float(x[j]))  # a Python float: a fifth of the time of an array
+    for j in nominal.sine_states:
+        values[j] = sine(x[j].item() if x.ndim == 1 else x[j])  # a Python float: a fifth of the time of an array
     return values
 
 

@@ -35,6 +35,11 @@ class ScheduleState(NamedTuple):
     scale: Array  # (m,) factor of input_scale
 
 
+def airspeed_range(params: ScheduleParams) -> tuple[Array, Array]:
+    """Airspeeds where the factor is the largest and the least of SCALE_RANGE, m/s."""
+    return params.speed / math.sqrt(SCALE_RANGE[1]), params.speed / math.sqrt(SCALE_RANGE[0])
+
+
 def target_scale(y: Array, params: ScheduleParams) -> Array:
     """Factor of input_scale at the airspeed V0 + V of y, shape (m,): (V0 / (V0 + V))^2 within SCALE_RANGE; 1 in channel V.
 
@@ -42,7 +47,7 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
     near the altitude of the trim. A thrust does not follow the ratio.
     """
     xp = array_namespace(y)
-    least, largest = (params.speed / math.sqrt(scale) for scale in reversed(SCALE_RANGE))
+    least, largest = airspeed_range(params)
     V = params.speed + (params.airspeed * y).sum(axis=0)
     ratio = params.speed / xp.minimum(xp.maximum(V, least + 0.0 * V), largest + 0.0 * V)
     return params.airspeed + (1.0 - params.airspeed) * (ratio * ratio)

@@ -20,6 +20,7 @@ from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
+from rise_di_controller.params import ControllerConfig
 
 Record = Callable[[Mapping[str, Signal]], None]
 """Takes the samples of a part of a flight, by topic."""
@@ -49,6 +50,7 @@ def simulate(
     scenario: Scenario,
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
+    control: Callable[[ControllerConfig], Controller] = Controller,
 ) -> Tape:
     """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says.
 
@@ -58,7 +60,7 @@ def simulate(
     change = 'a function of the flight time; scenario.vary(flight={"duration": ...}) changes the duration'
     require(progress is None or callable(progress), "progress", progress, change)
     parts: list[Mapping[str, Signal]] = []
-    outcome = fly(scenario, parts.append, progress, guide)
+    outcome = fly(scenario, parts.append, progress, guide, control)
     signals = {}
     for topic, last in parts[-1].items():
         samples = [part[topic] for part in parts if topic in part]
@@ -72,11 +74,12 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     record: Record,
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
+    control: Callable[[ControllerConfig], Controller] = Controller,
 ) -> str:
     """Fly a scenario and return the outcome. `record` takes the samples once per simulated second and at the end.
 
     `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario with guidance;
-    the default receives the true pose.
+    the default receives the true pose. `control` makes the controller.
 
     Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
     holds u until the next u. A lost sample of y is not recorded; a delayed sample keeps the stamp. A flight that diverges
@@ -84,7 +87,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     """
     require_euler(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
-    reference, controller = Reference(scenario.reference_model), Controller(scenario.controller)
+    reference, controller = Reference(scenario.reference_model), control(scenario.controller)
     guidance = None if scenario.guidance is None else guide(scenario.guidance)
     signals = {
         "y": _SignalBuilder(tuple(scenario.aircraft.channels().outputs)),

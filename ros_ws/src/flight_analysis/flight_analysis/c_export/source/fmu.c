@@ -1,0 +1,250 @@
+/* SPDX-FileCopyrightText: RISE-DI contributors
+ * SPDX-License-Identifier: Apache-2.0
+ *
+ * The controller as a co-simulation unit of FMI 2.0. A step of the unit is a tick: y and y_m have the stamp of the begin of the step,
+ * and u is valid after the step. Source: FMI 2.0.5, sections 2.1 and 4.2. Value references: modelDescription.xml.
+ */
+#include <stddef.h>
+
+#include "rise_di.c"
+
+enum { Y = 0, Y_M = 100, U = 200, ACTIVE = 300, Y_NEW = 301, Y_M_NEW = 302, MODE = 400 };
+enum { OK = 0, DISCARD = 2, ERROR = 3 };
+
+typedef struct {
+    void (*logger)(void *, const char *, int, const char *, const char *, ...);
+    void *(*allocate)(size_t, size_t);
+    void (*release)(void *);
+    void (*step_finished)(void *, int);
+    void *environment;
+} callbacks;
+
+typedef struct {
+    rise_di_controller controller;
+    rise_di_real y[RISE_DI_M], y_m[RISE_DI_M];
+    int active, y_new, y_m_new;
+    void (*release)(void *);
+} unit;
+
+static const rise_di_parameters exported = RISE_DI_PARAMETERS;
+
+const char *fmi2GetTypesPlatform(void);
+const char *fmi2GetVersion(void);
+int fmi2SetDebugLogging(unit *, int, size_t, const char *const *);
+unit *fmi2Instantiate(const char *, int, const char *, const char *, const callbacks *, int, int);
+void fmi2FreeInstance(unit *);
+int fmi2SetupExperiment(unit *, int, double, double, int, double);
+int fmi2EnterInitializationMode(unit *);
+int fmi2ExitInitializationMode(unit *);
+int fmi2Terminate(unit *);
+int fmi2Reset(unit *);
+int fmi2GetReal(unit *, const unsigned *, size_t, double *);
+int fmi2GetInteger(unit *, const unsigned *, size_t, int *);
+int fmi2GetBoolean(unit *, const unsigned *, size_t, int *);
+int fmi2GetString(unit *, const unsigned *, size_t, const char **);
+int fmi2SetReal(unit *, const unsigned *, size_t, const double *);
+int fmi2SetInteger(unit *, const unsigned *, size_t, const int *);
+int fmi2SetBoolean(unit *, const unsigned *, size_t, const int *);
+int fmi2SetString(unit *, const unsigned *, size_t, const char *const *);
+int fmi2DoStep(unit *, double, double, int);
+int fmi2CancelStep(unit *);
+/* Not offered by the unit, as modelDescription.xml says by silence; every function of FMI 2.0 has to exist. */
+int fmi2GetFMUstate(unit *, void **);
+int fmi2SetFMUstate(unit *, void *);
+int fmi2FreeFMUstate(unit *, void **);
+int fmi2SerializedFMUstateSize(unit *, void *, size_t *);
+int fmi2SerializeFMUstate(unit *, void *, char *, size_t);
+int fmi2DeSerializeFMUstate(unit *, const char *, size_t, void **);
+int fmi2GetDirectionalDerivative(unit *, const unsigned *, size_t, const unsigned *, size_t, const double *, double *);
+int fmi2SetRealInputDerivatives(unit *, const unsigned *, size_t, const int *, const double *);
+int fmi2GetRealOutputDerivatives(unit *, const unsigned *, size_t, const int *, double *);
+int fmi2GetStatus(unit *, int, int *);
+int fmi2GetRealStatus(unit *, int, double *);
+int fmi2GetIntegerStatus(unit *, int, int *);
+int fmi2GetBooleanStatus(unit *, int, int *);
+int fmi2GetStringStatus(unit *, int, const char **);
+
+const char *fmi2GetTypesPlatform(void) { return "default"; }
+
+const char *fmi2GetVersion(void) { return "2.0"; }
+
+int fmi2SetDebugLogging(unit *u, int on, size_t count, const char *const *categories) {
+    (void)u, (void)on, (void)count, (void)categories;
+    return OK;
+}
+
+int fmi2Reset(unit *u) {
+    rise_di_start(&u->controller, &exported);
+    fill(u->y, RISE_DI_M, ZERO);
+    fill(u->y_m, RISE_DI_M, ZERO);
+    u->active = u->y_new = u->y_m_new = 1;
+    return OK;
+}
+
+unit *fmi2Instantiate(const char *name, int type, const char *guid, const char *resources, const callbacks *functions, int visible,
+                      int logging) {
+    unit *u = functions->allocate(1, sizeof(unit));
+    (void)name, (void)guid, (void)resources, (void)visible, (void)logging;
+    if (type != 1) { /* fmi2CoSimulation */
+        return NULL;
+    }
+    if (u != NULL) {
+        u->release = functions->release;
+        (void)fmi2Reset(u);
+    }
+    return u;
+}
+
+void fmi2FreeInstance(unit *u) {
+    if (u != NULL) {
+        u->release(u);
+    }
+}
+
+int fmi2SetupExperiment(unit *u, int tolerance_defined, double tolerance, double start, int stop_defined, double stop) {
+    (void)u, (void)tolerance_defined, (void)tolerance, (void)start, (void)stop_defined, (void)stop;
+    return OK;
+}
+
+int fmi2EnterInitializationMode(unit *u) { return (void)u, OK; }
+
+int fmi2ExitInitializationMode(unit *u) { return (void)u, OK; }
+
+int fmi2Terminate(unit *u) { return (void)u, OK; }
+
+int fmi2CancelStep(unit *u) { return (void)u, ERROR; }
+
+/* The place of a real variable; NULL for an unknown reference. */
+static rise_di_real *real_of(unit *u, unsigned reference) {
+    rise_di_real *const groups[3] = {u->y, u->y_m, u->controller.u};
+    const unsigned group = reference / 100, i = reference % 100;
+    return (group < 3 && i < RISE_DI_M) ? &groups[group][i] : NULL;
+}
+
+static int *boolean_of(unit *u, unsigned reference) {
+    int *const places[3] = {&u->active, &u->y_new, &u->y_m_new};
+    return (reference >= ACTIVE && reference <= Y_M_NEW) ? places[reference - ACTIVE] : NULL;
+}
+
+int fmi2GetReal(unit *u, const unsigned *references, size_t count, double *values) {
+    for (size_t i = 0; i < count; i++) {
+        const rise_di_real *place = real_of(u, references[i]);
+        if (place == NULL) {
+            return ERROR;
+        }
+        values[i] = (double)*place;
+    }
+    return OK;
+}
+
+int fmi2SetReal(unit *u, const unsigned *references, size_t count, const double *values) {
+    for (size_t i = 0; i < count; i++) {
+        rise_di_real *place = real_of(u, references[i]);
+        if (place == NULL || references[i] >= U) {
+            return ERROR;
+        }
+        *place = (rise_di_real)values[i];
+    }
+    return OK;
+}
+
+int fmi2GetInteger(unit *u, const unsigned *references, size_t count, int *values) {
+    for (size_t i = 0; i < count; i++) {
+        if (references[i] != MODE) {
+            return ERROR;
+        }
+        values[i] = (int)u->controller.mode;
+    }
+    return OK;
+}
+
+int fmi2SetInteger(unit *u, const unsigned *references, size_t count, const int *values) {
+    (void)u, (void)references, (void)values;
+    return count == 0 ? OK : ERROR;
+}
+
+int fmi2GetBoolean(unit *u, const unsigned *references, size_t count, int *values) {
+    for (size_t i = 0; i < count; i++) {
+        const int *place = boolean_of(u, references[i]);
+        if (place == NULL) {
+            return ERROR;
+        }
+        values[i] = *place;
+    }
+    return OK;
+}
+
+int fmi2SetBoolean(unit *u, const unsigned *references, size_t count, const int *values) {
+    for (size_t i = 0; i < count; i++) {
+        int *place = boolean_of(u, references[i]);
+        if (place == NULL) {
+            return ERROR;
+        }
+        *place = values[i];
+    }
+    return OK;
+}
+
+int fmi2GetString(unit *u, const unsigned *references, size_t count, const char **values) {
+    (void)u, (void)references, (void)values;
+    return count == 0 ? OK : ERROR;
+}
+
+int fmi2SetString(unit *u, const unsigned *references, size_t count, const char *const *values) {
+    (void)u, (void)references, (void)values;
+    return count == 0 ? OK : ERROR;
+}
+
+int fmi2DoStep(unit *u, double t, double step_size, int no_set_state) {
+    const int64_t now_ns = (int64_t)((t * 1e9) + 0.5);
+    rise_di_status of_y = RISE_DI_TAKEN, of_y_m = RISE_DI_TAKEN;
+    rise_di_output output;
+    (void)step_size, (void)no_set_state;
+    if (u->y_m_new) {
+        of_y_m = rise_di_take_y_m(&u->controller, now_ns, now_ns, u->y_m);
+    }
+    if (u->y_new) {
+        of_y = rise_di_take_y(&u->controller, now_ns, now_ns, u->y);
+    }
+    (void)rise_di_tick(&u->controller, now_ns, u->active != 0, &output);
+    return (of_y == RISE_DI_TAKEN && of_y_m == RISE_DI_TAKEN) ? OK : DISCARD;
+}
+
+int fmi2GetFMUstate(unit *u, void **state) { return (void)u, (void)state, ERROR; }
+
+int fmi2SetFMUstate(unit *u, void *state) { return (void)u, (void)state, ERROR; }
+
+int fmi2FreeFMUstate(unit *u, void **state) { return (void)u, (void)state, ERROR; }
+
+int fmi2SerializedFMUstateSize(unit *u, void *state, size_t *size) { return (void)u, (void)state, (void)size, ERROR; }
+
+int fmi2SerializeFMUstate(unit *u, void *state, char *bytes, size_t size) {
+    return (void)u, (void)state, (void)bytes, (void)size, ERROR;
+}
+
+int fmi2DeSerializeFMUstate(unit *u, const char *bytes, size_t size, void **state) {
+    return (void)u, (void)bytes, (void)size, (void)state, ERROR;
+}
+
+int fmi2GetDirectionalDerivative(unit *u, const unsigned *of, size_t of_count, const unsigned *by, size_t by_count,
+                                 const double *seed, double *values) {
+    return (void)u, (void)of, (void)of_count, (void)by, (void)by_count, (void)seed, (void)values, ERROR;
+}
+
+int fmi2SetRealInputDerivatives(unit *u, const unsigned *of, size_t count, const int *orders, const double *values) {
+    return (void)u, (void)of, (void)count, (void)orders, (void)values, ERROR;
+}
+
+int fmi2GetRealOutputDerivatives(unit *u, const unsigned *of, size_t count, const int *orders, double *values) {
+    return (void)u, (void)of, (void)count, (void)orders, (void)values, ERROR;
+}
+
+int fmi2GetStatus(unit *u, int kind, int *value) { return (void)u, (void)kind, (void)value, DISCARD; }
+
+int fmi2GetRealStatus(unit *u, int kind, double *value) { return (void)u, (void)kind, (void)value, DISCARD; }
+
+int fmi2GetIntegerStatus(unit *u, int kind, int *value) { return (void)u, (void)kind, (void)value, DISCARD; }
+
+int fmi2GetBooleanStatus(unit *u, int kind, int *value) { return (void)u, (void)kind, (void)value, DISCARD; }
+
+int fmi2GetStringStatus(unit *u, int kind, const char **value) { return (void)u, (void)kind, (void)value, DISCARD; }

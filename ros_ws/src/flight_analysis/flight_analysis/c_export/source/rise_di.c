@@ -1,0 +1,769 @@
+/* SPDX-FileCopyrightText: RISE-DI contributors
+ * SPDX-License-Identifier: Apache-2.0
+ *
+ * The RISE-DI controller in C99. rise_di.h says what is called when. Functions and order of operations are those of the Python
+ * modules law, saturation, observer, schedule, feedforward, guard and controller of rise_di_controller, and of flight_core.arithmetic.
+ */
+#include "rise_di.h"
+
+#include <float.h>
+
+#if FLT_EVAL_METHOD != 0
+#error "float and double operations need their own precision: -msse2 -mfpmath=sse on 32-bit x86"
+#endif
+#ifdef __FAST_MATH__
+#error "-ffast-math changes the order of operations"
+#endif
+
+#if !RISE_DI_FLOAT32
+/* Fails under -fsingle-precision-constant, where constants lose digits. */
+typedef char rise_di_constants_are_double[(sizeof(1.0) == sizeof(double)) ? 1 : -1];
+#endif
+
+#define ZERO ((rise_di_real)0)
+#define ONE ((rise_di_real)1)
+#define TWO ((rise_di_real)2)
+#define SIX ((rise_di_real)6)
+#define NANOSECONDS ((rise_di_real)1000000000)
+
+#if RISE_DI_FLOAT32
+#define ROUNDING ((rise_di_real)12582912) /* 1.5 2^23 */
+#define REAL_MAX ((rise_di_real)FLT_MAX)
+#else
+#define ROUNDING ((rise_di_real)6755399441055744) /* 1.5 2^52 */
+#define REAL_MAX ((rise_di_real)DBL_MAX)
+#endif
+
+static rise_di_real lesser(rise_di_real a, rise_di_real b) { return (a < b) ? a : b; }
+
+static rise_di_real greater(rise_di_real a, rise_di_real b) { return (a > b) ? a : b; }
+
+static rise_di_real magnitude(rise_di_real a) { return (a < ZERO) ? -a : a; }
+
+static rise_di_real seconds(int64_t time_ns) { return (rise_di_real)time_ns / NANOSECONDS; }
+
+static void copy(const rise_di_real *from, rise_di_real *to, int32_t count) {
+    for (int32_t i = 0; i < count; i++) {
+        to[i] = from[i];
+    }
+}
+
+static void fill(rise_di_real *values, int32_t count, rise_di_real value) {
+    for (int32_t i = 0; i < count; i++) {
+        values[i] = value;
+    }
+}
+
+/* Whether every value is finite. */
+static bool is_finite(const rise_di_real *values, int32_t count) {
+    bool finite = true;
+    for (int32_t i = 0; i < count; i++) {
+        finite = finite && (values[i] >= -REAL_MAX) && (values[i] <= REAL_MAX);
+    }
+    return finite;
+}
+
+#if (RISE_DI_N > 0) || (RISE_DI_S > 0)
+/* The nearest integer, half to even, for magnitudes below 2^51 (float: 2^22). */
+static rise_di_real rounded(rise_di_real a) { return (a + ROUNDING) - ROUNDING; }
+
+/* result = matrix vector, summed over the columns 0, 1, ... in this order. */
+static void product(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector, rise_di_real *result) {
+    for (int32_t i = 0; i < rows; i++) {
+        rise_di_real total = matrix[i * columns] * vector[0];
+        for (int32_t j = 1; j < columns; j++) {
+            total = total + (matrix[(i * columns) + j] * vector[j]);
+        }
+        result[i] = total;
+    }
+}
+
+/* result = matrix' vector for a matrix of these rows and columns, in the same order. */
+static void product_transposed(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector,
+                               rise_di_real *result) {
+    for (int32_t i = 0; i < columns; i++) {
+        rise_di_real total = matrix[i] * vector[0];
+        for (int32_t j = 1; j < rows; j++) {
+            total = total + (matrix[(j * columns) + i] * vector[j]);
+        }
+        result[i] = total;
+    }
+}
+#endif
+
+/* u within the limits of magnitude, and of rate from `before` in dt. */
+static rise_di_real saturate(rise_di_real u, rise_di_real before, rise_di_real dt, const rise_di_limits *limits, int32_t i) {
+    const rise_di_real reach = limits->rate[i] * dt;
+    const rise_di_real low = greater(lesser(limits->lower[i], before + reach), before - reach);
+    const rise_di_real high = lesser(greater(limits->upper[i], before - reach), before + reach);
+    return lesser(greater(u, low), high);
+}
+
+/* ---- the law, equations (20) to (22) ---- */
+
+/* Equation (20): with the literal sign Pi is first used, then updated. */
+static rise_di_real control(const rise_di_parameters *p, const rise_di_real *scale, const rise_di_law *before,
+                            const rise_di_law *after, int32_t i) {
+    const rise_di_real Pi = (p->sign == (int64_t)RISE_DI_LITERAL) ? before->Pi[i] : after->Pi[i];
+    const rise_di_real integral = p->Lambda[i] * after->integral_e[i];
+    return scale[i] * (-p->D[i] * ((p->K[i] * ((after->e[i] - after->e_0[i]) + integral)) + Pi));
+}
+
+static void engage_law(rise_di_law *law, const rise_di_real *y, const rise_di_real *y_m) {
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        law->e[i] = y[i] - y_m[i];
+        law->e_0[i] = law->e[i];
+        law->integral_e[i] = ZERO;
+        law->Pi[i] = ZERO;
+    }
+}
+
+/* A tick of the law without limits: integral of e and Pi. */
+static void step_law(const rise_di_parameters *p, const rise_di_law *before, const rise_di_real *y, const rise_di_real *y_m,
+                     rise_di_real dt, rise_di_law *after) {
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real e = y[i] - y_m[i];
+        const rise_di_real increment = (dt * (e + before->e[i])) / TWO;
+        rise_di_real s;
+        after->integral_e[i] = before->integral_e[i] + increment;
+        if (p->sign == (int64_t)RISE_DI_LITERAL) {
+            if (e > ZERO) {
+                s = ONE;
+            } else {
+                s = (e < ZERO) ? -ONE : ZERO;
+            }
+        } else {
+            if (p->sign == (int64_t)RISE_DI_IMPLICIT) {
+                const rise_di_real change = e - before->e[i];
+                const rise_di_real linear = change + (p->Lambda[i] * increment);
+                const rise_di_real e_hat = (e + change) - (((dt * p->omega[i]) * p->K[i]) * linear);
+                s = e_hat / (((dt * dt) * p->omega[i]) * p->beta[i]);
+            } else {
+                s = e / p->eps[i];
+            }
+            s = lesser(greater(s, -ONE), ONE);
+        }
+        after->Pi[i] = before->Pi[i] + ((dt * p->beta[i]) * s);
+        after->e[i] = e;
+        after->e_0[i] = before->e_0[i];
+    }
+}
+
+/* Anti-windup of a tick: an outward increment of integral_e or Pi beyond a limit is reduced. Gives u before and after saturation. */
+static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, const rise_di_law *before, rise_di_real dt,
+                      const rise_di_real *u_trim, const rise_di_real *u_before, rise_di_law *after, rise_di_real *u_free,
+                      rise_di_real *u) {
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real total = u_trim[i] + control(p, scale, before, after, i);
+        const rise_di_real beyond = total - saturate(total, u_before[i], dt, &p->limits, i);
+        const rise_di_real increment = after->integral_e[i] - before->integral_e[i];
+        const rise_di_real increment_Pi = after->Pi[i] - before->Pi[i];
+        const rise_di_real change = (((-scale[i] * p->D[i]) * p->K[i]) * p->Lambda[i]) * increment;
+        const rise_di_real change_Pi = (-scale[i] * p->D[i]) * increment_Pi;
+        const bool outward = (change * beyond) > ZERO;
+        const bool outward_Pi = (change_Pi * beyond) > ZERO;
+        const rise_di_real excess = greater(magnitude(beyond) - (outward ? magnitude(change) : ZERO), ZERO);
+        if (outward) {
+            after->integral_e[i] = before->integral_e[i];
+        }
+        if (outward_Pi) {
+            const rise_di_real size = magnitude(change_Pi);
+            const rise_di_real kept = greater(size - excess, ZERO) / ((size > ZERO) ? size : ONE);
+            after->Pi[i] = before->Pi[i] + (kept * increment_Pi);
+        }
+        u_free[i] = u_trim[i] + control(p, scale, before, after, i);
+        u[i] = saturate(u_free[i], u_before[i], dt, &p->limits, i);
+    }
+}
+
+/* Pi of new parameters, without a jump of u. */
+static void retune_law(rise_di_law *law, const rise_di_parameters *old, const rise_di_real *old_scale,
+                       const rise_di_parameters *next, const rise_di_real *next_scale) {
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real u = control(old, old_scale, law, law, i);
+        const rise_di_real linear = (law->e[i] - law->e_0[i]) + (next->Lambda[i] * law->integral_e[i]);
+        law->Pi[i] = ((-next->D[i] * u) / next_scale[i]) - (next->K[i] * linear);
+    }
+}
+
+/* ---- schedule of input_scale over dynamic pressure ---- */
+
+#if RISE_DI_SCHEDULE
+static void target_scale(const rise_di_parameters *p, const rise_di_real *y, rise_di_real *target) {
+    rise_di_real V = p->airspeed[0] * y[0];
+    rise_di_real ratio;
+    for (int32_t i = 1; i < RISE_DI_M; i++) {
+        V = V + (p->airspeed[i] * y[i]);
+    }
+    V = p->speed + V;
+    ratio = p->speed / lesser(greater(V, p->V_least), p->V_largest);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        target[i] = p->airspeed[i] + ((ONE - p->airspeed[i]) * (ratio * ratio));
+    }
+}
+#endif
+
+static void scheduled(const rise_di_parameters *p, const rise_di_law *law, rise_di_real *scale) {
+#if RISE_DI_SCHEDULE
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        scale[i] = p->input_scale[i] * law->scale[i];
+    }
+#else
+    (void)law;
+    copy(p->input_scale, scale, RISE_DI_M);
+#endif
+}
+
+#if RISE_DI_SCHEDULE
+static void follow_schedule(const rise_di_parameters *p, rise_di_law *law, const rise_di_real *y, rise_di_real dt) {
+    rise_di_real target[RISE_DI_M];
+    rise_di_real old_scale[RISE_DI_M];
+    rise_di_real next_scale[RISE_DI_M];
+    const rise_di_real part = lesser(dt / p->time, ONE);
+    target_scale(p, y, target);
+    scheduled(p, law, old_scale);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        law->scale[i] = law->scale[i] + (part * (target[i] - law->scale[i]));
+    }
+    scheduled(p, law, next_scale);
+    retune_law(law, p, old_scale, p, next_scale);
+}
+#endif
+
+/* ---- observer ---- */
+
+#if RISE_DI_S > 0
+static void predict(const rise_di_parameters *p, const rise_di_real *u, const rise_di_real *u_trim, rise_di_real *z) {
+    rise_di_real moved[RISE_DI_S];
+    rise_di_real driven[RISE_DI_S];
+    rise_di_real input[RISE_DI_M];
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        input[i] = u[i] - u_trim[i];
+    }
+    product(p->Phi, RISE_DI_S, RISE_DI_S, z, moved);
+    product(p->Gamma, RISE_DI_S, RISE_DI_M, input, driven);
+    for (int32_t i = 0; i < RISE_DI_S; i++) {
+        z[i] = moved[i] + driven[i];
+    }
+}
+
+static void start_estimates(const rise_di_parameters *p, rise_di_law *law, const rise_di_real *y, const rise_di_real *y_m) {
+    rise_di_real e[RISE_DI_M];
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        e[i] = y[i] - y_m[i];
+    }
+    product_transposed(p->H, RISE_DI_M, RISE_DI_S, e, law->z);
+    fill(law->u_o, RISE_DI_M, ZERO);
+    law->sigma = ZERO;
+}
+
+/* Correction of the estimates by the measured error, and the contribution u_o to the trim. */
+static void correct(const rise_di_parameters *p, rise_di_law *law, const rise_di_real *y, const rise_di_real *y_m,
+                    rise_di_real dt) {
+    rise_di_real innovation[RISE_DI_M];
+    rise_di_real correction[RISE_DI_S];
+    rise_di_real feedback[RISE_DI_M];
+    product(p->H, RISE_DI_M, RISE_DI_S, law->z, innovation);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        innovation[i] = (y[i] - y_m[i]) - innovation[i];
+    }
+    product(p->L, RISE_DI_S, RISE_DI_M, innovation, correction);
+    for (int32_t i = 0; i < RISE_DI_S; i++) {
+        law->z[i] = law->z[i] + correction[i];
+    }
+    law->sigma = lesser(law->sigma + (dt * p->fade_rate), ONE);
+    product(p->F, RISE_DI_M, RISE_DI_S, law->z, feedback);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        law->u_o[i] = saturate(-law->sigma * feedback[i], law->u_o[i], dt, &p->observer_limits, i);
+    }
+}
+
+static bool same_values(const rise_di_real *a, const rise_di_real *b, int32_t count) {
+    bool same = true;
+    for (int32_t i = 0; i < count; i++) {
+        same = same && (a[i] == b[i]);
+    }
+    return same;
+}
+
+static bool same_model(const rise_di_parameters *a, const rise_di_parameters *b) {
+    return same_values(a->Phi, b->Phi, RISE_DI_S * RISE_DI_S) && same_values(a->Gamma, b->Gamma, RISE_DI_S * RISE_DI_M) &&
+           same_values(a->H, b->H, RISE_DI_M * RISE_DI_S) && same_values(a->L, b->L, RISE_DI_S * RISE_DI_M) &&
+           same_values(a->F, b->F, RISE_DI_M * RISE_DI_S);
+}
+#endif
+
+/* ---- feedforward by inversion of the nominal model ---- */
+
+#if RISE_DI_N > 0
+/* Sine with an error below 5e-16 (float: 3e-7) for angles up to 1e6 rad (float: 100 rad). */
+static rise_di_real sine(rise_di_real x) {
+    static const rise_di_real coefficient[9] = RISE_DI_SINE_COEFFICIENTS;
+    const rise_di_real angle = lesser(greater(x, -RISE_DI_MAX_ANGLE), RISE_DI_MAX_ANGLE);
+    const rise_di_real k = rounded(angle * RISE_DI_INVERSE_PI);
+    const rise_di_real odd = k - (TWO * rounded(k / TWO));
+    const rise_di_real r = (angle - (k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW);
+    const rise_di_real r_squared = r * r;
+    rise_di_real series = coefficient[0];
+    for (int32_t i = 1; i < 9; i++) {
+        series = (series * r_squared) + coefficient[i];
+    }
+    return (ONE - (TWO * magnitude(odd))) * (r + ((r * r_squared) * series));
+}
+
+static void sines(const rise_di_parameters *p, const rise_di_real *x, rise_di_real *values) {
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        values[i] = (p->has_sine[i] > ZERO) ? sine(x[i]) : ZERO;
+    }
+}
+
+/* matrix x + gravity sin(x) */
+static void drift(const rise_di_parameters *p, const rise_di_real *matrix, const rise_di_real *gravity, const rise_di_real *x,
+                  rise_di_real *result) {
+    rise_di_real linear[RISE_DI_N];
+    rise_di_real angle_sines[RISE_DI_N];
+    rise_di_real pulled[RISE_DI_N];
+    product(matrix, RISE_DI_N, RISE_DI_N, x, linear);
+    sines(p, x, angle_sines);
+    product(gravity, RISE_DI_N, RISE_DI_N, angle_sines, pulled);
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        result[i] = linear[i] + pulled[i];
+    }
+}
+
+/* x_dot of the nominal model under the ideal input. */
+static void slope(const rise_di_parameters *p, const rise_di_real *x, const rise_di_real *forced, rise_di_real *x_dot) {
+    drift(p, p->path_A, p->path_gravity, x, x_dot);
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        x_dot[i] = x_dot[i] + forced[i];
+    }
+}
+
+/* x_dot at x + dt k, a stage of the Runge-Kutta step. */
+static void stage(const rise_di_parameters *p, const rise_di_real *x, rise_di_real dt, const rise_di_real *k,
+                  const rise_di_real *forced, rise_di_real *x_dot) {
+    rise_di_real at[RISE_DI_N];
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        at[i] = x[i] + (dt * k[i]);
+    }
+    slope(p, at, forced, x_dot);
+}
+
+static void engage_feedforward(const rise_di_parameters *p, rise_di_feedforward *state, const rise_di_real *y_m) {
+    product_transposed(p->C, RISE_DI_M, RISE_DI_N, y_m, state->x);
+    fill(state->u, RISE_DI_M, ZERO);
+    fill(state->u_0, RISE_DI_M, ZERO);
+    state->dt = ZERO;
+    state->ticks = ZERO;
+}
+
+/* A Runge-Kutta step of the nominal model along y_m, and u_ff extrapolated to the instant of action. */
+static void step_feedforward(const rise_di_parameters *p, rise_di_feedforward *state, const rise_di_real *y_m, rise_di_real dt,
+                             rise_di_real *u_ff) {
+    rise_di_real output[RISE_DI_M];
+    rise_di_real y_m_dot[RISE_DI_M];
+    rise_di_real input[RISE_DI_M];
+    rise_di_real forced[RISE_DI_N];
+    rise_di_real k1[RISE_DI_N];
+    rise_di_real k2[RISE_DI_N];
+    rise_di_real k3[RISE_DI_N];
+    rise_di_real k4[RISE_DI_N];
+    rise_di_real middle[RISE_DI_N];
+    product(p->C, RISE_DI_M, RISE_DI_N, state->x, output);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        y_m_dot[i] = (y_m[i] - output[i]) / dt;
+    }
+    product(p->inverse, RISE_DI_M, RISE_DI_M, y_m_dot, input);
+    product(p->B, RISE_DI_N, RISE_DI_M, input, forced);
+    slope(p, state->x, forced, k1);
+    stage(p, state->x, dt / TWO, k1, forced, k2);
+    stage(p, state->x, dt / TWO, k2, forced, k3);
+    stage(p, state->x, dt, k3, forced, k4);
+    for (int32_t i = 0; i < RISE_DI_N; i++) {
+        const rise_di_real x = state->x[i] + ((dt / SIX) * (((k1[i] + (TWO * k2[i])) + (TWO * k3[i])) + k4[i]));
+        middle[i] = (x + state->x[i]) / TWO;
+        state->x[i] = x;
+    }
+    drift(p, p->A, p->gravity, middle, forced);
+    product(p->C, RISE_DI_M, RISE_DI_N, forced, output);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        output[i] = y_m_dot[i] - output[i];
+    }
+    product(p->inverse, RISE_DI_M, RISE_DI_M, output, input);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        const rise_di_real ahead = dt + (TWO * p->lead[i]);
+        const rise_di_real extrapolated = input[i] + ((ahead * (input[i] - state->u[i])) / (dt + state->dt));
+        if (state->ticks < TWO) {
+            state->u_0[i] = extrapolated;
+        }
+        u_ff[i] = extrapolated - state->u_0[i];
+        state->u[i] = input[i];
+    }
+    state->dt = dt;
+    state->ticks = state->ticks + ONE;
+}
+#endif
+
+/* ---- the whole law: observer or schedule over the law ---- */
+
+static void engage_all(const rise_di_parameters *p, rise_di_law *law, const rise_di_real *y, const rise_di_real *y_m) {
+    (void)p;
+    engage_law(law, y, y_m);
+#if RISE_DI_SCHEDULE
+    target_scale(p, y, law->scale);
+#endif
+#if RISE_DI_S > 0
+    start_estimates(p, law, y, y_m);
+#endif
+}
+
+/* A tick of the whole law from the state `before`: without limits u_free is the result, with limits u_free and u. */
+static void tick_law(const rise_di_parameters *p, const rise_di_law *before, const rise_di_real *y, const rise_di_real *y_m,
+                     rise_di_real dt, const rise_di_real *u_trim, const rise_di_real *u_before, bool limited,
+                     rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
+    rise_di_law begin = *before;
+    rise_di_real scale[RISE_DI_M];
+    rise_di_real trim[RISE_DI_M];
+    copy(u_trim, trim, RISE_DI_M);
+#if RISE_DI_SCHEDULE
+    follow_schedule(p, &begin, y, dt);
+#endif
+#if RISE_DI_S > 0
+    correct(p, &begin, y, y_m, dt);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        trim[i] = u_trim[i] + begin.u_o[i];
+    }
+#endif
+    scheduled(p, &begin, scale);
+    *after = begin;
+    step_law(p, &begin, y, y_m, dt, after);
+    if (limited) {
+        limit_law(p, scale, &begin, dt, trim, u_before, after, u_free, u);
+    } else {
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            u_free[i] = trim[i] + control(p, scale, &begin, after, i);
+            u[i] = u_free[i];
+        }
+    }
+#if RISE_DI_S > 0
+    predict(p, u, u_trim, after->z);
+#endif
+}
+
+/* ---- guard ---- */
+
+/* The sample `back` places before the newest. */
+static const rise_di_sample *sample_at(const rise_di_samples *samples, int32_t back) {
+    return &samples->sample[((samples->newest - back) + RISE_DI_SAMPLES) % RISE_DI_SAMPLES];
+}
+
+void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_real value[RISE_DI_M]) {
+    samples->newest = (samples->count == 0) ? 0 : ((samples->newest + 1) % RISE_DI_SAMPLES);
+    samples->sample[samples->newest].stamp_ns = stamp_ns;
+    copy(value, samples->sample[samples->newest].value, RISE_DI_M);
+    if (samples->count < RISE_DI_SAMPLES) {
+        samples->count = samples->count + 1;
+    }
+}
+
+/* y_m at an instant: a sample, interpolated, or extrapolated by at most a period. False where neither is possible. */
+static bool align(const rise_di_parameters *p, const rise_di_samples *samples, int64_t stamp_ns, rise_di_real *value) {
+    const rise_di_sample *newer = (const rise_di_sample *)0;
+    const rise_di_sample *older = (const rise_di_sample *)0;
+    const rise_di_sample *first = (const rise_di_sample *)0;
+    const rise_di_sample *second = (const rise_di_sample *)0;
+    bool possible = true;
+    int32_t back = 0;
+    while ((back < samples->count) && (older == (const rise_di_sample *)0)) {
+        const rise_di_sample *sample = sample_at(samples, back);
+        if (sample->stamp_ns <= stamp_ns) {
+            older = sample;
+        } else {
+            newer = sample;
+            back = back + 1;
+        }
+    }
+    if (older == (const rise_di_sample *)0) {
+        possible = false;
+    } else if (older->stamp_ns == stamp_ns) {
+        first = older;
+    } else if (newer != (const rise_di_sample *)0) {
+        first = older;
+        second = newer;
+    } else if ((stamp_ns - older->stamp_ns) > p->period_ns) {
+        possible = false;
+    } else {
+        first = older;
+        for (back = 1; (back < samples->count) && (second == (const rise_di_sample *)0); back++) {
+            const rise_di_sample *sample = sample_at(samples, back);
+            if ((older->stamp_ns - sample->stamp_ns) >= p->slope_ns) {
+                first = sample;
+                second = older;
+            }
+        }
+    }
+    if (possible && (second == (const rise_di_sample *)0)) {
+        copy(first->value, value, RISE_DI_M);
+    } else if (possible) {
+        const rise_di_real span = (rise_di_real)(second->stamp_ns - first->stamp_ns);
+        const rise_di_real fraction = (rise_di_real)(stamp_ns - first->stamp_ns) / span;
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            value[i] = first->value[i] + (fraction * (second->value[i] - first->value[i]));
+        }
+    } else {
+        /* no reference at this instant */
+    }
+    return possible;
+}
+
+/* Factor of the failsafe u: 1 up to hold, then linear to 0 over ramp. */
+static rise_di_real failsafe_scale(int64_t silence_ns, int64_t hold_ns, int64_t ramp_ns) {
+    rise_di_real scale;
+    if (silence_ns <= hold_ns) {
+        scale = ONE;
+    } else if (silence_ns >= (hold_ns + ramp_ns)) {
+        scale = ZERO;
+    } else {
+        scale = ONE - ((rise_di_real)(silence_ns - hold_ns) / (rise_di_real)ramp_ns);
+    }
+    return scale;
+}
+
+static void log_inputs(rise_di_output *output, int64_t stamp_ns, const rise_di_real *y, const rise_di_real *y_m,
+                       rise_di_real offset, rise_di_real dt) {
+    output->stamp_ns = stamp_ns;
+    copy(y, output->y, RISE_DI_M);
+    copy(y_m, output->y_m, RISE_DI_M);
+    output->y_m_offset = offset;
+    output->dt = dt;
+}
+
+/* A tick without fresh inputs, or of a deactivated controller. */
+static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di_output *output) {
+    const rise_di_parameters *p = c->parameters;
+    const bool was_active = c->mode != RISE_DI_INACTIVE;
+    if (c->has_law) {
+        rise_di_real scale = ONE;
+        if ((c->mode == RISE_DI_ENGAGED) || (c->mode == RISE_DI_WAITING) || (was_active != active)) {
+            c->failsafe_start_ns = now_ns;
+            copy(c->u, c->u_failsafe, RISE_DI_M);
+            c->hold_ns = active ? p->hold_ns : 0;
+            c->ramp_ns = p->ramp_ns;
+        }
+        if (active || (p->deactivation_holds == 0)) {
+            scale = failsafe_scale(now_ns - c->failsafe_start_ns, c->hold_ns, c->ramp_ns);
+        }
+        if (!active) {
+            c->mode = RISE_DI_INACTIVE;
+        } else if (scale == ONE) {
+            c->mode = RISE_DI_HOLD;
+        } else {
+            c->mode = (scale > ZERO) ? RISE_DI_RAMP : RISE_DI_TRIM;
+        }
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            c->u[i] = (scale == ONE) ? c->u_failsafe[i] : (scale * c->u_failsafe[i]);
+            c->u_free[i] = c->u[i];
+        }
+        log_inputs(output, now_ns, c->y, c->y_m, ZERO, ZERO);
+    } else {
+        c->mode = active ? RISE_DI_WAITING : RISE_DI_INACTIVE;
+    }
+    return c->has_law;
+}
+
+/* Bumpless engagement: the law starts from the present u. */
+static void engage(rise_di_controller *c, const rise_di_sample *y, const rise_di_real *y_m) {
+    c->mode = RISE_DI_ENGAGED;
+    c->has_law = true;
+    engage_all(c->parameters, &c->law, y->value, y_m);
+    copy(c->u, c->u_trim, RISE_DI_M);
+    copy(c->u, c->u_free, RISE_DI_M);
+    fill(c->u_ff, RISE_DI_M, ZERO);
+#if RISE_DI_N > 0
+    engage_feedforward(c->parameters, &c->feedforward, y_m);
+#endif
+}
+
+/* A step of the law with a new y. Returns dt. */
+static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const rise_di_real *y_m) {
+    const rise_di_parameters *p = c->parameters;
+    const rise_di_real measured = seconds(y->stamp_ns - c->y_stamp_ns);
+    const rise_di_real dt = lesser(greater(measured, p->dt_least), p->dt_largest);
+    const rise_di_law *before = &c->law;
+    rise_di_law after;
+    rise_di_real u_trim[RISE_DI_M];
+    rise_di_real u_free[RISE_DI_M];
+    rise_di_real u[RISE_DI_M];
+    bool limited = false;
+#if RISE_DI_S > 0
+    rise_di_law predicted = c->law;
+    const int32_t missed = (int32_t)rounded(dt / p->period) - 1;
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        u_trim[i] = c->u_trim[i] + c->u_ff[i];
+    }
+    for (int32_t k = 0; k < missed; k++) {
+        predict(p, c->u, u_trim, predicted.z);
+    }
+    before = &predicted;
+#endif
+#if RISE_DI_N > 0
+    step_feedforward(p, &c->feedforward, y_m, dt, c->u_ff);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        u_trim[i] = c->u_trim[i] + c->u_ff[i];
+    }
+#else
+    copy(c->u_trim, u_trim, RISE_DI_M);
+#endif
+    tick_law(p, before, y->value, y_m, dt, u_trim, c->u, false, &after, u_free, u);
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        u[i] = saturate(u_free[i], c->u[i], dt, &p->limits, i);
+        limited = limited || (u[i] != u_free[i]);
+    }
+    if (limited) {
+        tick_law(p, before, y->value, y_m, dt, u_trim, c->u, true, &after, u_free, u);
+    }
+    c->law = after;
+    copy(u, c->u, RISE_DI_M);
+    copy(u_free, c->u_free, RISE_DI_M);
+    return dt;
+}
+
+static bool is_fresh(int64_t now_ns, int64_t stamp_ns, int64_t max_age_ns) {
+    const int64_t age_ns = now_ns - stamp_ns;
+    return (age_ns <= max_age_ns) && (age_ns >= -max_age_ns);
+}
+
+static bool any(const rise_di_real *values) {
+    bool result = false;
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        result = result || (values[i] != ZERO);
+    }
+    return result;
+}
+
+bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
+                        bool active, rise_di_output *output) {
+    rise_di_controller *c = controller;
+    const int64_t max_age_ns = c->parameters->max_age_ns;
+    rise_di_real reference[RISE_DI_M];
+    rise_di_real dt = ZERO;
+    bool fresh = false;
+    bool published = true;
+    if ((y != (const rise_di_sample *)0) && (y_m->count > 0)) {
+        fresh = is_fresh(now_ns, y->stamp_ns, max_age_ns) && is_fresh(now_ns, sample_at(y_m, 0)->stamp_ns, max_age_ns) &&
+                align(c->parameters, y_m, y->stamp_ns, reference);
+    }
+    if ((!active) && fresh && (!c->has_law) && (!any(c->u))) {
+        c->mode = RISE_DI_INACTIVE;
+        log_inputs(output, now_ns, y->value, reference, ZERO, ZERO);
+    } else if ((!active) || (!fresh)) {
+        published = failsafe(c, now_ns, active, output);
+    } else {
+        if ((!c->has_law) || (c->mode != RISE_DI_ENGAGED)) {
+            engage(c, y, reference);
+        } else if (y->stamp_ns <= c->y_stamp_ns) {
+            published = false;
+        } else {
+            dt = step(c, y, reference);
+        }
+        if (published) {
+            c->y_stamp_ns = y->stamp_ns;
+            copy(y->value, c->y, RISE_DI_M);
+            copy(reference, c->y_m, RISE_DI_M);
+            log_inputs(output, y->stamp_ns, y->value, reference, seconds(sample_at(y_m, 0)->stamp_ns - y->stamp_ns), dt);
+        }
+    }
+    return published;
+}
+
+/* ---- controller: samples and calls ---- */
+
+void rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters) {
+    controller->parameters = parameters;
+    controller->mode = RISE_DI_WAITING;
+    controller->has_law = false;
+    controller->y_stamp_ns = 0;
+    controller->failsafe_start_ns = 0;
+    controller->hold_ns = 0;
+    controller->ramp_ns = 0;
+    controller->y_samples.count = 0;
+    controller->y_samples.newest = 0;
+    controller->y_m_samples.count = 0;
+    controller->y_m_samples.newest = 0;
+    fill(controller->u, RISE_DI_M, ZERO);
+    fill(controller->u_free, RISE_DI_M, ZERO);
+    fill(controller->u_trim, RISE_DI_M, ZERO);
+    fill(controller->u_ff, RISE_DI_M, ZERO);
+    fill(controller->u_failsafe, RISE_DI_M, ZERO);
+}
+
+static rise_di_status take(const rise_di_controller *c, rise_di_samples *samples, int64_t stamp_ns, int64_t now_ns,
+                           const rise_di_real *value) {
+    rise_di_status status = RISE_DI_TAKEN;
+    if (stamp_ns > (now_ns + c->parameters->max_age_ns)) {
+        status = RISE_DI_FUTURE;
+    } else if ((samples->count > 0) && (stamp_ns <= sample_at(samples, 0)->stamp_ns)) {
+        status = RISE_DI_ORDER;
+    } else if (!is_finite(value, RISE_DI_M)) {
+        status = RISE_DI_NOT_FINITE;
+    } else {
+        rise_di_append(samples, stamp_ns, value);
+    }
+    return status;
+}
+
+rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
+    return take(controller, &controller->y_samples, stamp_ns, now_ns, value);
+}
+
+rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
+    return take(controller, &controller->y_m_samples, stamp_ns, now_ns, value);
+}
+
+bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, rise_di_output *output) {
+    const rise_di_samples *samples = &controller->y_samples;
+    const rise_di_samples *y_m = &controller->y_m_samples;
+    const rise_di_sample *y = (const rise_di_sample *)0;
+    if (samples->count > 0) {
+        y = sample_at(samples, 0);
+        if (y_m->count > 0) { /* the newest y up to a period after the newest y_m */
+            const int64_t known_ns = sample_at(y_m, 0)->stamp_ns + controller->parameters->period_ns;
+            bool paired = false;
+            for (int32_t back = 0; (back < samples->count) && (!paired); back++) {
+                if (sample_at(samples, back)->stamp_ns <= known_ns) {
+                    y = sample_at(samples, back);
+                    paired = true;
+                }
+            }
+        }
+    }
+    return rise_di_guard_tick(controller, now_ns, y, y_m, active, output);
+}
+
+void rise_di_retune(rise_di_controller *controller, const rise_di_parameters *parameters) {
+    rise_di_controller *c = controller;
+    if (parameters->digest != c->parameters->digest) {
+        if (c->has_law) {
+            rise_di_real old_scale[RISE_DI_M];
+            rise_di_real next_scale[RISE_DI_M];
+            scheduled(c->parameters, &c->law, old_scale);
+            scheduled(parameters, &c->law, next_scale);
+            retune_law(&c->law, c->parameters, old_scale, parameters, next_scale);
+#if RISE_DI_S > 0
+            if (!same_model(c->parameters, parameters)) {
+                for (int32_t i = 0; i < RISE_DI_M; i++) {
+                    c->u_trim[i] = c->u_trim[i] + c->law.u_o[i];
+                }
+                start_estimates(parameters, &c->law, c->y, c->y_m);
+            }
+#endif
+        }
+        c->parameters = parameters;
+    }
+}
+
+void rise_di_restart(rise_di_controller *controller) {
+    if (controller->mode == RISE_DI_ENGAGED) {
+        controller->mode = RISE_DI_WAITING;
+    }
+}

@@ -1,0 +1,205 @@
+/* SPDX-FileCopyrightText: RISE-DI contributors
+ * SPDX-License-Identifier: Apache-2.0
+ *
+ * The RISE-DI controller in C99: law, anti-windup, limits, guard, feedforward, observer, schedule. No library, no heap, no global.
+ *
+ * The caller owns the struct rise_di_controller. Order of calls in a period:
+ *
+ *   rise_di_start     once, before the first sample
+ *   rise_di_take_y    for each sample of y; rise_di_take_y_m for each sample of y_m
+ *   rise_di_tick      once a period; true: send u with the stamp output.stamp_ns
+ *
+ * Vectors have RISE_DI_M values in the order of RISE_DI_OUTPUTS and RISE_DI_INPUTS (rise_di_parameters.h): SI and rad, deviations
+ * from trim. Stamps are nanoseconds of the clock of the caller. An interrupt must not call two functions for one controller at once.
+ *
+ * Every operation is rounded once to rise_di_real. Compile with -ffp-contract=off: a fused multiply-add has a single rounding for
+ * two operations and gives different last bits. Never compile with -ffast-math. The equations are those of docs/theory.md.
+ */
+#ifndef RISE_DI_H
+#define RISE_DI_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "rise_di_parameters.h"
+
+#ifndef RISE_DI_REAL
+#if RISE_DI_FLOAT32
+typedef float rise_di_real;
+#else
+typedef double rise_di_real;
+#endif
+#endif
+
+/* How sgn(e) of equation (21) is sampled. */
+typedef enum { RISE_DI_LITERAL = 0, RISE_DI_IMPLICIT = 1, RISE_DI_SOFT = 2 } rise_di_sign;
+
+typedef enum {
+    RISE_DI_WAITING = 0, /* no y or no y_m received yet: nothing is commanded */
+    RISE_DI_ENGAGED = 1, /* the law commands u */
+    RISE_DI_HOLD = 2,    /* failsafe: y or y_m is stale, u is held, nothing is integrated */
+    RISE_DI_RAMP = 3,    /* failsafe: u ramps to trim */
+    RISE_DI_TRIM = 4,    /* failsafe: u is at trim */
+    RISE_DI_INACTIVE = 5 /* deactivated: u is held or ramps to trim */
+} rise_di_mode;
+
+typedef enum {
+    RISE_DI_TAKEN = 0,
+    RISE_DI_FUTURE = 1,    /* refused: the stamp is ahead of the clock by more than max_age_ns */
+    RISE_DI_ORDER = 2,     /* refused: the stamp is not later than the stamp before */
+    RISE_DI_NOT_FINITE = 3 /* refused: NaN or infinite */
+} rise_di_status;
+
+/* Limits of magnitude and rate; the largest number of rise_di_real where there is no limit. */
+typedef struct {
+    rise_di_real lower[RISE_DI_M]; /* units of u, from trim */
+    rise_di_real upper[RISE_DI_M]; /* units of u, from trim */
+    rise_di_real rate[RISE_DI_M];  /* units of u / s */
+} rise_di_limits;
+
+/* Parameters of a controller, constant. RISE_DI_PARAMETERS initialises the parameters of the scenario. */
+typedef struct {
+    uint64_t digest;          /* hash of the parameters, the channel `parameters` of the log */
+    int64_t period_ns;        /* of the ticks */
+    int64_t max_age_ns;       /* an older sample is stale */
+    int64_t hold_ns;          /* failsafe: how long u is held */
+    int64_t ramp_ns;          /* failsafe: how long u then takes to trim */
+    int64_t slope_ns;         /* least distance of two samples for a slope of y_m */
+    int64_t deactivation_holds; /* 1: u is held when deactivated, 0: u ramps to trim */
+    int64_t sign;             /* rise_di_sign */
+    rise_di_real period;      /* s */
+    rise_di_real dt_least;    /* s, lower limit of dt */
+    rise_di_real dt_largest;  /* s, upper limit of dt */
+    rise_di_real K[RISE_DI_M];           /* diagonal of K (22), 1/s */
+    rise_di_real Lambda[RISE_DI_M];      /* diagonal of Lambda (4), 1/s */
+    rise_di_real beta[RISE_DI_M];        /* diagonal of beta (21), units of y / s^2 */
+    rise_di_real D[RISE_DI_M];           /* diagonal of D (11), +1 or -1 */
+    rise_di_real input_scale[RISE_DI_M]; /* u per scaled input: units of u s / units of y */
+    rise_di_real omega[RISE_DI_M];       /* abs(Omega_ii) in scaled inputs; implicit sign */
+    rise_di_real eps[RISE_DI_M];         /* half-width of the softened sign, units of y */
+    rise_di_limits limits;               /* of u */
+#if RISE_DI_SCHEDULE
+    rise_di_real speed;               /* trim speed V0, m/s */
+    rise_di_real airspeed[RISE_DI_M]; /* 1 for the output V, else 0 */
+    rise_di_real time;                /* time constant of the schedule, s */
+    rise_di_real V_least;             /* m/s, where the factor of input_scale is largest */
+    rise_di_real V_largest;           /* m/s, where the factor of input_scale is least */
+#endif
+#if RISE_DI_N > 0 /* feedforward: x_dot = A x + gravity sin(x) + B u, y = C x, N states */
+    rise_di_real A[RISE_DI_N * RISE_DI_N];            /* row by row, as every matrix */
+    rise_di_real B[RISE_DI_N * RISE_DI_M];
+    rise_di_real C[RISE_DI_M * RISE_DI_N];
+    rise_di_real gravity[RISE_DI_N * RISE_DI_N];
+    rise_di_real inverse[RISE_DI_M * RISE_DI_M];      /* of Omega = C B */
+    rise_di_real path_A[RISE_DI_N * RISE_DI_N];       /* (I - B Omega^-1 C) A */
+    rise_di_real path_gravity[RISE_DI_N * RISE_DI_N]; /* (I - B Omega^-1 C) gravity */
+    rise_di_real lead[RISE_DI_M];                     /* time from a tick until the input acts, s */
+    rise_di_real has_sine[RISE_DI_N];                 /* 1 for a state with a sine term, else 0 */
+#endif
+#if RISE_DI_S > 0 /* observer: z+ = Phi z + Gamma (u - u_trim), e = H z, S estimates */
+    rise_di_real Phi[RISE_DI_S * RISE_DI_S];
+    rise_di_real Gamma[RISE_DI_S * RISE_DI_M];
+    rise_di_real H[RISE_DI_M * RISE_DI_S];
+    rise_di_real L[RISE_DI_S * RISE_DI_M]; /* correction of z by e - H z */
+    rise_di_real F[RISE_DI_M * RISE_DI_S]; /* u_o = -sigma F z */
+    rise_di_limits observer_limits;        /* of u_o */
+    rise_di_real fade_rate;                /* of sigma after engagement, 1/s */
+#endif
+} rise_di_parameters;
+
+/* State of the law between two ticks. */
+typedef struct {
+    rise_di_real e_0[RISE_DI_M];        /* e at engagement, units of y */
+    rise_di_real e[RISE_DI_M];          /* e = y - y_m at the last tick, units of y */
+    rise_di_real integral_e[RISE_DI_M]; /* units of y s */
+    rise_di_real Pi[RISE_DI_M];         /* equation (21), scaled input */
+#if RISE_DI_SCHEDULE
+    rise_di_real scale[RISE_DI_M]; /* factor of input_scale */
+#endif
+#if RISE_DI_S > 0
+    rise_di_real z[RISE_DI_S];   /* estimates, predicted for the next tick */
+    rise_di_real u_o[RISE_DI_M]; /* contribution to the trim, units of u */
+    rise_di_real sigma;          /* fade-in, 0 to 1 */
+#endif
+} rise_di_law;
+
+#if RISE_DI_N > 0
+/* State of the feedforward between two ticks. */
+typedef struct {
+    rise_di_real x[RISE_DI_N];   /* state of the nominal model, SI */
+    rise_di_real u[RISE_DI_M];   /* input in the middle of the last tick */
+    rise_di_real dt;             /* of the last tick, s */
+    rise_di_real ticks;          /* since engagement */
+    rise_di_real u_0[RISE_DI_M]; /* u_ff at engagement */
+} rise_di_feedforward;
+#endif
+
+typedef struct {
+    int64_t stamp_ns;
+    rise_di_real value[RISE_DI_M];
+} rise_di_sample;
+
+/* The last samples with increasing stamps, a ring. */
+typedef struct {
+    rise_di_sample sample[RISE_DI_SAMPLES];
+    int32_t newest; /* index of the newest sample */
+    int32_t count;  /* number of samples, at most RISE_DI_SAMPLES */
+} rise_di_samples;
+
+/* A controller. Read by the caller: mode, u. */
+typedef struct {
+    const rise_di_parameters *parameters;
+    rise_di_mode mode;
+    bool has_law;                    /* whether the law has engaged since the start */
+    rise_di_law law;
+    int64_t y_stamp_ns;              /* stamp of y of the last step */
+    rise_di_real y[RISE_DI_M];       /* of the last step */
+    rise_di_real y_m[RISE_DI_M];     /* at the stamp of y */
+    rise_di_real u[RISE_DI_M];       /* commanded, after saturation, units of u from trim */
+    rise_di_real u_free[RISE_DI_M];  /* before saturation */
+    rise_di_real u_trim[RISE_DI_M];  /* u at engagement */
+    rise_di_real u_ff[RISE_DI_M];    /* feedforward, 0 without */
+    int64_t failsafe_start_ns;
+    rise_di_real u_failsafe[RISE_DI_M]; /* u at the start of the failsafe */
+    int64_t hold_ns;                 /* times of the present failsafe */
+    int64_t ramp_ns;
+#if RISE_DI_N > 0
+    rise_di_feedforward feedforward;
+#endif
+    rise_di_samples y_samples;
+    rise_di_samples y_m_samples;
+} rise_di_controller;
+
+/* Inputs of a tick, for a log, and the stamp of u. */
+typedef struct {
+    int64_t stamp_ns;            /* of y, and so of u; the instant of the tick where no y is used */
+    rise_di_real y[RISE_DI_M];
+    rise_di_real y_m[RISE_DI_M]; /* at the stamp of y */
+    rise_di_real y_m_offset;     /* stamp of the newest y_m minus stamp of y, s */
+    rise_di_real dt;             /* step of the law, s; 0 without a step */
+} rise_di_output;
+
+/* Set a controller to u = 0, waiting for the first samples. `parameters` has to outlive the controller. */
+void rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters);
+
+/* Take a sample of y or of y_m. A refused sample changes nothing. */
+rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
+rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
+
+/* A tick at now_ns. Returns whether controller->u is to be sent, with the stamp output->stamp_ns. active false: deactivated. */
+bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, rise_di_output *output);
+
+/* A tick with samples of the caller in place of those taken; y may be a null pointer. */
+bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
+                        bool active, rise_di_output *output);
+
+/* Replace the parameters between two ticks without a jump of u. Parameters of equal digest change nothing. */
+void rise_di_retune(rise_di_controller *controller, const rise_di_parameters *parameters);
+
+/* Engage again with the next fresh y and y_m, from the u of then; a failsafe goes on. */
+void rise_di_restart(rise_di_controller *controller);
+
+/* Append a sample to a ring. */
+void rise_di_append(rise_di_samples *samples, int64_t stamp_ns, const rise_di_real value[RISE_DI_M]);
+
+#endif

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz, the unit of FMI 2.0."""
+
+import math
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from tests.conftest import REPOSITORY
+
+from flight_analysis.c_export.constants import exportable
+from flight_analysis.c_export.events import run_recording
+from flight_analysis.c_export.library import CController, build_fmu, build_library
+from flight_analysis.c_export.proof import FLAGS, build, write_code
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
+from flight_core.modes import Mode
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_log.tape_reader import read_run
+from rise_di_controller.controller import Controller
+from rise_di_controller.rise_di import RiseDiConfig
+
+pytestmark = [
+    pytest.mark.package("flight_analysis"),
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"),
+]
+TAKEN, FUTURE, ORDER, NOT_FINITE = range(4)  # rise_di_status of rise_di.h
+
+
+@pytest.fixture
+def c_controller(tmp_path: Path) -> Callable[[RiseDiConfig], CController]:
+    def build(config: RiseDiConfig) -> CController:
+        write_code(config, "test", tmp_path / "code", float32=False)
+        return CController(build_library(tmp_path / "code", ["gcc"], tmp_path / "rise_di.so"), len(config.outputs))
+
+    return build
+
+
+def test_library_replays_a_log(tmp_path: Path, c_controller: Callable[[RiseDiConfig], CController]) -> None:
+    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data")
+    run = read_run(tmp_path / "osprey_servo")
+    (config,), recording, _ = run_recording(run)
+    u = c_controller(config).replay(recording)
+    assert u.tobytes() == np.ascontiguousarray(run.tape["internals"].group("u").values).tobytes()
+
+
+class Call(NamedTuple):
+    """An instant of a caller, and the samples that have arrived since the last: stamp, value."""
+
+    now_ns: int
+    y: list[tuple[int, FloatArray]]
+    y_m: list[tuple[int, FloatArray]]
+
+
+def jittering_calls(count: int, seed: int) -> list[Call]:
+    """Calls at 250 Hz, late by up to a quarter of a period; a fifth of y and a tenth of y_m lost; a second without y."""
+    rng, calls = np.random.default_rng(seed), []
+    for k in range(1, count):
+        stamp_ns = k * NANOSECONDS // 250
+        now_ns = stamp_ns + int(rng.integers(0, 1_000_000))
+        y_m = 0.05 * np.sin(0.01 * k + np.arange(4.0))
+        lost = rng.random(2) < (0.2, 0.1)
+        y = [] if lost[0] or 500 <= k < 750 else [(stamp_ns - int(rng.integers(0, 500_000)), y_m + 0.01 * rng.normal(size=4))]
+        calls.append(Call(now_ns, y, [] if lost[1] else [(stamp_ns, y_m)]))
+    return calls
+
+
+@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer"])
+def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CController]) -> None:
+    """The caller of the page on export, with jitter and lost samples: u and mode are those of the Python controller."""
+    controller = find_scenario(name).controller
+    if controller.observer is None:  # the matrices of an observer hold at the rate of its design
+        controller = find_scenario(name).vary(controller={"rate": 250.0}, aircraft={"rate": 250.0, "step": 0.004}).controller
+    python, c = Controller(controller), c_controller(exportable(controller))
+    modes, moved = set(), np.zeros(4)
+    for call in jittering_calls(1500, 3):
+        for stamp_ns, value in call.y_m:
+            python.take_y_m(StampedVector(stamp_ns, value), call.now_ns)
+            assert c.take_y_m(stamp_ns, value, call.now_ns) == TAKEN
+        for stamp_ns, value in call.y:
+            python.take_y(StampedVector(stamp_ns, value), call.now_ns)
+            assert c.take_y(stamp_ns, value, call.now_ns) == TAKEN
+        output = python.tick(call.now_ns)
+        u, mode = c.tick(call.now_ns)
+        assert mode == (-1 if output is None else python.mode)
+        assert u.tobytes() == python.state.u.tobytes()
+        modes.add(python.mode)
+        moved = np.maximum(moved, np.abs(u))
+    assert modes >= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
+    assert (moved > 0.0).all()
+
+
+def test_samples_are_refused_as_by_controller(c_controller: Callable[[RiseDiConfig], CController]) -> None:
+    config = exportable(find_scenario("osprey_servo").controller)
+    python, c = Controller(config), c_controller(config)
+    age_ns = config.guard().max_age_ns
+    for stamp_ns, expected in (
+        (0, TAKEN),
+        (0, ORDER),
+        (-1, ORDER),
+        (age_ns, TAKEN),
+        (age_ns + 1, FUTURE),
+        (10 * age_ns, FUTURE),
+    ):
+        assert c.take_y(stamp_ns, np.zeros(4), 0) == expected
+        reason = ""
+        try:
+            python.take_y(StampedVector(stamp_ns, np.zeros(4)), 0)
+        except ChannelError as error:
+            reason = error.reason
+        assert reason == {TAKEN: "", ORDER: "order", FUTURE: "future"}[expected]
+    for value in (math.nan, math.inf, -math.inf):
+        assert c.take_y(2 * age_ns, np.array([0.0, value, 0.0, 0.0]), 2 * age_ns) == NOT_FINITE
+
+
+def test_fmu_flies_to_the_bit(tmp_path: Path) -> None:
+    """FMPy, an independent host of FMI, steps the unit with y and y_m of a flight in one process."""
+    fmpy = pytest.importorskip("fmpy", reason="FMPy is not installed: pip install fmpy")
+    scenario = find_scenario("osprey_observer", 5.0).vary(
+        aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}
+    )
+    config = exportable(scenario.controller)
+    write_code(config, "osprey_observer", tmp_path / "code", float32=False)
+    unit = build_fmu(tmp_path / "code", ["gcc"], config, "osprey_observer", tmp_path / "rise_di.fmu")
+    tape = simulate(scenario)
+    groups = {group: tape["internals"].group(group) for group in ("y", "y_m", "u")}
+    t = tape.time("internals")
+    names = [f"{group}.{name}" for group in ("y", "y_m") for name in config.outputs]
+    columns = [groups[group][name] for group in ("y", "y_m") for name in config.outputs]
+    assert pytest.importorskip("fmpy.validation").validate_fmu(str(unit)) == []
+    signals = np.zeros(len(t), dtype=[("time", float), *((name, float) for name in names)])
+    signals["time"] = t
+    for name, column in zip(names, columns, strict=True):
+        signals[name] = column
+    flown = fmpy.simulate_fmu(
+        str(unit),
+        start_time=0.0,
+        stop_time=float(t[-1]),
+        output_interval=0.01,
+        input=signals,
+        output=[f"u.{name}" for name in config.inputs],
+    )
+    u = np.column_stack([flown[f"u.{name}"] for name in config.inputs])
+    assert len(u) == len(t)
+    assert u[1:].tobytes() == groups["u"].values[:-1].tobytes()  # valid after the step, whose begin has the stamp
+
+
+def test_program_of_the_page_flies(tmp_path: Path) -> None:
+    page = (REPOSITORY / "docs" / "export.md").read_text(encoding="utf-8")
+    (tmp_path / "caller.c").write_text(page.partition("```c\n")[2].partition("```")[0], encoding="utf-8")
+    write_code(exportable(find_scenario("osprey_servo").controller), "osprey_servo", tmp_path, float32=False)
+    build(["gcc", *FLAGS, "-o", "caller", "caller.c", "rise_di.c"], tmp_path)
+    assert subprocess.run(["./caller"], cwd=tmp_path, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("flag", ["-ffast-math", "-fsingle-precision-constant", "-mfpmath=387"])
+def test_code_refuses_flags_that_change_bits(flag: str, tmp_path: Path) -> None:
+    write_code(exportable(find_scenario("osprey_servo").controller), "osprey_servo", tmp_path, float32=False)
+    build(["gcc", *FLAGS, "-c", "rise_di.c"], tmp_path)
+    with pytest.raises(ParameterError, match=r"rise_di\.c"):
+        build(["gcc", *FLAGS, flag, "-c", "rise_di.c"], tmp_path)
