@@ -50,7 +50,7 @@ def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, cap
 def test_engagement_shorter_than_sample_leaves_figures_of_flight(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = read_run(run)
     instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
-    monkeypatch.setattr(run_folder, "read_run", lambda _: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
+    monkeypatch.setattr(run_folder, "read_run", lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
     summary = read_flight(run, "completed").summary
     assert summary["duration"] > 1.0
     assert summary["notes"][0].endswith("s: lost")

@@ -9,7 +9,9 @@ from importlib import import_module
 from typing import Any, Self
 
 import rclpy
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.signals import SignalHandlerOptions
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -106,9 +108,21 @@ def _sleep_until(deadline_ns: int) -> None:
         time.sleep(min(pause_ns / NANOSECONDS, IDLE_POLL_PERIOD))
 
 
+def unsendable(types: Mapping[str, str]) -> dict[str, str]:
+    """The topics with a message type that is not installed, with the type, or with a name that no topic of ROS may have."""
+    lacking = {}
+    for topic, name in types.items():
+        try:
+            validate_full_topic_name(topic)
+            _message_type(topic, name)
+        except (InvalidTopicNameException, ParameterError):
+            lacking[topic] = name
+    return lacking
+
+
 def _message_type(topic: str, name: str) -> Any:
     package, _, kind = name.partition("/msg/")
     try:
         return getattr(import_module(f"{package}.msg"), kind)
-    except (ImportError, AttributeError):
+    except (ImportError, AttributeError, ValueError):  # the name may hold anything
         raise ParameterError(f"{topic}: its type {name} is not installed, expected the package {package}") from None

@@ -41,6 +41,7 @@ from flight_bringup.launch.stages import (
     scenario_argument,
     start_in_stages,
 )
+from flight_bringup.player import unsendable
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import require
 from flight_log.playback import read_playback
@@ -90,6 +91,7 @@ def _play(context: LaunchContext) -> list[Action]:
     others = [spec.executable for spec in nodes if spec not in (RECORDER, CONTROLLER)]
     require(not (lockstep and others), "lockstep", f"true with {', '.join(others)}", "controller and recorder alone")
     recorded = read_playback(log).types
+    recorded = recorded.keys() - unsendable(recorded)
     topics = argument(context, "topics") or ",".join(replayed_topics(recorded, nodes, namespace, autopilot))
     end_with_launch(context)
 

@@ -14,6 +14,7 @@ from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 from flight_bringup.scenarios import find_scenario
+from flight_cli.log_options import LogNamespace
 from flight_cli.output import new_table, print_json
 
 CONTRADICTS = 1
@@ -26,6 +27,7 @@ def check_signs(
     bag: Annotated[
         Path | None, typer.Option(help="A recorded flight with y and u, each input excited; with a bridge, its engaged time.")
     ] = None,
+    namespace: LogNamespace = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
@@ -36,7 +38,7 @@ def check_signs(
     channel_map = load_map(map_name)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
-    checked = check_scenario(channel_map, chosen, frame, bag)
+    checked = check_scenario(channel_map, chosen, frame, bag, namespace)
     if as_json:
         channels, sentences = [channel._asdict() for channel in checked.channels], list(checked.contradictions)
         result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}

@@ -31,9 +31,9 @@ from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
 from flight_analysis.report.plotting import Curve, Interval, PlotContext, SampleStore, time_series_figure
 from flight_analysis.report.summary import DisplayUnit, display_unit
-from flight_bringup.scenarios import find_scenario
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
+from flight_cli.log_options import scenario_file
 from flight_cli.output import COUNT_COLUMNS, new_table, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -192,13 +192,11 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
     if write is not None:
         require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
-    recorded = read_run(source.log, source.namespace)
-    if source.scenario is not None:
-        controller: ControllerConfig = find_scenario(source.scenario).controller
-    elif recorded.scenario is not None:
-        controller = recorded_parameters(recorded.scenario)
-    else:
+    recorded = read_run(source.log, source.namespace, scenario_file(source.scenario))
+    recorded.require()
+    if recorded.scenario is None:
         raise ParameterError(f"{source.log}: found a log without its scenario, expected --scenario with the controller's lags")
+    controller = recorded_parameters(recorded.scenario)
     actuation = _actuation(controller, nominal, controller.delay if source.delay is None else source.delay)
     samples, console = recording(recorded.tape, nominal), Console(quiet=as_json)
     with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
@@ -216,8 +214,6 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         console.print(f"model: {write}, innovations: {page}", highlight=False)
     again = None
     if refly_margin is not None:
-        if recorded.scenario is None:
-            raise ParameterError(f"{source.log}: found a log without its scenario, expected one that --refly can fly")
         with console.status("flying with the model"):
             again = _refly(recorded_scenario(recorded.scenario), recorded.tape, found.airframe, refly_margin)
         _show_flights_of_model(console, again, _units(found))

@@ -3,15 +3,19 @@
 """`rise-di play`: publish the topics of a recorded flight again with their timing, for a node under test."""
 
 import math
+import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from flight_cli.log_options import LogNamespace
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
 from flight_core.parameters import require
+from flight_core.text import printable
 from flight_log.playback import SHARED, read_playback
+from flight_log.tape_reader import listed
 
 
 class Stamps(StrEnum):
@@ -30,28 +34,39 @@ def play(
     stamps: Annotated[
         Stamps, typer.Option(help="now: moved to the present, as a controller in real time needs them; recorded: unchanged.")
     ] = Stamps.NOW,
+    namespace: LogNamespace = None,
 ) -> None:
     """Publish the topics of a recorded flight again with their timing, and /clock with the time of the log.
 
-    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log is refused.
+    The bytes of the log are sent, with new stamps. A domain with a publisher on a topic of the log is refused. A warning names
+    the skipped topics: without CDR, or of a message type that is not installed.
     Exit status: 0 played to the end, 2 bad input, 130 interrupted.
     """
     for option, value in (("--rate", rate), ("--start", start)):
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
-    playback = read_playback(run, names, start)
-    from flight_bringup.player import Player  # noqa: PLC0415 - loads rclpy, which other commands do not need
+    playback = read_playback(run, names, start, namespace)
+    from flight_bringup.player import Player, unsendable  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)
-    with Player(playback.types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
-        task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(playback.types)}, stamps {stamps}")
+    skipped = {**playback.skipped, **({} if names else unsendable(playback.types))}
+    types = {topic: name for topic, name in playback.types.items() if topic not in skipped}
+    require(bool(types), str(run), f"no topic to play among {listed(skipped)}", "a topic whose message type is installed")
+    if skipped:
+        print(
+            f"warning: {printable(listed(skipped))} skipped: without CDR, or of a message type that is not installed",
+            file=sys.stderr,
+        )
+    messages = [message for message in playback.messages if message.topic in types]
+    with Player(types, SHARED) as sender, progress_bar(*CLOCK_COLUMNS) as bar:
+        task = bar.add_task("play", total=end - start, clock="", shown=f"{', '.join(types)}, stamps {stamps}")
 
         def progress(due_ns: int) -> None:
             t = playback.t(due_ns)
             bar.update(task, completed=t - start, clock=f"t = {t:5.1f} of {end:.1f} s, {rate:g} times")
 
         while True:
-            sender.play(playback.messages, rate, stamps_now=stamps is Stamps.NOW, progress=progress)
+            sender.play(messages, rate, stamps_now=stamps is Stamps.NOW, progress=progress)
             progress(playback.messages[-1].due_ns)
             if not loop:
                 break

@@ -18,9 +18,11 @@ from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorde
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.run_folder import log_account
+from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_core.files import parse_yaml
 from flight_core.parameters import require
+from flight_core.text import printable
 from flight_log.tape_reader import read_run
 
 DIFFERS = 1
@@ -32,7 +34,8 @@ def replay(
         list[str] | None,
         typer.Option("--set", help="A parameter to change, as in controller.Lambda='[5, 5, 3, 1]'; may be repeated."),
     ] = None,
-    namespace: Annotated[str | None, typer.Option(help="Namespace of the aircraft, if the log holds several.")] = None,
+    scenario: LogScenario = None,
+    namespace: LogNamespace = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
@@ -43,8 +46,10 @@ def replay(
     """
     changed = dict(map(_parse_setting, settings or []))
     require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
-    with Console(stderr=True, quiet=as_json).status(f"computing {run} again"):
-        recorded = read_run(run, namespace)
+    given = scenario_file(scenario)
+    with Console(stderr=True, quiet=as_json).status(f"computing {printable(str(run))} again"):
+        recorded = read_run(run, namespace, given)
+        recorded.require()
         parameters = recorded_parameters(recorded.scenario_file())
         others = vary(parameters, changed) if changed else None
         result = recompute(recorded, parameters, others)

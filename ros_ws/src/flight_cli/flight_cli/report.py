@@ -12,6 +12,7 @@ from rich.console import Console
 from flight_analysis.report import comparison
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
+from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
 from flight_cli.output import LATEST, new_table, options, print_json, show_flight
 from flight_core.files import display_path
 
@@ -29,14 +30,26 @@ def report(
         Path | None, typer.Option(help="Write all signals as CSV, one row an instant, one column a channel.")
     ] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
+    scenario: LogScenario = None,
+    namespace: LogNamespace = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, a list for several runs.")] = False,
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
 
     Exit status: 0, or 2 bad input.
     """
+    given = scenario_file(scenario)
     with options("html", "output", "png", "csv", "parquet"):
-        page, flights = write_report(*(runs or [LATEST]), html=html, output=output, png=png, csv=csv, parquet=parquet)
+        page, flights = write_report(
+            *(runs or [LATEST]),
+            html=html,
+            output=output,
+            png=png,
+            csv=csv,
+            parquet=parquet,
+            namespace=namespace,
+            scenario=given,
+        )
     if as_json:
         summaries = [flight.summary for flight in flights]
         print_json(summaries[0] if len(flights) == 1 else summaries)

@@ -12,9 +12,11 @@ from typing import Annotated
 import typer
 
 from flight_bringup.processes import end_with_parent
+from flight_cli.log_options import LogScenario, scenario_file
 from flight_cli.target import RemovedKeyFile
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
+from flight_log.tape_reader import StoredFile, stored_scenario
 from flight_view.flight import Flight
 from flight_view.text import show
 from flight_view.watch import DEFAULT_PORT, newest_run, require_log, serve
@@ -40,7 +42,11 @@ def watch(
     control_real: Annotated[
         bool, typer.Option("--control-real", help="As --control, and gains also while a bridge sends to an autopilot.")
     ] = False,
-    namespace: Annotated[str, typer.Option(help="With --control: the namespace of the flight.")] = "",
+    scenario: LogScenario = None,
+    namespace: Annotated[
+        str | None,
+        typer.Option(help="Namespace of the aircraft: by default the first in the log, with --control the root."),
+    ] = None,
     _: RemovedKeyFile = None,
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
@@ -49,23 +55,23 @@ def watch(
     The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
     require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
-    require(not namespace or control or control_real, "--namespace", "no --control", "--control beside it")
+    given = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
     chosen = [newest_run(runs) if run is None else run, *([ghost] if ghost is not None else [])]
     for folder in chosen:
         if not wait:
-            require_log(folder)
+            require_log(folder, namespace)
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
         require(ghost is None, "--text", "two runs", "one run")
         require(not (control or control_real), "--text", "--control beside it", "one of the two")
-        show(Flight(chosen[0]))
+        show(Flight(chosen[0], namespace=namespace, scenario=given))
     elif foxglove:
         require(ghost is None and not (control or control_real), "--foxglove", "a ghost or --control beside it", "RUN alone")
         _serve_foxglove(chosen[0], port)
     elif control or control_real:
-        _serve_with_control(chosen, ports, namespace, real=control_real)
+        _serve_with_control(chosen, ports, namespace or "", given, real=control_real)
     else:
-        serve(chosen, ports, _announce)
+        serve(chosen, ports, _announce, None, namespace, given)
 
 
 def _announce(line: str) -> None:
@@ -82,7 +88,9 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
     foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
-def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: str, *, real: bool) -> None:
+def _serve_with_control(
+    runs: Sequence[Path], ports: Sequence[int], namespace: str, scenario: StoredFile | None, *, real: bool
+) -> None:
     from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
@@ -96,7 +104,7 @@ def _serve_with_control(runs: Sequence[Path], ports: Sequence[int], namespace: s
 
         _announce(f"control key: {key}")
         try:
-            serve(runs, ports, _announce, control)
+            serve(runs, ports, _announce, control, namespace or None, scenario)
         finally:
             for opened in controls:
                 opened.close()

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from itertools import groupby, islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any
+from typing import Any
 from urllib.parse import quote
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -123,7 +123,7 @@ def _unpack(file: Path, plain: Path, kind: str) -> bool:
     size = 0
     try:
         with opened(file, "rb") as source, plain.open("wb") as target:
-            while block := _read(source):
+            while block := source.read1(COPY_BYTES):  # what a truncated file holds before its end
                 size += len(block)
                 unpack = UNPACK.get(file.suffix, "unpack")
                 require(size <= limit, str(file), f"more than {limit} bytes unpacked", f"them on a larger disk: {unpack}")
@@ -135,8 +135,24 @@ def _unpack(file: Path, plain: Path, kind: str) -> bool:
     return True
 
 
-def _read(source: IO[bytes]) -> bytes:
-    return source.read(COPY_BYTES)
+def log_topics(run: Path) -> dict[str, str]:
+    """The types of the topics of a log by full name; with "in ENCODING" of messages that are no CDR.
+
+    By the index of a file alone where the file has an index. Raises ParameterError for a path without a log.
+    """
+    topics: dict[str, str] = {}
+    for file in log_files(run):
+        schemas: dict[int, str] = {}
+        with open_scan(file) as scan:
+            for record in scan.records():
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    name, encoding = schemas.get(record.schema_id, ""), record.message_encoding
+                    topics.setdefault(record.topic, name if encoding == "cdr" else f"{name} in {encoding}")
+                elif topics and scan.message_counts:  # the index names all channels
+                    break
+    return topics
 
 
 def plain_message(data: bytes) -> bytes:

@@ -84,10 +84,12 @@ class RecordedRun(NamedTuple):
     topics: Mapping[str, str] = {}
 
     def require(self, *names: str) -> None:
-        """Raise ParameterError with the topics of the log where a topic of a flight has no sample."""
+        """Raise ParameterError with the topics of the log where a topic of a flight has no sample, or every topic."""
         missing = [name for name in names if name not in self.tape]
-        where, has = "the log" if self.path is None else str(self.path), listed(self.topics)
-        require(not missing, where, f"no sample of {', '.join(missing)}{f' among {has}' if has else ''}", A_FLIGHT)
+        if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):
+            where, has = "the log" if self.path is None else str(self.path), listed(self.topics)
+            found = f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
+            raise ParameterError(f"{where}: found {found}, expected {A_FLIGHT}")
 
     def scenario_file(self) -> StoredFile:
         """The scenario in the log. Raises ParameterError for a log without one."""
@@ -403,8 +405,8 @@ def _add_metadata(folder: Path, log: _Log) -> None:
         log.known_end_ns = max(log.known_end_ns, end_ns)
     except ParameterError:
         fault = "cannot be read" if is_file(folder / METADATA) else "is missing"
-        mend = "rise-di repair" if any(folder.glob("*.mcap")) else "ros2 bag reindex"
-        log.notes.append(f"{METADATA} {fault}: {mend} {shlex.quote(str(folder))}")
+        mend = {".mcap": "rise-di repair", ".db3": "ros2 bag reindex"}.get(bag_files(folder)[0].suffix)
+        log.notes.append(f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}")
     if missing := missing_parts(bag_files(folder), information):
         known = f"named in {METADATA}" if information else "a number between those there"
         log.notes.append(f"{', '.join(missing)}: {known} and missing; the log is a part of the recording")

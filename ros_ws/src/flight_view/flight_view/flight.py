@@ -35,7 +35,7 @@ from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
-from flight_log.tape_reader import read_run
+from flight_log.tape_reader import StoredFile, listed, read_run
 from flight_view.series import Series
 
 RATE = 50.0  # Hz
@@ -95,9 +95,18 @@ class _Topic:
 
 
 class Flight:
-    """A flight in a log. `update` reads new messages."""
+    """A flight in a log. `update` reads new messages.
 
-    def __init__(self, run: Path, now: Callable[[], float] = time.monotonic) -> None:
+    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the scenario in the log.
+    """
+
+    def __init__(
+        self,
+        run: Path,
+        now: Callable[[], float] = time.monotonic,
+        namespace: str | None = None,
+        scenario: StoredFile | None = None,
+    ) -> None:
         self.run = run
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
@@ -115,7 +124,8 @@ class Flight:
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of)
         self._topics: dict[str, _Topic] = {}  # by full name
-        self._namespace: str | None = None
+        self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
+        self._kinds: dict[str, str] = {}  # types of the topics of the log, by full name
         self._takes_routes = True  # whether guidance takes a route in flight
         self._unreadable = 0
         self._start_ns: int | None = None  # by `truth`
@@ -128,6 +138,9 @@ class Flight:
         self._behind = False  # there is more to read at once
         self._account: Thread | None = None  # counts the samples of an ended log
         self._lacks: list[str] = []
+        self._given = scenario
+        if scenario is not None:
+            self._take_scenario(scenario.content)
 
     @property
     def start_ns(self) -> int:
@@ -159,10 +172,12 @@ class Flight:
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
         follower = self._follower
+        among = f" among {_text(listed(self._kinds))}" if self._kinds else ""
         refused = {name: samples.refused for name, samples in self.samples.items() if samples.refused}
         return [
             *self.notes,
             *self._lacks,
+            *([f"no sample of a flight{among}"] if self._follower.complete and not self.samples else []),
             *([f"the log cannot be read further: {_text(follower.fault)}"] if follower.fault else []),
             *([f"{follower.damaged} damaged parts of the log are left out"] if follower.damaged else []),
             *([f"{self._unreadable} samples are unreadable"] if self._unreadable else []),
@@ -206,11 +221,15 @@ class Flight:
         """What an ended log lacks. The page reads a part of the samples; this reads the whole log."""
         with suppress(ParameterError, OSError):
             recorded = read_run(self.run, self._namespace)
+            if self._given is not None:
+                recorded = recorded._replace(scenario=self._given)
             of = log_account(recorded)
             lacks = () if of is None else (f"the log lacks {lack}" for lack in of.lacks)
             self._lacks = [_text(sentence) for sentence in (*recorded.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:
+        if len(self._kinds) < MAX_CHANNELS:
+            self._kinds[topic] = type_name
         if (topic, type_name) in ((LOG, LOG_TYPE), (PARAMETER_EVENTS, PARAMETER_EVENT)):
             return math.inf
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
@@ -223,7 +242,7 @@ class Flight:
         if self._namespace is None:
             self._namespace = namespace
         if namespace != self._namespace:
-            self._note(f"another aircraft in the namespace {namespace or '/'} is not shown")
+            self._note(f"another aircraft in the namespace {namespace or '/'} is not shown: --namespace {namespace or '/'}")
             return 0.0
         return RATES[name]
 
@@ -241,15 +260,18 @@ class Flight:
                 for topic, count in record.metadata.items():
                     self._note(f"{topic}: the recorder lost {count} messages")
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
-            try:
-                path = Path("scenario.yaml")
-                self.scenario = parse_recorded_scenario(record.data, path)
-                # Guidance of an earlier version with a key refused every route.
-                self._takes_routes = not parse_scenario_sections(record.data, path).get("guidance", {}).get("key_file")
-                self.described += 1
-                self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
-            except ParameterError as error:
-                self._note(f"units, limits and commands are unknown: {error}")
+            self._take_scenario(record.data)
+
+    def _take_scenario(self, content: bytes) -> None:
+        try:
+            path = Path("scenario.yaml")
+            self.scenario = parse_recorded_scenario(content, path)
+            # Guidance of an earlier version with a key refused every route.
+            self._takes_routes = not parse_scenario_sections(content, path).get("guidance", {}).get("key_file")
+            self.described += 1
+            self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
+        except ParameterError as error:
+            self._note(f"units, limits and commands are unknown: {error}")
 
     def _take(self, messages: Messages) -> None:
         if messages.type_name != JOINT_STATE:

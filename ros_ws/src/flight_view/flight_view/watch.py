@@ -14,9 +14,12 @@ from pathlib import Path
 from flight_core.files import is_folder
 from flight_core.parameters import ParameterError, require
 from flight_log.disk import is_locked
+from flight_log.named_vectors import JOINT_STATE, full_name
+from flight_log.open_log import log_files, log_topics
 from flight_log.rosbag2_metadata import bag_files
+from flight_log.tape_reader import A_FLIGHT, StoredFile, chosen_namespace, listed
 from flight_view.control import Control
-from flight_view.flight import Flight
+from flight_view.flight import RATES, Flight
 from flight_view.server import ADDRESS, Server
 
 DEFAULT_PORT = 8077
@@ -34,9 +37,17 @@ def newest_run(runs: Path) -> Path:
     return latest.resolve()
 
 
-def require_log(run: Path) -> None:
-    """Raise ParameterError unless a run has a log."""
-    require(bool(bag_files(run)), str(run), "no .mcap file", "the folder of a run or an MCAP file")
+def require_log(run: Path, namespace: str | None = None) -> None:
+    """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an aircraft in the namespace."""
+    with suppress(OSError):
+        if any(is_locked(file) for file in log_files(run)):
+            return
+    topics = log_topics(run)
+    aircraft = [topic for topic, name in topics.items() if full_name(name) == JOINT_STATE and topic.rpartition("/")[2] in RATES]
+    has = f"no topic of a flight among {listed(topics)}" if topics else "no topic"
+    require(bool(aircraft), str(run), has, A_FLIGHT)
+    if namespace is not None:
+        chosen_namespace(aircraft, namespace, str(run))
 
 
 def serve(
@@ -44,23 +55,26 @@ def serve(
     ports: Sequence[int],
     announce: Callable[[str], None],
     control: Callable[[Flight], Control] | None = None,
+    namespace: str | None = None,
+    scenario: StoredFile | None = None,
 ) -> None:
     """Serve a run, and a second run as a ghost, on the first free port, until SIGINT or SIGTERM.
 
-    `announce` gets two lines for the user. `control` lets the page command the first flight.
+    `announce` gets two lines for the user. `control` lets the page command the first flight. `namespace` and `scenario` as in
+    `Flight`.
 
     Raises ParameterError where no port is free, or a log is unreadable.
     """
-    asyncio.run(_serve(runs, ports, announce, control))
+    flights = [Flight(run, namespace=namespace, scenario=scenario) for run in runs]
+    asyncio.run(_serve(flights, ports, announce, control))
 
 
 async def _serve(
-    runs: Sequence[Path],
+    flights: Sequence[Flight],
     ports: Sequence[int],
     announce: Callable[[str], None],
     control: Callable[[Flight], Control] | None,
 ) -> None:
-    flights = [Flight(run) for run in runs]
     server = Server(flights, secrets.token_urlsafe(16), None if control is None else control(flights[0]))
     for port in ports:
         try:

@@ -50,8 +50,13 @@ def require_signs(channel_map: ChannelMap, scenario: Scenario) -> None:
         raise ParameterError("; ".join(contradictions))
 
 
-def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None) -> SignCheck:
-    """Check a channel map against a scenario's controller, for an airframe and optionally a recorded flight."""
+def check_scenario(
+    channel_map: ChannelMap, scenario: Scenario, frame: Airframe, bag: Path | None, namespace: str | None = None
+) -> SignCheck:
+    """Check a channel map against a scenario's controller, for an airframe and optionally a recorded flight.
+
+    `namespace` selects the aircraft of a log with several.
+    """
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     for key, names, expected in (
         (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
@@ -62,21 +67,20 @@ def check_scenario(channel_map: ChannelMap, scenario: Scenario, frame: Airframe,
         require_channels(key, names, expected, "the channels of the controller")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
-    measured = None if bag is None else recorded_response(bag, outputs, inputs)
+    measured = None if bag is None else recorded_response(bag, outputs, inputs, namespace)
     return check(channel_map, in_map, outputs, inputs, scenario.controller.D, measured)
 
 
-def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...]) -> Response:
+def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...], namespace: str | None = None) -> Response:
     """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the engagements of a bridge.
 
     y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
     Raises ParameterError for a log without y and u, for a bridge without engagement, and for a flight under guidance, whose
     y_m follows y.
     """
-    recorded = read_run(bag)
+    recorded = read_run(bag, namespace)
     tape = recorded.tape
-    for topic in ("y", "u"):
-        require(topic in tape, str(bag), f"no {topic}", "a log with y and u")
+    recorded.require("y", "u")
     flown = recorded.engagements
     if flown is None:
         require("bridge/would_send" not in tape, str(bag), "no engagement of its bridge", "a flight with an engaged bridge")

@@ -31,6 +31,8 @@ def report(
     png: FilePath | None = None,
     csv: FilePath | None = None,
     parquet: FilePath | None = None,
+    namespace: str | None = None,
+    scenario: FilePath | None = None,
 ) -> Report:
     """Write the report page of a recorded run, or a page that compares several runs with the first, as `rise-di report` does.
 
@@ -41,6 +43,8 @@ def report(
         png: File for y over y_m, e and u as one figure.
         csv: File for all signals, one row an instant, one column a channel.
         parquet: File for the same table as Parquet.
+        namespace: Namespace of the aircraft, for logs with several aircraft.
+        scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in each log.
 
     Raises ParameterError for a run that cannot be read, and for a file that cannot be written.
     """
@@ -51,10 +55,11 @@ def report(
     alone = len(folders) == 1 and html is None
     require(output is None or alone, "output", "a comparison", "one run; html for several")
     if alone:
-        result = write_report(folders[0], output=None if output is None else as_path(output, "output", "the path of a folder"))
+        folder = None if output is None else as_path(output, "output", "the path of a folder")
+        result = write_report(folders[0], output=folder, namespace=namespace, scenario=scenario)
         page, flights = result.report, [result.flight]
     else:
-        flights = [read_flight(folder) for folder in folders]
+        flights = [read_flight(folder, namespace=namespace, scenario=scenario) for folder in folders]
         if html is None:
             files.insert(0, ("html", folders[0].absolute().parent / "comparison.html", write_page))
         page = files[0][1]

@@ -15,6 +15,7 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
 from flight_analysis.report.account import Account, account, flown
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
+from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, read_file, write_file, writing
 from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
 from flight_core.parameters import ParameterError, require
@@ -73,16 +74,19 @@ def _write(path: Path, text: str) -> Path:
     return path
 
 
-def read_flight(run: Path, outcome: str | None = None) -> RecordedFlight:
+def read_flight(
+    run: Path, outcome: str | None = None, namespace: str | None = None, scenario: FilePath | None = None
+) -> RecordedFlight:
     """Read a recorded flight and summarise it. No file is written.
 
     Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the log cannot be read, or holds
-    no scenario.
+    no scenario. `namespace` and `scenario` as in `read_run`.
     """
-    return _flight(read_run(run), run, outcome)
+    return _flight(read_run(run, namespace, scenario), run, outcome)
 
 
 def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
+    recorded.require()
     folder, scenario = _folder(run), _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     log = replace(recorded.tape, signals=signals)
@@ -157,19 +161,27 @@ def _write_scenario(recorded: RecordedRun, path: Path) -> None:
     )
 
 
-def write_report(run: Path, outcome: str | None = None, output: Path | None = None) -> FlightResult:
+def write_report(
+    run: Path,
+    outcome: str | None = None,
+    output: Path | None = None,
+    namespace: str | None = None,
+    scenario: FilePath | None = None,
+) -> FlightResult:
     """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the run.
 
     The files go beside the log, or into the new folder `output`. Without an outcome the report of an old run is
-    written again and runs/latest stays. Raises ParameterError as `read_flight` does, before any file is written.
+    written again and runs/latest stays. A `scenario` in place of the scenario in the log is not written. Raises ParameterError
+    as `read_flight` does, before any file is written.
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
-    recorded = read_run(run)
+    recorded = read_run(run, namespace, scenario)
     flight, folder = _flight(recorded, run, outcome), output or _folder(run)
     with writing("", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-        _write_scenario(recorded, folder / flight.scenario.path.name)
+        if scenario is None:
+            _write_scenario(recorded, folder / flight.scenario.path.name)
         write_file(folder / SUMMARY, json.dumps(flight.summary, indent=2, allow_nan=False) + "\n")
         write_page(folder / REPORT, [flight])
     if outcome is not None:
