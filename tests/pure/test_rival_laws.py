@@ -134,7 +134,7 @@ def test_doubling_solves_the_riccati_equation(osprey: NominalModel) -> None:
     estimator = observer_design.aircraft_model(osprey, observed.unnamed(osprey), np.full(3, 2.0))
     generator = np.random.default_rng(1)
     Q = np.tile(estimator.H.T @ estimator.H, (5, 1, 1))
-    R = riccati.diagonals(np.exp(generator.normal(-3.0, 1.0, (4, 5))))
+    R = riccati.diagonal(np.exp(generator.normal(-3.0, 1.0, (4, 5))).T)
     found = riccati.riccati(estimator.Phi, estimator.Gamma, Q, R)
     for k in range(5):  # scipy's own residuals are of that size: modes that decay with 0.01 1/s lie 1e-4 from the unit circle
         expected = solve_discrete_are(estimator.Phi, estimator.Gamma, Q[k], R[k])

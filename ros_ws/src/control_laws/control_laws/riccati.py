@@ -48,11 +48,6 @@ def diagonal(values: FloatArray) -> FloatArray:
     return np.asarray(values[..., :, None] * np.eye(values.shape[-1]))
 
 
-def diagonals(values: FloatArray) -> FloatArray:
-    """Diagonal matrices, (N, s, s), of diagonals in columns, (s, N)."""
-    return diagonal(values.T)
-
-
 def gain_of(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray:
     """The gain (R + G'P G)^-1 G'P F of u = -gain z for the least sum of z'Q z + u'R u, shape (.., m, s)."""
     P = riccati(F, G, Q, R)
