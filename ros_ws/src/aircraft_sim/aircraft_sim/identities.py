@@ -28,7 +28,7 @@ KINDS = {
 OF_RATES = {"theta": "q r phi", "phi": "p q r theta phi", "psi": "q r theta phi", "h": None, "altitude": None}
 """States whose derivative no force changes, and the named states that enter it; None: any."""
 
-TURNED, COUPLED, LIFT = (0.7, 1.02), (0.7, 1.3), (0.3, 2.8)
+TURNED, COUPLED, LIFT = (0.7, 1.02), (0.6, 1.35), (0.3, 2.8)
 """Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a rate, Z_q or Y_r; of the
 change of lift = weight with speed, which compressibility and thrust change: published aircraft have 0.78 to 1.02."""
 MANY = 4  # states of which every order is tried: 24

@@ -33,7 +33,8 @@ COMMANDS = MappingProxyType(
         "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
         "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
         "gains": "Select gains for an airframe, and check every condition on them.",
-        "airframes": "Show the airframes of the library, and what the theorem asks of each.",
+        "airframes": "Show airframes of the library or your own, and what the theorem asks of each.",
+        "airframe": "Make an airframe of your own from matrices, with a scenario that flies.",
         "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
@@ -68,7 +69,11 @@ def application(words: list[str]) -> typer.Typer:
     for name, sentence in COMMANDS.items():
         if name in words:
             module = name.replace("-", "_")
-            app.command(name)(resolve_name(f"flight_cli.{module}:{module}"))
+            command = resolve_name(f"flight_cli.{module}:{module}")
+            if isinstance(command, typer.Typer):  # a command with commands of its own
+                app.add_typer(command, name=name, help=sentence)
+            else:
+                app.command(name)(command)
         else:
             app.command(name, help=sentence)(lambda: None)
     return app

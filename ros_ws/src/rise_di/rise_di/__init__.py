@@ -29,6 +29,7 @@ __all__ = [
     "Limits",
     "LoopMargins",
     "Measurements",
+    "NewAirframe",
     "NonNegatives",
     "ParameterError",
     "Positives",
@@ -62,6 +63,7 @@ __all__ = [
     "limited_integral",
     "load_airframe",
     "margins",
+    "new_airframe",
     "read_run",
     "recorded_scenario",
     "replay",
@@ -101,6 +103,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_log.tape_reader import RecordedRun, read_run
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.gain_design import check_gains, select_gains
+    from rise_di.own_airframe import NewAirframe, new_airframe
     from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
     from rise_di_controller.controller import Controller
     from rise_di_controller.decomposition import decompose
@@ -135,6 +138,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.gain_design": ("check_gains", "select_gains"),
+        "rise_di.own_airframe": ("NewAirframe", "new_airframe"),
         "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),
         "rise_di_controller.controller": ("Controller",),
         "rise_di_controller.decomposition": ("decompose",),

@@ -134,7 +134,7 @@ def _loop(
     if delay is not None:
         loop = loop._replace(delay=as_number(delay, "delay", 0.0, MAX_DELAY_MARGIN, "s"))
     if lag is not None:
-        loop = loop._replace(lag=_lags(lag, airframe))
+        loop = loop._replace(lag=lags_by_input(lag, airframe))
     if y_rate is not None:
         y_rate = as_number(y_rate, "y_rate", *RATES, "Hz")
         age = max(loop.base.max_age, MESSAGES / y_rate)
@@ -160,7 +160,7 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
     return loop._replace(base=loop.base.model_copy(update=limits))
 
 
-def _lags(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
+def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     """Lags by input, s. Raises ParameterError."""
     names = list(airframe.inputs)
     values = as_numbers(lag, "lag", expected := "seconds, 0 or more")

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An airframe of the user's own, with a scenario that flies, as `rise-di airframe new` writes both."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numpy.typing import ArrayLike
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.uncertainty import as_yaml
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import first_flight, gain_selection
+from flight_analysis.design.airframe_import import Named, import_airframe
+from flight_core.arguments import FilePath, as_path
+from flight_core.files import write_file, writing
+from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError, require
+from rise_di.gain_design import lags_by_input, select_gains
+
+SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
+CLEAR = 0.9  # part of an end stop that u reaches at most
+SAMPLES = 20  # uncertain airframes for the bounds of the theorem
+LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n"
+
+
+class NewAirframe(NamedTuple):
+    """The files that are written, the airframe, and what it was made of."""
+
+    airframe_file: Path
+    scenario_file: Path
+    airframe: Airframe
+    note: str
+
+
+def new_airframe(
+    source: Any,
+    *,
+    folder: FilePath = ".",
+    name: str = "",
+    speed: str | float | None = None,
+    states: Named = (),
+    inputs: Named = (),
+    outputs: str | Sequence[str] = (),
+    thrust: bool = False,
+    text: str = "",
+    lag: ArrayLike | None = None,
+    replace: bool = False,
+    **body: str | float,
+) -> NewAirframe:
+    """Write NAME.yaml, an airframe, and NAME_flight.yaml, a scenario with selected gains that has been flown once.
+
+    Args:
+        source: A state space of python-control or SciPy, or the path of a MATLAB file (.mat), of an airframe file (.yaml), or
+            of a text of AVL (system matrix, or stability derivatives) or XFLR5 (state matrices).
+        folder: Folder of both files.
+        name: Name of the airframe; empty: that of the file.
+        speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
+        states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".
+        inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1 more thrust".
+        outputs: As many as inputs: names of states or of rows of C with units ("V: ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
+            Empty: q, V, p, r by elevator, thrust, aileron, rudder.
+        thrust: Whether to add an input thrust in units of the weight along the flight path, for a model without a thrust.
+        text: Where the figures come from.
+        lag: Lags of the actuators in s, one or one an input; None: 0.05 s of a control surface, 0.3 s of an engine.
+        replace: Whether files of these names may be replaced.
+        body: mass, Ixx, Iyy, Izz, Ixz, density of the aircraft of AVL's derivatives, and its unit of length, `length`.
+
+    Raises ParameterError with one sentence: for a model that contradicts physics, and for an aircraft that no gains fly.
+    """
+    airframe, note = import_airframe(
+        source, name=name, speed=speed, states=states, inputs=inputs, outputs=outputs, thrust=thrust, text=text, **body
+    )
+    place = as_path(folder, "folder", "the path of a folder")
+    files = place / f"{airframe.name}.yaml", place / f"{airframe.name}_flight.yaml"
+    own = isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
+    for path in files[own:]:
+        require(replace or not path.exists(), "folder", f"{path}", "a new file, or replace")
+    lags = first_flight.default_lags(airframe) if lag is None else tuple(lags_by_input(lag, airframe).values())
+    text_of_airframe = LICENCE + as_yaml(airframe)
+    with tempfile.TemporaryDirectory() as trial:
+        (Path(trial) / files[0].name).write_text(text_of_airframe, encoding="utf-8")
+        scenario = _flying(airframe, Path(trial) / files[0].name, files, lags)
+    with writing("folder", place, "a folder that can"):
+        place.mkdir(parents=True, exist_ok=True)
+        if not own:
+            write_file(files[0], text_of_airframe)
+        write_file(files[1], LICENCE + "#\n" + scenario)
+    return NewAirframe(*files, airframe, note)
+
+
+def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequence[float]) -> str:
+    """The text of a scenario with selected gains whose flight ends as planned, clear of the end stops.
+
+    `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text names them.
+    """
+    reached, controller = "", first_flight.placeholder(airframe, lag)
+    for size in SIZES:
+
+        def text(path: Path, section: str, size: float = size) -> str:
+            return first_flight.scenario_text(airframe, str(path), str(files[1]), section, lag, size)
+
+        selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
+        section = gain_selection.as_yaml(selection)
+        flown = _parsed(text(trial, section), files[1])
+        tape = simulate(flown)
+        stops = zip(flown.aircraft.channels().inputs, flown.aircraft.actuators.upper, strict=True)
+        used = {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
+        if tape.outcome == COMPLETED and max(used.values()) <= CLEAR:
+            return text(files[0], section)
+        hardest = max(used, key=lambda key: used[key])
+        reached = f"outcome {tape.outcome}, {hardest} at {100.0 * used[hardest]:.0f} % of its end stop"
+    raise ParameterError(
+        f"airframe {airframe.name}: found {reached}, expected a flight: give the lags of its actuators with lag"
+    )
+
+
+def _parsed(text: str, path: Path) -> Scenario:
+    return parse_scenario(text.encode(), path)
