@@ -23,12 +23,20 @@ PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.
 # With symlinks in place only these need another build; Python sources are live.
 BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/*/config/*.yaml ros_ws/src/*/launch/*.py)
 
+# The venv and the workspace hold the path of their checkout: after a move or a copy everything is made again.
+MADE_IN := $(shell sed -n 's/^command = .* -m venv --clear //p' .venv/pyvenv.cfg 2> /dev/null)
+MOVED := $(if $(filter-out $(subst $() ,?,$(CURDIR)/.venv),$(subst $() ,?,$(MADE_IN))),yes)
+
 FLY := --extra ros --group build
 ALL := $(FLY) --extra campaign --group messages --group docs --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock --requirement pyproject.toml
 
 XDIST = $(BIN)/python -m pytest --maxprocesses 4 --dist loadfile
+
+ifdef MOVED
+.PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
+endif
 
 .PHONY: fly test test-fast test-sitl check docs evidence foxglove messages wheel setup setup-all lock clean
 
@@ -82,6 +90,7 @@ setup-all: .venv/.all .venv/.workspace
 	@command -v $(PYTHON) > /dev/null || { echo "error: no $(PYTHON) here; install Python 3.11 to 3.13, or say make PYTHON=..." >&2; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' \
 	  || { echo "error: $$($(PYTHON) --version) found, but the ROS 2 wheels are for 3.11 to 3.13; say make PYTHON=python3.12" >&2; exit 2; }
+	@$(if $(MOVED),echo "this checkout was made in $(MADE_IN): everything is made again in $(CURDIR)" >&2)
 	$(PYTHON) -m venv --clear .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
 	@touch $@
@@ -99,6 +108,7 @@ setup-all: .venv/.all .venv/.workspace
 	@touch .venv/.fly .venv/.messages $@
 
 .venv/.workspace: $(BUILD_INPUTS) | .venv/.fly
+	@$(if $(MOVED),rm -rf ros_ws/build ros_ws/install ros_ws/log)
 	@mkdir -p ros_ws/build ros_ws/install && find ros_ws/build ros_ws/install -xtype l -delete # colcon keeps links to files that moved, and fails
 	cd ros_ws && PATH="$(BIN):$$PATH" colcon build --symlink-install --event-handlers console_cohesion- status-
 	@printf '%s\n' $(PACKAGES:%=$(CURDIR)/ros_ws/build/%) \

@@ -17,7 +17,7 @@ from operator import attrgetter
 from types import ModuleType
 from typing import Any
 
-from flight_ros.transport import PROFILE_VARIABLE
+from flight_core.environment import PROFILE_VARIABLE
 
 
 class Event: ...

@@ -26,12 +26,13 @@ from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
 from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
+from flight_core.environment import PROFILE_VARIABLE
 from flight_core.parameters import Config, ParameterError
 from flight_log.bag import LogAttachments
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from flight_ros.topics import NodeState
-from flight_ros.transport import DISCOVERY_VARIABLE, PROFILE_VARIABLE
+from flight_ros.transport import DISCOVERY_VARIABLE
 
 pytestmark = pytest.mark.package("flight_bringup")
 

@@ -31,11 +31,11 @@ from autopilot_bridge.params import (
     WatchedRow,
     load_map,
 )
+from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import ChannelError
-from flight_ros import transport
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
@@ -298,8 +298,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         """Why no sample of a topic was accepted, as a sentence."""
         publishers = self.get_publishers_info_by_topic(subscription.name)
         if not publishers:
-            profile = os.environ.get(transport.PROFILE_VARIABLE, "")
-            return f"no publisher. The autopilot's agent needs the same DDS profile, {transport.PROFILE_VARIABLE}={profile}"
+            profile = os.environ.get(PROFILE_VARIABLE, "")
+            return f"no publisher. The autopilot's agent needs the same DDS profile, {PROFILE_VARIABLE}={profile}"
         kind = type_name(subscription.topic.type)
         faults = (mismatch(subscription.name, publisher, kind, subscription.qos) for publisher in publishers)
         refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))

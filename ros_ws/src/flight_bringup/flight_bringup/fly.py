@@ -22,6 +22,7 @@ from flight_bringup.graph import Autopilot
 from flight_bringup.processes import FlightProcesses, handle_signals
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
+from flight_core.environment import require_ros_environment
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED, INTERRUPTED
 from flight_core.parameters import ParameterError, require
@@ -70,6 +71,7 @@ def fly_over_topics(
     it, or without one when too little time is left.
     Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
     """
+    require_ros_environment()
     from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     try:

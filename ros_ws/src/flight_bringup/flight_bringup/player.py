@@ -10,12 +10,11 @@ from typing import Any, Self
 
 import rclpy
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
-from flight_ros import transport
+from flight_ros.client import start_middleware
 from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant, stamp_of
@@ -39,8 +38,7 @@ class Player:
 
     def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
-        transport.prepare()
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # the command handles Ctrl-C
+        start_middleware()
         self._node = rclpy.create_node("player", start_parameter_services=False, enable_rosout=False)
         try:
             self._require_no_publishers([topic for topic in (*types, CLOCK.name) if topic not in shared])

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from flight_core.environment import require_ros_environment
+
 REFUSED = 1
 
 
@@ -24,6 +26,7 @@ def engage(
     where the map has a condition for it; elsewhere max_engaged of the map ends the engagement, unless you engage again before.
     Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """
+    require_ros_environment()
     from autopilot_bridge.client import EngagementClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with EngagementClient(namespace) as client:

@@ -23,6 +23,7 @@ from flight_cli.output import (
     show_flight,
 )
 from flight_core import outcome as ends
+from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
@@ -120,6 +121,7 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
     """Raise ParameterError where the flight would fail, before anything is written."""
     if not in_process:
         require_package("rclpy", "; without ROS fly with --in-process")
+        require_ros_environment()
     if autopilot is None:
         require_euler(scenario)
     else:

@@ -12,6 +12,7 @@ import typer
 
 from flight_cli.log_options import LogNamespace
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
+from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.playback import SHARED, read_playback
@@ -46,6 +47,7 @@ def play(
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start, namespace)
+    require_ros_environment()
     from flight_bringup.player import Player, unsendable  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     end = playback.t(playback.messages[-1].due_ns)

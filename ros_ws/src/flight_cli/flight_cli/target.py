@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from flight_core.environment import require_ros_environment
 from flight_core.parameters import REMOVED, ParameterError, require
 from flight_guidance.modes import TARGETS
 
@@ -42,6 +43,7 @@ def target(
     """
     values = dict(map(_parse, commands))
     require(len(values) == len(commands), "target", "a command twice", "each once")
+    require_ros_environment()
     from flight_guidance.client import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
     with TargetClient(namespace) as client:

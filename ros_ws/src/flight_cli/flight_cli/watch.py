@@ -14,6 +14,7 @@ import typer
 from flight_bringup.processes import end_with_parent
 from flight_cli.log_options import LogScenario, scenario_file
 from flight_cli.target import RemovedKeyFile
+from flight_core.environment import require_ros_environment
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
 from flight_log.tape_reader import StoredFile, stored_scenario
@@ -93,6 +94,8 @@ def _serve_with_control(
 ) -> None:
     from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
+
+    require_ros_environment()
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
     with ControlClient(namespace) as client:

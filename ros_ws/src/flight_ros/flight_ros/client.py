@@ -13,8 +13,18 @@ from rclpy.signals import SignalHandlerOptions
 
 from flight_core.parameters import ParameterError
 from flight_ros import transport
+from flight_ros.rclpy_private import ARGUMENT_ERRORS
 
 SERVICE_TIMEOUT = 10.0  # s
+
+
+def start_middleware() -> None:
+    """Start rclpy in the default context. Raises ParameterError with the reason where the middleware does not start."""
+    transport.prepare()
+    try:
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)  # the command handles SIGINT, not rclpy
+    except ARGUMENT_ERRORS as error:
+        raise ParameterError(f"ROS 2: does not start ({' '.join(str(error).split())}), expected its environment") from None
 
 
 class Client:
@@ -25,14 +35,13 @@ class Client:
 
     def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None) -> None:
         if parent is None:
-            transport.prepare()
-            # The command handles SIGINT, not rclpy.
-            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            start_middleware()
             try:
                 node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
-            except NameValidationException as error:
+            except (NameValidationException, *ARGUMENT_ERRORS) as error:
                 rclpy.try_shutdown()
-                raise ParameterError(f"--namespace: {' '.join(str(error).split())}") from None
+                key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
+                raise ParameterError(f"{key}: {' '.join(str(error).split())}") from None
             self._node, self._cancelled = node, threading.Event()
         else:
             self._node, self._cancelled = parent._node, parent._cancelled

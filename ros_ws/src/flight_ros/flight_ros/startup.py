@@ -8,18 +8,21 @@ sooner. For this reason this module imports rclpy and little else.
 
 import gc
 import os
+import sys
 from contextlib import suppress
 from pkgutil import resolve_name
 from types import FrameType
+from typing import TYPE_CHECKING
 
-import rclpy
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import get_default_context
-
+from flight_core.environment import require_ros_environment
 from flight_core.scheduling import lower_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_ros import transport
-from flight_ros.rclpy_private import Participant, create_participant
+
+if TYPE_CHECKING:
+    from flight_ros.rclpy_private import Participant
+
+BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
 
 
 def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
@@ -28,6 +31,11 @@ def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
     `early`: create a DDS participant before the imports. `lower_by`: levels of real-time priority, more for
     nodes of a longer period.
     """
+    try:
+        require_ros_environment()
+    except ValueError as error:  # a ParameterError, whose module a node loads later
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(BAD_ENVIRONMENT)
     lower_real_time_priority(lower_by)
     gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
     handle_shutdown(_exit)
@@ -37,8 +45,14 @@ def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
     run(*make_nodes, early_participant=early_participant)
 
 
-def _create_early_participant() -> Participant | None:
+def _create_early_participant() -> "Participant | None":
     """A node without topics. It is hidden, as its name begins with _ (ROS 2 design, topic and service names)."""
+    import rclpy  # noqa: PLC0415 - on a full /dev/shm the import itself is a bus error
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
+    from rclpy.utilities import get_default_context  # noqa: PLC0415
+
+    from flight_ros.rclpy_private import create_participant  # noqa: PLC0415
+
     with suppress(Exception):  # the same exception occurs in `run`, which reports it
         transport.prepare()
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)

@@ -11,7 +11,8 @@ from importlib.resources import files
 from pathlib import Path
 from xml.etree import ElementTree
 
-PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+from flight_core.environment import PROFILE_VARIABLE, require_ros_environment
+
 DISCOVERY_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOOPBACK_PROFILE = Path(str(files("flight_ros"))) / "loopback.xml"
 
@@ -25,7 +26,11 @@ def environment() -> dict[str, str]:
 
 
 def prepare() -> None:
-    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read as XML."""
+    """Set the environment before rclpy starts. Raises ParameterError if the profile cannot be read as XML.
+
+    Raises as `require_ros_environment`, too.
+    """
+    require_ros_environment()
     os.environ.update(environment())
     profile = os.environ[PROFILE_VARIABLE]
     try:

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What ROS 2 needs of the environment, checked in less than a millisecond before rclpy is loaded.
+
+Without the check rclpy ends with a traceback, with a bus error, or after a timeout.
+"""
+
+import os
+import re
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import NoReturn
+
+PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+SHARED_MEMORY, LEAST_SHARED_MEMORY = Path("/dev/shm"), 1 << 16  # bytes; rclpy and a flight use 12 kB # noqa: S108
+MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
+
+
+def require_ros_environment() -> None:
+    """Raise ParameterError with the mend where no node can start: logs, shared memory, loopback, domain, middleware."""
+    _require_domain()
+    _require_middleware()
+    _require_shared_memory()
+    _require_log_folder()
+    if PROFILE_VARIABLE not in os.environ:
+        _require_loopback()
+
+
+def _require_domain() -> None:
+    domain = os.environ.get("ROS_DOMAIN_ID", "")
+    fits = not domain or (re.fullmatch(r"[0-9]{1,9}", domain) and int(domain) <= MAX_DOMAIN)
+    if not fits:
+        _refuse(f"ROS_DOMAIN_ID: found {domain!r}, expected a number from 0 to {MAX_DOMAIN}")
+
+
+def _require_middleware() -> None:
+    """By the index of the installed packages; an installation without an index passes."""
+    wanted = os.environ.get("RMW_IMPLEMENTATION", "")
+    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    indexes = [Path(prefix) / "share/ament_index/resource_index/rmw_typesupport" for prefix in prefixes]
+    known = sorted({path.name for index in indexes if index.is_dir() for path in index.iterdir()} - {"rmw_implementation"})
+    if wanted and known and wanted not in known:
+        _refuse(f"RMW_IMPLEMENTATION: found {wanted!r}, expected one of {', '.join(known)}")
+
+
+def _require_shared_memory() -> None:
+    """Rclpy writes a page of shared memory when it is loaded: on a full file system that is a bus error."""
+    try:
+        state = os.statvfs(SHARED_MEMORY)
+    except OSError:  # without the folder rclpy does without
+        return
+    free = state.f_bavail * state.f_frsize
+    if state.f_blocks > 0 and free < LEAST_SHARED_MEMORY:
+        mend = "remove files there, or start a container with --shm-size=64m"
+        _refuse(f"{SHARED_MEMORY}: found {free} bytes free, expected {LEAST_SHARED_MEMORY} or more: {mend}")
+
+
+def log_folder() -> Path | None:
+    """The folder for the logs of nodes, as rcl_logging_interface has it; None without any of its variables."""
+    for variable, inside in (("ROS_LOG_DIR", ""), ("ROS_HOME", "log"), ("HOME", ".ros/log")):
+        if value := os.environ.get(variable):
+            home = os.environ.get("HOME", "~")
+            return Path(home + value[1:] if value.startswith("~") else value) / inside
+    return None
+
+
+def _require_log_folder() -> None:
+    folder = log_folder()
+    if folder is None:
+        _refuse("ROS_LOG_DIR: found none and no HOME, expected a folder for the logs of nodes: ROS_LOG_DIR=FOLDER")
+    probe = folder / f".rise-di-{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        os.close(os.open(probe, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+    except (OSError, ValueError) as error:
+        if folder.is_dir() and isinstance(error, FileExistsError):
+            return  # of a killed process of the same number
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        _refuse(f"{folder}: cannot be written ({reason}), expected a folder for the logs of nodes that can: ROS_LOG_DIR=FOLDER")
+    finally:
+        with suppress(OSError, ValueError):
+            probe.unlink()
+
+
+def _require_loopback() -> None:
+    """Nodes talk over 127.0.0.1 unless the user has a profile."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            probe.connect(probe.getsockname())
+            probe.send(b"")
+    except OSError as error:
+        _refuse(f"127.0.0.1: cannot be reached ({error.strerror}), expected the loopback interface up: ip link set lo up")
+
+
+def _refuse(sentence: str) -> NoReturn:
+    from flight_core.parameters import ParameterError  # noqa: PLC0415 - the start of a node does without
+
+    raise ParameterError(sentence) from None

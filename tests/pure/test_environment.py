@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Environments in which no node can start: each is one sentence with the mend, from every command and from a node."""
+
+import os
+import shutil
+import subprocess
+import sys
+import timeit
+from pathlib import Path
+
+import pytest
+
+from flight_core import environment
+from flight_core.environment import require_ros_environment
+from flight_core.parameters import ParameterError
+
+pytestmark = pytest.mark.package("flight_core")
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+BAD_INPUT = 2
+RISE_DI = [sys.executable, "-m", "flight_cli.cli"]
+STARTS = {
+    "fly": [*RISE_DI, "fly", "--duration", "1"],
+    "target": [*RISE_DI, "target", "heading=90"],
+    "engage": [*RISE_DI, "engage"],
+    "node": [sys.executable, "-m", "rise_di_controller.main"],
+}
+
+
+@pytest.fixture(autouse=True)
+def plain(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A right environment."""
+    for name in ("ROS_LOG_DIR", "ROS_HOME", "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", environment.PROFILE_VARIABLE):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+
+def test_right_environment_passes_in_a_millisecond() -> None:
+    """Best of 5 means of 20: the host may be busy."""
+    assert min(timeit.repeat(require_ros_environment, number=20, repeat=5)) / 20 < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("variables", "sentence"),
+    [
+        ({"HOME": ""}, r"ROS_LOG_DIR: found none and no HOME, expected .* ROS_LOG_DIR=FOLDER"),
+        ({"ROS_LOG_DIR": "/proc/nope"}, r"/proc/nope: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER"),
+        ({"ROS_LOG_DIR": "/dev/null"}, r"/dev/null: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER"),
+        ({"ROS_HOME": "/dev/null"}, r"/dev/null/log: cannot be written"),
+        ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID: found '233', expected a number from 0 to 232"),
+        ({"ROS_DOMAIN_ID": "abc"}, r"ROS_DOMAIN_ID: found 'abc'"),
+        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID: found '-1'"),
+        ({"ROS_DOMAIN_ID": "1.5"}, r"ROS_DOMAIN_ID: found '1.5'"),
+        ({"RMW_IMPLEMENTATION": "rmw_nope"}, r"RMW_IMPLEMENTATION: found 'rmw_nope', expected one of .*rmw_fastrtps_cpp"),
+    ],
+)
+def test_variable_without_use_is_named(variables: dict[str, str], sentence: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(ParameterError, match=sentence):
+        require_ros_environment()
+
+
+@pytest.mark.parametrize("value", ["0", "232", ""])
+def test_right_domain_passes(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    require_ros_environment()
+
+
+def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:
+    require_ros_environment()
+    assert not list((tmp_path / ".ros" / "log").iterdir())
+
+
+def test_absent_shared_memory_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A process without /dev/shm flies: the profile has UDP alone."""
+    monkeypatch.setattr(environment, "SHARED_MEMORY", tmp_path / "nowhere")
+    require_ros_environment()
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_start_without_home_is_one_sentence(start: str, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    variables = {name: value for name, value in os.environ.items() if name != "HOME"}
+    result = subprocess.run(STARTS[start], env=variables, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert result.returncode == BAD_INPUT
+    assert result.stderr.startswith("error: ROS_LOG_DIR: found none and no HOME")
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "before", "sentence"),
+    [
+        (["--net"], "true", "error: 127.0.0.1: cannot be reached"),
+        (
+            ["--mount"],
+            "mount -t tmpfs -o size=1m tmpfs /dev/shm && ! dd if=/dev/zero of=/dev/shm/x bs=64k 2> /dev/null",
+            "error: /dev/shm: found 0 bytes free",
+        ),
+    ],
+)
+def test_host_that_cannot_fly_is_told(options: list[str], before: str, sentence: str, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    if (unshare := shutil.which("unshare")) is None:
+        pytest.skip("needs unshare")
+    separate = [unshare, *options]
+    if subprocess.run([*separate, "sh", "-c", before], check=False, capture_output=True).returncode:
+        pytest.skip("needs the right to unshare")
+    for start in ("fly", "node"):
+        command = [*separate, "sh", "-c", f'{before} && exec "$@"', "sh", *STARTS[start]]
+        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert result.returncode == BAD_INPUT, result.stderr
+        assert result.stderr.startswith(sentence)
+        assert result.stderr.count("\n") == 1
+
+
+def test_moved_checkout_is_made_again(tmp_path: Path) -> None:
+    """By the path in pyvenv.cfg, which venv writes."""
+    (tmp_path / "Makefile").write_bytes((REPOSITORY / "Makefile").read_bytes())
+    venv = tmp_path / ".venv"
+    venv.mkdir()
+    for name in (".uv", ".fly", ".all", ".messages", ".workspace"):
+        (venv / name).touch()
+    (tmp_path / "requirements.lock").touch()
+    os.utime(tmp_path / "requirements.lock", (0, 0))
+    for place, again in ((tmp_path, False), (tmp_path.parent / "of old", True)):
+        made_by = f"/usr/bin/python3 -m venv --clear {place}/.venv"
+        (venv / "pyvenv.cfg").write_text(f"version = 3.11.7\ncommand = {made_by}\n", encoding="utf-8")
+        for target in ("setup", "setup-all"):
+            command = [shutil.which("make") or "make", "-n", target]
+            made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+            assert ("-m venv --clear .venv" in made and "colcon build" in made) is again
