@@ -13,8 +13,9 @@ from tests.closed_loop import law_params
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
-from flight_core.vectors import FloatArray, StampedVector
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller import guard, internals
+from rise_di_controller.controller import Controller
 from rise_di_controller.guard import ControllerState, align
 from rise_di_controller.internals import Saturation
 from rise_di_controller.law import LawState, Sign, control, engage, retune, step, step_with_anti_windup
@@ -90,6 +91,33 @@ def test_engages_with_zero_input() -> None:
     modes = run((0, None, []), (10, sample(10, 1.0), []), (20, None, [sample(20)]), both)
     assert [state.mode for state in modes] == [Mode.WAITING, Mode.WAITING, Mode.WAITING, Mode.ENGAGED]
     assert modes[-1].u.tolist() == [0.0] * 4
+
+
+AGE = round(1000 * PARAMS.max_age)  # ms
+
+
+@pytest.mark.parametrize("offset", [-10_000, -AGE - 1, -AGE, 0, AGE, AGE + 1, 10_000])  # ms
+def test_y_bounded_behind_and_ahead_of_clock(offset: int) -> None:
+    now = 20_000
+    y_m = [sample(ms) for ms in sorted({now, now + offset})]
+    (state,) = run((now, sample(now + offset), y_m))
+    assert (state.mode is Mode.ENGAGED) == (abs(offset) <= AGE)
+
+
+@pytest.mark.parametrize("offset", [AGE, AGE + 1, 10_000])  # ms; an old y_m has no value at the stamp of a fresh y
+def test_y_m_bounded_ahead_of_clock(offset: int) -> None:
+    (state,) = run((0, sample(0), [sample(0), sample(offset)]))
+    assert (state.mode is Mode.ENGAGED) == (offset <= AGE)
+
+
+@pytest.mark.parametrize("signal", ["y", "y_m"])
+def test_controller_refuses_stamp_ahead_of_clock(signal: str) -> None:
+    """Else later samples with right stamps would be out of order."""
+    controller = Controller(PARAMS)
+    take = controller.take_y if signal == "y" else controller.take_y_m
+    with pytest.raises(ChannelError, match="ahead of the clock"):
+        take(sample(AGE + 1), 0)
+    take(sample(AGE), 0)
 
 
 def test_new_sample_is_step_of_law() -> None:
@@ -243,9 +271,11 @@ def test_large_integral_tick_reaches_limit() -> None:
 
 
 @pytest.mark.equation(23)
-@given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10))
-def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: float, scale: float) -> None:
-    new = TWO._replace(K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2)
+@given(state=STATES, k=st.floats(0.5, 50), Lambda=st.floats(0.1, 10), scale=st.floats(0.1, 10), D=st.sampled_from([-1.0, 1.0]))
+def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: float, scale: float, D: float) -> None:
+    new = TWO._replace(
+        D=TWO.D * D, K=TWO.K * k, Lambda=TWO.Lambda * Lambda, input_scale=TWO.input_scale * scale, beta=TWO.beta * 2
+    )
     retuned = retune(state, TWO, new)
     before, after = control(state, state, TWO), control(retuned, retuned, new)
     # u is a sum of terms of this size, each rounded once or twice
