@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from tests.conftest import REPOSITORY
 from tests.joint_states import JOINT_STATE, vector
-from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest, HTTPResponse
+from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
 from flight_bringup.scenarios import find_scenario
@@ -436,25 +436,81 @@ def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
     against(recorded)(client)
 
 
-def test_connections_beyond_limit_closed(recorded: Path) -> None:
-    """A freed connection serves again."""
+Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+async def connect(server: Server, request: bytes = b"", count: int = http.MAX_CONNECTIONS) -> list[Connection]:
+    """Connections to a server, with what each sends."""
+    connections = [await asyncio.open_connection("127.0.0.1", server.port, limit=1024) for _ in range(count)]
+    for _, writer in connections:
+        writer.write(request)
+    return connections
+
+
+def request(server: Server, path: str, token: str = TOKEN) -> bytes:
+    return f"GET {path}?token={token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
+
+
+def end(*connections: Connection) -> None:
+    for _, writer in connections:
+        writer.close()
+
+
+def test_connections_without_token_leave_place(recorded: Path) -> None:
+    """A new connection takes the place of the oldest connection without the token; the page is served throughout."""
 
     async def client(server: Server) -> None:
-        idle = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(http.MAX_CONNECTIONS)]
-        for _ in range(1000):
-            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
-            assert await reader.read() == b""  # closed at once
-            writer.close()
-        for _, writer in idle:
-            writer.close()
-        while True:
-            try:
-                assert (await get(server, "/")).code == 200
-            except (HTTPClientError, OSError):  # the server has not noticed yet
-                continue
-            break
+        idle = await connect(server, count=1000)
+        assert (await get(server, "/data/0")).code == 200
+        limit = http.MAX_CONNECTIONS + http.RESERVED
+        for reader, _ in idle[: len(idle) - limit]:
+            assert await rest_of(reader) == b""  # closed
+        assert not any(reader.at_eof() for reader, _ in idle[2 - limit :])
+        end(*idle)
 
     against(recorded)(client)
+
+
+@pytest.mark.parametrize("token", ["", "another"])
+def test_answer_without_token_ends_connection(token: str, recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        (connection,) = await connect(server, 3 * request(server, "/data/0", token), 1)
+        content = await asyncio.wait_for(connection[0].read(), http.REQUEST_TIMEOUT / 2)
+        assert content.count(b"HTTP/1.1 401") == 1
+        end(connection)
+
+    against(recorded)(client)
+
+
+def test_connections_with_token_beyond_limit_refused(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        kept = await connect(server, request(server, "/view.js"))
+        for reader, _ in kept:
+            assert (await reader.readline()).startswith(b"HTTP/1.1 303")
+        assert (await get(server, "/view.js")).code == 503
+        end(*kept)
+        while (await get(server, "/view.js")).code != 200:  # until the server has noticed
+            pass
+
+    against(recorded)(client)
+
+
+def test_answer_not_taken_ends_connection(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.5)
+    monkeypatch.setattr(http, "answer", lambda *_, **__: bytes(64 << 20))  # more than the buffers of the network hold
+
+    async def client(server: Server) -> None:
+        (connection,) = await connect(server, request(server, "/data/0"), 1)
+        assert len(await rest_of_late(connection[0])) < 64 << 20
+        end(connection)
+
+    against(recorded)(client)
+
+
+async def rest_of_late(reader: asyncio.StreamReader) -> bytes:
+    """What arrives at a client that begins to read after a second."""
+    await asyncio.sleep(1.0)
+    return await rest_of(reader)
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
@@ -640,7 +696,7 @@ def test_websocket_has_single_pending_request(recorded: Path, monkeypatch: pytes
 def test_websocket_without_reader_gets_few_answers(
     recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A WebSocket asks and reads no answer: the server makes few answers, and ends quietly."""
+    """A WebSocket asks and reads no answer: the server makes few answers, ends the WebSocket, and ends quietly."""
     made: list[bytes] = []
 
     def big(*_: object, **__: object) -> bytes:
@@ -662,6 +718,8 @@ def test_websocket_without_reader_gets_few_answers(
             before = len(made)
             await asyncio.sleep(2.0 * http.STATE_PERIOD)
         assert len(made) <= 20  # of 1 MiB: what the buffers of the network hold
+        monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.3)
+        await left(server)
 
     with socket.socket() as browser:
         against(recorded)(client)

@@ -6,7 +6,7 @@ import asyncio
 import json
 import math
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ from flight_analysis.closed_loop.margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import check_gains, manoeuvre, study_airframe
 from flight_bringup.scenarios import find_scenario
-from flight_view.control import BURST, LEASE, Control, RefusedError, gains_of, new_key
-from flight_view.server import Server
+from flight_view.control import BURST, KEY_PERIOD, LEASE, Control, RefusedError, gains_of, new_key
+from flight_view.server import MAX_CONNECTIONS, Server
 from rise_di_controller.params import ControllerConfig
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
@@ -330,6 +330,73 @@ def test_engagement_that_waits_for_turn_cancelled_too(recorded: Path, osprey_gus
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
+# Actions by state
+
+VALUES = {"k_g": [1.1 * find_scenario("osprey_gust").controller.k_g]}  # type: ignore[attr-defined]
+REQUESTS: Mapping[str, Mapping[str, Any]] = {
+    "state": {},
+    "check": {"values": VALUES},
+    "gains": {"values": VALUES},
+    "undo": {},
+    "fault": {"values": {"sensors.dropout": 0.2}},
+    "gust": {"axis": "lateral", "speed": 3, "length": 20},
+    "target": {"values": {"heading": 1.5}},
+    "route": {"points": [[0, 0, 50], [500, 0, 60]]},
+    "hold": {},
+    "skip": {},
+    "activate": {},
+    "deactivate": {},
+    "engage": {"map": "plane"},
+    "disengage": {},
+}
+OVER = ("ended", "interrupted")
+ALLOWED_AFTER_END = ("state", "check", "deactivate", "disengage")
+NOTHING_TO_DO = ("undo", "skip")  # 422: no change to undo, no further leg
+
+
+def test_table_has_each_action(desk: Desk) -> None:
+    desk.control.close()
+    assert REQUESTS.keys() == {*desk.control._actions, "check"}
+
+
+@pytest.mark.parametrize("action", REQUESTS)
+@pytest.mark.parametrize("state", ["reading", "recording", *OVER])
+def test_action_by_key_lease_rate_and_state(
+    state: str, action: str, recorded: Path, osprey_gust: Scenario, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each cell of the table: who asks for which action in which state of the flight."""
+    desk = Desk(recorded, osprey_gust, "aircraft", "controller", "guidance", *(["bridge"] if "engage" in action else []))
+    monkeypatch.setattr(desk.flight, "state", lambda: state)
+    monkeypatch.setattr(desk.nodes, "engage", lambda: "")
+    digest = ""
+
+    async def status(key: str = KEY, lease: str = "") -> int:
+        try:
+            await desk.control.answer({"do": action, "digest": digest, **REQUESTS[action]}, key, lease or desk.lease)
+        except RefusedError as error:
+            return int(error.status)
+        return 200
+
+    async def steps(desk: Desk) -> None:
+        nonlocal digest
+        digest = (await desk.ask("state"))["digest"]
+        refused = 409 if state in OVER and action not in ALLOWED_AFTER_END else 0
+        assert await status(key="ABCD-EFGX") == 403
+        desk.time += 5.0 * KEY_PERIOD
+        desk.lease = (await desk.ask("state"))["lease"]
+        assert await status(lease="another") == (refused or 423)
+        assert desk.nodes.done == []
+        desk.time += BURST
+        for _ in range(int(BURST)):
+            await desk.ask("state")
+            desk.time -= 1.0
+        assert await status() == (200 if action in {"deactivate", "disengage"} else 429)
+        desk.time += 2.0
+        assert await status() == (refused or (422 if action in NOTHING_TO_DO else 200))
+
+    with_desk(desk, steps)
+
+
 # Over HTTP
 
 
@@ -402,3 +469,29 @@ def test_without_control_there_is_nothing_to_post_to(desk: Desk) -> None:
 def test_every_scenario_offers_its_gains() -> None:
     for name in ("osprey_gust", "osprey_observer", "jsbsim_c172p"):
         assert {"k_g", "k_d", "Lambda", "beta"} <= set(gains_of(find_scenario(name).controller))
+
+
+def test_clients_that_stay_and_read_nothing_do_not_delay_deactivation(desk: Desk) -> None:
+    """64 clients with the token and 200 without, each of which sends a request and reads no answer."""
+
+    async def steps(desk: Desk) -> None:
+        server = Server([desk.flight], TOKEN, desk.control)
+        server.listen(0)
+        clients = []
+        try:
+            lease = json.loads((await post(server, {"do": "state"})).body)["lease"]
+            for k in range(MAX_CONNECTIONS + 200):
+                query = f"?token={TOKEN}" if k < MAX_CONNECTIONS else ""
+                _, writer = await asyncio.open_connection("127.0.0.1", server.port)
+                writer.write(f"GET /data/0{query} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode())
+                writer.transport.pause_reading()  # type: ignore[attr-defined]
+                clients.append(writer)
+            for _ in range(20):  # more than the reserved connections
+                assert (await post(server, {"do": "deactivate"}, **{"X-Control-Lease": lease})).code == 200
+        finally:
+            for writer in clients:
+                writer.transport.abort()
+            await server.close()
+        assert desk.nodes.done == 20 * [("activate", False)]
+
+    with_desk(desk, steps)

@@ -39,7 +39,8 @@ NODES: Mapping[NodeSpec, Callable[[], FlightNode[Any]]] = {
 }
 NOW_NS = 1000 * NANOSECONDS
 CONTROLLER_AGE, GUIDANCE_AGE = SCENARIO.controller.max_age, SCENARIO.guidance.max_age if SCENARIO.guidance else 0.0
-U_M_AGE, U_AGE = SCENARIO.reference_model.live.max_age, SCENARIO.aircraft.max_age + SCENARIO.aircraft.sensors.delay
+DELAY = 0.05  # s, of the sensors of the aircraft
+U_M_AGE, U_AGE = SCENARIO.reference_model.live.max_age, SCENARIO.aircraft.max_age + DELAY
 LIMITS = {
     "controller": {"y": CONTROLLER_AGE, "y_m": CONTROLLER_AGE},
     "aircraft": {"u": U_AGE},
@@ -89,6 +90,7 @@ def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
 @pytest.mark.parametrize("spec", NODES)
 def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_path: Path) -> None:
     overrides = parameter_overrides(spec, SCENARIO, tmp_path, 0.0, lockstep=lockstep)
+    overrides = {**overrides, "sensors.delay": DELAY} if spec is AIRCRAFT else overrides
     parameters = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
     with node(NODES[spec], "--params-file", str(SCENARIO.path), *parameters) as made:
         topics = {subscription.topic.name for subscription in made.polled_subscriptions}

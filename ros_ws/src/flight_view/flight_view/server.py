@@ -16,19 +16,21 @@ import math
 import socket
 import struct
 import time
+from asyncio import Future
 from collections.abc import Awaitable, Mapping, Sequence
 from contextlib import suppress
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import parse_qsl
 
 import numpy as np
+from tornado.http1connection import HTTP1Connection, HTTP1ServerConnection
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream, StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler
-from tornado.websocket import WebSocketClosedError, WebSocketHandler
+from tornado.websocket import WebSocketClosedError, WebSocketHandler, WebSocketProtocol
 
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
@@ -49,8 +51,9 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-MAX_CONNECTIONS = 64  # a browser holds up to six
-REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, and for the next request to begin
+MAX_CONNECTIONS = 64  # with the token; a browser holds up to six
+RESERVED = 8  # further connections: for requests of control, and for the first request of a connection
+REQUEST_TIMEOUT = 10.0  # s, for a request to arrive in full, for the next request to begin, and for the peer to take the answer
 MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
@@ -72,7 +75,7 @@ class Server:
         self.streams: set[_News] = set()  # open WebSockets
         self._news = asyncio.Event()
         names = [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data), (r"/news/([01])", _News)]
-        self._http = _LimitedServer(
+        self.http = _LimitedServer(
             Application(
                 [*names, *([(r"/control", _Control)] if control else [])],
                 default_handler_class=_Handler,
@@ -91,14 +94,14 @@ class Server:
         listener = socket.create_server((ADDRESS, port), backlog=MAX_CONNECTIONS)
         listener.setblocking(False)
         self.port = listener.getsockname()[1]
-        self._http.add_socket(listener)
+        self.http.add_socket(listener)
 
     async def close(self) -> None:
         """Stop listening and close all connections."""
-        self._http.stop()
+        self.http.stop()
         for stream in [*self.streams]:
             stream.close()
-        await self._http.close_all_connections()
+        await self.http.close_all_connections()
 
     def accepts(self, host: str) -> bool:
         """Whether a Host header names this server, exactly."""
@@ -195,26 +198,44 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
 
 
 class _LimitedServer(HTTPServer):
-    """Accepts at most MAX_CONNECTIONS connections."""
+    """Holds at most MAX_CONNECTIONS connections with the token, and RESERVED further connections.
+
+    A new connection takes the place of the oldest connection that has not shown the token.
+    """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         super().initialize(*args, **kwargs)
-        self._count = 0
+        self._admitted: dict[IOStream, bool] = {}  # by connection in the order of arrival: whether it has a place for long
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
-        if self._count >= MAX_CONNECTIONS:
-            stream.close()
-            return
-        self._count += 1
+        if len(self._admitted) >= MAX_CONNECTIONS + RESERVED:
+            oldest = next((held for held, admitted in self._admitted.items() if not admitted), stream)
+            self._admitted.pop(oldest, None)
+            oldest.close()
+            if oldest is stream:
+                return
+        self._admitted[stream] = False
         super().handle_stream(stream, address)
 
+    def admit(self, stream: IOStream) -> bool:
+        """Keep the connection of a request with the token. False where MAX_CONNECTIONS connections are kept already."""
+        if sum(self._admitted.values()) < MAX_CONNECTIONS:
+            self._admitted[stream] = True
+        return self._admitted[stream]
+
     def on_close(self, server_conn: object) -> None:
-        self._count -= 1
+        self._admitted.pop(cast("HTTP1ServerConnection", server_conn).stream, None)
         super().on_close(server_conn)
 
 
 class _Handler(RequestHandler):
-    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass answers."""
+    """Checks the Host header and the token of a request. Answers 404, not found, where no subclass answers.
+
+    A connection without the token, or beyond MAX_CONNECTIONS, is closed after the answer. A connection whose peer does not take
+    the answer within REQUEST_TIMEOUT is closed, too.
+    """
+
+    _kept = False
 
     @property
     def server(self) -> Server:
@@ -229,12 +250,35 @@ class _Handler(RequestHandler):
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
+    @property
+    def stream(self) -> IOStream:
+        return cast("HTTP1Connection", self.request.connection).stream
+
     def prepare(self) -> None:
         if not self.server.accepts(self.request.host):
             raise HTTPError(HTTPStatus.FORBIDDEN)
         given = self.get_query_argument("token", "") or self.get_cookie(self.cookie) or ""
         if not hmac.compare_digest(given.encode(), self.server.token.encode()):
             raise HTTPError(HTTPStatus.UNAUTHORIZED, reason="Open the whole address that rise-di watch printed")
+        self._kept = self.server.http.admit(self.stream)
+        if not self._kept and not isinstance(self, _Control):
+            raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=f"{MAX_CONNECTIONS} connections are open")
+
+    def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
+        """Send the answer, and close the connection as the class says."""
+        stream, kept = self.stream, self._kept
+        if not kept:
+            self.set_header("Connection", "close")
+        sent = super().finish(chunk)
+        timeout = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, stream.close)
+
+        def end(_: "Future[None]") -> None:
+            timeout.cancel()
+            if not kept:
+                stream.close()
+
+        sent.add_done_callback(end)
+        return sent
 
     def require_page(self) -> None:
         """Refuse a request from a foreign page."""
@@ -301,6 +345,7 @@ class _News(_Handler, WebSocketHandler):
 
     def open(self, *names: str) -> None:
         self.flight = self.server.flights[int(names[0])]
+        self._sending: Future[None] | None = None
         self.server.streams.add(self)
         self._await_request()
 
@@ -316,11 +361,18 @@ class _News(_Handler, WebSocketHandler):
         return self._answered  # before it is done, the next message is not read
 
     def look(self) -> None:
-        """Answer the request on news or after MAX_WAIT. Close after REQUEST_TIMEOUT without a request."""
+        """Answer the request on news or after MAX_WAIT.
+
+        Close after REQUEST_TIMEOUT without a request, or without a peer that takes the answer.
+        """
         waited = time.monotonic() - self._since
         if self._known is None:
             if waited > REQUEST_TIMEOUT:
                 self.close()
+                if (
+                    self._sending is not None and not self._sending.done()
+                ):  # the peer does not read the end of the answer either
+                    cast("IOStream", cast("WebSocketProtocol", self.ws_connection).stream).close()
             return
         try:
             if waited < MAX_WAIT and not has_news(self.flight, self._known):
