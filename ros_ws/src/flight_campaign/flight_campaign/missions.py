@@ -26,6 +26,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
 from flight_guidance import modes, path
+from flight_guidance.fence import RIGHT, Escape, last_safe_turn
 from flight_guidance.lateral import PathError
 from flight_guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
 from flight_guidance.params import GuidanceConfig
@@ -107,6 +108,9 @@ class MissionState(NamedTuple):
     altitude_squares: Array
     phi_max: Array
     missed: Array  # legs
+    fence: Array  # action of the fence, as in GuidanceState
+    home_altitude: Array  # m
+    clearance: Array  # m, the least one from the fence
 
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
@@ -223,7 +227,8 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
         jnp.zeros((3, count)),
         none,
         velocity,
-        *(none,) * 6,
+        *(none,) * 8,
+        none + modes.LARGEST,
     )
 
 
@@ -276,12 +281,26 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             return jnp.where(joins_leg, onto(leg, place), entered(leg, following, place))
 
         entry = jnp.where(joins_leg, leg.start_curvature, leg.entry)
-        wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
         altitude = jnp.where(joins_leg, leg.from_altitude, leg.altitude)
+        escape, home_altitude, homing = (
+            Escape(state.fence, False, state.clearance, 0.0),
+            state.home_altitude,
+            state.fence != 0.0,
+        )
+        if params.fence is not None:
+            escape = last_safe_turn(params.fence, state.fence, modes.motion_of(before, pose, speed, params))
+            homing = escape.action != 0.0
+            home = modes.home(pose, params)
+            home_altitude = jnp.where(escape.begins, home["altitude"], state.home_altitude)
+            orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), position)
+            error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))
+            entry, altitude = jnp.where(homing, orbit.curvature, entry), jnp.where(homing, home_altitude, altitude)
+        wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
+        wanted = jnp.where(jnp.abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
         target = Target(altitude=altitude, V=jnp.where(joins_leg, leg.from_V, leg.V))
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
-        off, counts = pose["altitude"] - altitude, leg.has_end & ~joins_leg
+        off, counts = pose["altitude"] - altitude, leg.has_end & ~joins_leg & ~homing
         return state._replace(
             u_m=jnp.stack(after.u_m),
             alpha=after.alpha,
@@ -298,6 +317,9 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             altitude_squares=state.altitude_squares + jnp.where(counts, off**2, 0.0),
             phi_max=jnp.maximum(state.phi_max, jnp.abs(pose["phi"])),
             missed=state.missed + missed,
+            fence=escape.action,
+            home_altitude=home_altitude,
+            clearance=jnp.minimum(state.clearance, escape.clearance),
         )
 
     def begin() -> MissionState:
@@ -314,7 +336,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             wind=(state.air[0], state.air[1]),
         )
         leg, joins_leg = at(state.leg), state.joining != 0.0
-        ends = passed(leg, position) & ~joins_leg
+        ends = passed(leg, position) & ~joins_leg & (state.fence == 0.0)
         missed = ends & (jnp.hypot(position[0] - leg.end[0], position[1] - leg.end[1]) > leg.near)
         number = jnp.where(ends, state.leg + 1, state.leg)
         still = jnp.where(joins_leg & ~onto(leg, position), state.joining, 0.0)
@@ -369,4 +391,5 @@ def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
         "rms.altitude": jnp.sqrt(state.altitude_squares / samples),
         "max.phi": state.phi_max,
         "missed": state.missed,
+        **({} if mission.guidance.fence is None else {"max.breach": jnp.maximum(-state.clearance, 0.0)}),
     }

@@ -6,11 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from flight_core.parameters import require
 from flight_guidance import path, protection
+from flight_guidance.fence import Fence, clearance
 from flight_guidance.lateral import least_period, least_radius
 from flight_guidance.modes import LARGEST
-from flight_guidance.path import Leg, Line
+from flight_guidance.path import Leg, Line, Point, Route
 from flight_guidance.route_file import Waypoint
 
 HEADWIND = 1.2
@@ -73,6 +76,27 @@ def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, ca
         expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
         require(abs(change) <= reach, f"route[{k}].altitude", found, expected)
     return legs
+
+
+def require_inside(route: Route, fence: Fence, margin: float) -> None:
+    """Raise ParameterError for a leg nearer to the fence than `margin`, m, with the place that is the farthest outside."""
+    start: Point = (0.0, 0.0)
+    for number, leg in enumerate(route.legs):
+        points = path.outline(leg, start)
+        start = points[-1]
+        if isinstance(leg, Line):
+            count = math.ceil(path.length(leg) / (POINT_DISTANCE * route.radius)) + 1
+            points = [path.along(leg.start, leg.end, k / count) for k in range(count + 1)]
+        north, east = np.array(points).T
+        inside = clearance(fence.zones, north, east)
+        worst = int(np.argmin(inside))
+        where = f"{abs(inside[worst]):.0f} m {'inside' if inside[worst] >= 0.0 else 'outside'} of the fence"
+        found = f"leg {number}, {where} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
+        require(bool(inside[worst] >= margin), "route", found, f"at least {margin:.0f} m inside")
+
+
+POINT_DISTANCE = 0.05
+"""Distance of the points of a line at which the fence is checked, in radii of the fillets."""
 
 
 def _up(value: float, step: float) -> float:

@@ -34,6 +34,7 @@ from flight_guidance.path import Line, Route
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
 WIND = ("north", "east")
+FENCE = ("action", "clearance", "predicted")
 
 
 class GuidanceOutput(NamedTuple):
@@ -49,6 +50,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
     return (
         *("mode", "mode.lateral", "mode.vertical", "leg", "route", "xtrack", "to_go"),
         *("joining", "track", "missed"),
+        *(f"fence.{name}" for name in FENCE),
         *("phi_c", "theta_c", "climb_c", "V_c"),
         *(f"limited.{name}" for name in LIMITED),
         *("age.pose", "begin", "given"),
@@ -72,6 +74,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) ->
         [
             *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
             *(state.joining, commands.track, commands.missed),
+            *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
             *(seconds(inputs.pose_age_ns), inputs.begin, modes.bits(inputs.given)),
@@ -114,6 +117,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
         group("u_m", outputs),
         logged["joining"],
         (logged["wind.north"], logged["wind.east"]),
+        logged["fence.action"],
     )
     return inputs, state
 
@@ -200,6 +204,13 @@ class Guidance:
             return False
         speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
         self.take_target(modes.hold(self.pose(), speed, self._params))
+        return True
+
+    def home(self) -> bool:
+        """Fly home and orbit there; False while guidance does not fly."""
+        if self.mode is not Mode.ENGAGED or self._pose is None:
+            return False
+        self.take_target(modes.home(self.pose(), self._params))
         return True
 
     def skip(self) -> bool:

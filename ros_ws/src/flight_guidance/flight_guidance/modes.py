@@ -21,6 +21,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, Scalar, array_namespace
 from flight_guidance import path, protection
 from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
+from flight_guidance.fence import HOME, RIGHT, Escape, Fence, Motion, last_safe_turn
 from flight_guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
 from flight_guidance.path import Arc, Leg, Point, Route
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
@@ -88,6 +89,15 @@ LATERAL: Mapping[str, Lateral] = {
 VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
 
 
+class Home(NamedTuple):
+    """Where an aircraft goes in the end."""
+
+    north: float = 0.0  # m
+    east: float = 0.0  # m
+    altitude: float | None = None  # m; None: the altitude of then
+    after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
+
+
 class Limits(NamedTuple):
     """Limits of commands."""
 
@@ -113,6 +123,8 @@ class GuidanceParams(NamedTuple):
     slew: tuple[float, ...]  # largest derivatives of u_m
     max_age_ns: int
     hold_ns: int
+    fence: Fence | None = None
+    home: Home = Home()
 
 
 class Begin(IntEnum):
@@ -153,6 +165,7 @@ class GuidanceState(NamedTuple):
     u_m: tuple[float, ...]
     joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
+    fence: float = 0.0  # action of the fence: 1 and -1 turn to the right and left, 2 flies home after the turn, 0 none
 
 
 class Commands(NamedTuple):
@@ -164,6 +177,8 @@ class Commands(NamedTuple):
     to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
     track: float = 0.0  # course of the path at the nearest point, rad
     missed: float = 0.0  # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
+    clearance: float = LARGEST  # m, from the fence
+    predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
     bank_limited: bool = False
     theta_limited: bool = False
     climb_limited: bool = False
@@ -223,6 +238,13 @@ def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> d
     return {"heading": pose["psi"], "altitude": pose["altitude"], "V": floor}
 
 
+def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
+    """Commands to orbit home clockwise on the least radius, at the altitude of home or of now."""
+    at = params.home
+    altitude = pose["altitude"] if at.altitude is None else at.altitude
+    return {"north": at.north, "east": at.east, "radius": float(math.ceil(params.limits.radius)), "altitude": altitude}
+
+
 def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
     """The state before the first step, at t: holds the heading, the altitude and the airspeed of now."""
     alpha = pose["theta"] - path_angle(pose["climb"], speed)
@@ -259,6 +281,7 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
         target=state.target,
         leg=state.leg,
         joining=state.joining,
+        fence=state.fence,
     )  # the mode, since after a lost pose the wings are levelled
     # Up to the age limit of u_m the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
@@ -283,17 +306,22 @@ def step(
        `hold` the attitude is unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
     2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a circle that touches the leg at
        the start, unless the aircraft is near; a leg whose end the aircraft passes far away is missed.
-    3. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
-    4. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
+    3. The fence: the last safe turn, then home, in place of the lateral mode.
+    4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
+    5. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
     state = begin(state, inputs, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
     pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
     state, missed = _with_commands(state, inputs.given, pose, route)
+    state, escape = _within_fence(state, pose, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
+    if abs(state.fence) == RIGHT and state.mode is Mode.ENGAGED:
+        wanted = math.copysign(params.limits.bank, state.fence)
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
+    commands = commands._replace(clearance=float(escape.clearance), predicted=float(escape.predicted))
     return state._replace(t_ns=inputs.t_ns), commands
 
 
@@ -355,8 +383,9 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
     pose = dict(zip(POSE, inputs.pose, strict=True))
     if inputs.pose_age_ns <= params.max_age_ns:
         if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
-            target = state.target._replace(phi=0.0, altitude=pose["altitude"])
-            level = state._replace(lateral=Lateral.PHI, vertical=Vertical.ALTITUDE, target=target)
+            after_loss = home(pose, params) if params.home.after_loss else {"phi": 0.0, "altitude": pose["altitude"]}
+            lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
+            level = state._replace(lateral=lateral, vertical=Vertical.ALTITUDE, target=state.target._replace(**after_loss))
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
         return state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
     lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
@@ -367,6 +396,34 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
         phi=math.remainder(state.phi + dt * phi_dot, 2.0 * math.pi),
         theta=state.theta + dt * theta_dot,
     )
+
+
+def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Motion:
+    """What the fence predicts a turn from."""
+    return Motion(
+        pose["north"],
+        pose["east"],
+        pose["phi"],
+        pose["psi"] + pose["beta"],
+        speed,
+        state.wind,
+        protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed),
+        params.attitude.roll_rate,
+        0.5 / params.attitude.k_phi,
+    )
+
+
+def _within_fence(
+    state: GuidanceState, pose: Mapping[str, float], speed: float, params: GuidanceParams
+) -> tuple[GuidanceState, Escape]:
+    """The state with the turn away from the fence; home is the target from the begin of the turn on."""
+    if params.fence is None or state.mode is not Mode.ENGAGED:
+        return state, Escape(state.fence, False, LARGEST, LARGEST)
+    escape = last_safe_turn(params.fence, state.fence, motion_of(state, pose, speed, params))
+    if escape.begins:
+        target = state.target._replace(**home(pose, params))
+        state = state._replace(lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0)
+    return state._replace(fence=float(escape.action)), escape
 
 
 def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
@@ -387,6 +444,8 @@ def _with_commands(
     if not given:
         return state, missed
     state = state._replace(target=state.target._replace(**given))
+    if state.fence == HOME and LATERAL.keys() & given.keys():
+        state = state._replace(fence=0.0)
     for name in given:
         state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
     if "leg" in given and route is not None:

@@ -103,6 +103,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             (SetBool, "engage", self._engage),
             (Trigger, "hold", lambda _: self._guidance.hold() or "guidance does not fly"),
             (Trigger, "skip", lambda _: self._guidance.skip() or "no route with a further leg is flown"),
+            (Trigger, "resume", lambda _: self._guidance.resume() or "found no route to resume, or the route is flown"),
+            (Trigger, "home", lambda _: self._guidance.home() or "guidance does not fly"),
         ):
             self.create_service(kind, f"~/{name}", _service(answer))
 

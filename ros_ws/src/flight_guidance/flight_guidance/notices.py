@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, a ground speed along the leg below 0, a wind far from `guidance.wind`.
+"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a wind far from `guidance.wind`.
 
 The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
 """
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from flight_core.vectors import Array, Scalar, array_namespace
+from flight_guidance.fence import RIGHT
 from flight_guidance.modes import Lateral
 
 DWELL = 10.0
@@ -60,17 +61,24 @@ class Notices:
     `wind`: guidance.wind, m/s; `largest_wind`: of the airspeed command, m/s, the wind up to which circles fit into the bank.
     """
 
-    CHANNELS = ("leg", "missed", "mode.lateral", "track", "V_c", "pose.v_north", "pose.v_east", "wind.north", "wind.east")
+    CHANNELS = (
+        *("leg", "missed", "mode.lateral", "track", "V_c", "pose.v_north", "pose.v_east", "wind.north", "wind.east"),
+        *("fence.action", "fence.clearance"),
+    )
 
     def __init__(self, wind: float, largest_wind: Callable[[float], float]) -> None:
         self._wind, self._largest_wind = wind, largest_wind
-        self._blown, self._strong, self._leg = _Lasting(), _Lasting(), 0
+        self._blown, self._strong, self._leg, self._action = _Lasting(), _Lasting(), 0, 0.0
 
     def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
         """The notices of a sample at the flight time t, s, from the CHANNELS of the log."""
         before, self._leg, texts = self._leg, int(log["leg"]), []
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
+        action, self._action = self._action, log["fence.action"]
+        if abs(self._action) == RIGHT and self._action != action:
+            side = "right" if self._action == RIGHT else "left"
+            texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
         wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
         if self._blown.due(t, holds=bool(is_blown_back(log))):
             texts.append(f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of {wind:.1f} m/s")

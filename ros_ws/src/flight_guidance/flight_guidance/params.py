@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import repeat, starmap
 from typing import Annotated, Any
 
+import numpy as np
+
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field
 from flight_core.parameters import (
@@ -24,9 +26,10 @@ from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from flight_guidance import protection
 from flight_guidance.attitude import AttitudeParams
-from flight_guidance.feasibility import Performance, flyable_legs, speeds
+from flight_guidance.feasibility import Performance, flyable_legs, require_inside, speeds
+from flight_guidance.fence import MARGIN, Fence, Zone, clearance
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
-from flight_guidance.modes import TARGETS, GuidanceParams, Limits, read_target
+from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, read_target
 from flight_guidance.notices import Notices
 from flight_guidance.path import Route, leads
 from flight_guidance.route_file import Waypoint
@@ -72,6 +75,37 @@ class RouteConfig(Config):
         waypoints = [f"waypoint {k}" for k in range(len(self.north))]
         for key in ("east", "altitude", *(["V"] if self.V else [])):
             require_length(key, getattr(self, key), waypoints)
+
+
+class ZoneConfig(Config):
+    """A zone of the fence: a polygon of three or more corners, or a circle round a single point."""
+
+    north: Numbers = Field(description="of the corners, or of the centre, m")
+    east: Numbers = Field(description="m")
+    radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
+    exclude: bool = Field(default=False, description="whether the aircraft keeps out of the zone; else the aircraft stays in")
+
+    def _check(self) -> None:
+        require_length("east", self.east, [f"corner {k}" for k in range(len(self.north))])
+        fits = len(self.north) == 1 if self.radius else len(self.north) >= 3
+        found = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
+        require(fits, "north", found, "three or more corners, or a centre with a radius")
+        corners = list(zip(self.north, self.east, strict=True))
+        twice = [k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]]
+        require(not twice, "north", f"the corner {corners[twice[0]] if twice else ''} twice in succession", "each corner once")
+
+    def zone(self) -> Zone:
+        """The zone of the equations."""
+        return Zone(self.north, self.east, self.radius or 0.0, self.exclude)
+
+
+class HomeConfig(Config):
+    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose by choice."""
+
+    north: float = Field(default=0.0, description="m")
+    east: float = Field(default=0.0, description="m")
+    altitude: float | None = Field(default=None, description="m; none: the altitude of then")
+    after_loss: bool = Field(default=False, description="fly home when pose returns after a loss; else level the wings")
 
 
 class GuidanceConfig(NodeConfig):
@@ -132,6 +166,8 @@ class GuidanceConfig(NodeConfig):
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")
+    fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in, or to keep out of, by a name of yours")
+    home: HomeConfig = Field(default=HomeConfig(), description="where the aircraft goes at a fence and by `guidance/home`")
 
     def _check(self) -> None:
         period_ns(self.rate, "rate")
@@ -150,9 +186,28 @@ class GuidanceConfig(NodeConfig):
         fits = self.period is None or self.period >= least
         rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
+        self._check_home()
         params, route = self.params(), None if self.route is None else self.plan(self.waypoints())
         for start, target in self.program_steps():
             read_target(target, params, route, f"program at {start:g} s")
+
+    def _check_home(self) -> None:
+        if (fence := self.fence_zones()) is None:
+            return
+        north, east = np.array(fence.home[0]), np.array(fence.home[1])
+        needed = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
+        inside = float(clearance(fence.zones, north, east))
+        found, expected = f"home {inside:.0f} m inside of the fence", f"at least {needed:.0f} m, for the orbit round home"
+        require(inside >= needed, "home", found, expected)
+
+    def fence_zones(self) -> Fence | None:
+        """The fence of the equations; None without zones."""
+        zones = tuple(zone.zone() for zone in self.fence.values())
+        return Fence(zones, (self.home.north, self.home.east)) if zones else None
+
+    def fence_margin(self, speed: float) -> float:
+        """Least distance of a route from the fence at an airspeed, m: MARGIN of flight with the wind from behind."""
+        return MARGIN * (speed + self.wind)
 
     def by_rule(self) -> list[tuple[str, Any]]:
         """Parameters by rule from the remaining sections of a scenario, for parameters left out."""
@@ -216,6 +271,8 @@ class GuidanceConfig(NodeConfig):
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
+            fence=self.fence_zones(),
+            home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
         )
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:
@@ -247,13 +304,16 @@ class GuidanceConfig(NodeConfig):
         numbers = leads(legs)
         # Fillets have the altitude of the waypoint that they lead to; a leg leaves the waypoint before.
         altitude, before = [waypoint.altitude for waypoint in waypoints], [max(k - 1, 0) for k in numbers]
-        return Route(
+        route = Route(
             legs,
             tuple(altitude[k] for k in numbers),
             tuple(flown[k] for k in numbers),
             tuple(altitude[k] for k in before),
             tuple(flown[k] for k in before),
         )
+        if (fence := self.fence_zones()) is not None:
+            require_inside(route, fence, max(map(self.fence_margin, flown)))
+        return route
 
     def program_steps(self) -> list[tuple[float, dict[str, float]]]:
         """The targets of the program by instant, in order: (s, {channel: value})."""

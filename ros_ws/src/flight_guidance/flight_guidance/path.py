@@ -83,6 +83,11 @@ def length(leg: Leg) -> float:
     return math.dist(leg.start, leg.end) if isinstance(leg, Line) else 0.0
 
 
+def along(start: Point, end: Point, share: float) -> Point:
+    """The point at a share of the way from a start to an end."""
+    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+
+
 def nearest(leg: Leg, position: Point) -> float:
     """Distance along a line from the start to the point nearest to a position, m, from 0 to the length; 0 for an arc."""
     return min(max(length(leg) - to_go(leg, position), 0.0), length(leg)) if isinstance(leg, Line) else 0.0

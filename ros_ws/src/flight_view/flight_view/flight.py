@@ -61,6 +61,7 @@ GROUPS = {
         "limited",
         "target",
         "wind",
+        "fence",
     ),
 }
 """Channels and groups of channels that are kept; of the other topics all."""

@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The fence: distances and predicted turns against closed forms, flights that would leave, a fleet, refusals."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import sampled_matrices
+from flight_analysis.closed_loop.guidance_replay import replay_guidance
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.guided import guidance_notices
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import fleet, missions
+from flight_campaign.benchmark_course import build_course
+from flight_core.parameters import ParameterError
+from flight_core.tape import Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray, StampedVector
+from flight_guidance.fence import BANKS, HOME, LEFT, RIGHT, Fence, Motion, Zone, clearance, last_safe_turn, turn_clearance
+from flight_guidance.guidance import Guidance
+from flight_guidance.modes import Lateral
+from flight_guidance.params import GuidanceConfig
+
+pytestmark = [pytest.mark.package("flight_guidance"), pytest.mark.slow]
+
+SQUARE = Zone((-100.0, 100.0, 100.0, -100.0), (-100.0, -100.0, 100.0, 100.0))
+ELL = Zone((0.0, 200.0, 200.0, 100.0, 100.0, 0.0), (0.0, 0.0, 100.0, 100.0, 300.0, 300.0))
+TOWER = Zone((300.0,), (0.0,), 50.0, exclude=True)
+FIELD = Zone((-400.0, 1300.0, 1300.0, -400.0), (-500.0, -500.0, 500.0, 500.0))
+SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": 25.0}
+BOX: dict[str, Any] = {"field": {"north": [*FIELD.north], "east": [*FIELD.east]}}
+MS = 1_000_000  # ns
+
+
+def at(zones: tuple[Zone, ...], *points: tuple[float, float]) -> FloatArray:
+    north, east = np.array(points).T
+    return np.asarray(clearance(zones, north, east))
+
+
+def test_clearance_is_distance_from_border() -> None:
+    assert at((SQUARE,), (0.0, 0.0), (90.0, 0.0), (130.0, 140.0), (100.0, 0.0)) == pytest.approx([100.0, 10.0, -50.0, 0.0])
+    # In the concave corner at (100, 100) the nearest border is the corner itself.
+    assert at((ELL,), (70.0, 60.0), (150.0, 150.0), (50.0, 200.0)) == pytest.approx([50.0, -50.0, 50.0])
+    assert at((TOWER,), (300.0, 0.0), (360.0, 0.0), (300.0, -80.0)) == pytest.approx([-50.0, 10.0, 30.0])
+
+
+def test_clearance_of_several_zones() -> None:
+    """An aircraft stays in one of the zones to stay in, and out of each excluded zone."""
+    second = SQUARE._replace(north=tuple(value + 150.0 for value in SQUARE.north))
+    assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == pytest.approx([25.0, 10.0, 10.0])
+    hole = Zone((20.0,), (0.0,), 10.0, exclude=True)
+    assert at((SQUARE, hole), (0.0, 0.0), (20.0, 0.0)) == pytest.approx([10.0, -10.0])
+
+
+@pytest.mark.parametrize("wind", [0.0, 7.5, -7.5])
+def test_predicted_turn_is_arc_with_drift(wind: float) -> None:
+    """Head on to an edge, without roll time: the way to the edge is R sin(w t) + W t at w t = acos(-W / V)."""
+    speed, bank = 25.0, math.radians(30.0)
+    edge = Zone((-2000.0, 500.0, 500.0, -2000.0), (-3000.0, -3000.0, 3000.0, 3000.0))
+    rate = GRAVITY * math.tan(min(BANKS) * bank) / speed  # the wider of the two turns
+    turned = math.acos(-wind / speed)
+    ahead = speed / rate * math.sin(turned) + wind * turned / rate
+    for side, name in ((1.0, 0), (-1.0, 1)):
+        phi = np.float64(side * min(BANKS) * bank)
+        motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, speed, (wind, 0.0), bank, 1e9, 0.0)
+        # Home is far behind. 64 points of the trapezoidal rule: 0.3 m.
+        turns = turn_clearance(Fence((edge,), (-1900.0, 0.0)), motion)
+        assert float(turns[name]) == pytest.approx(500.0 - ahead, abs=0.3)
+
+
+def test_turn_begins_at_last_moment() -> None:
+    fence, bank = Fence((FIELD,), (200.0, 0.0)), math.radians(30.0)
+
+    def motion(north: float, east: float, course: float = 0.0) -> Motion:
+        return Motion(np.float64(north), np.float64(east), np.float64(0.0), course, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
+
+    def action(north: float, before: float = 0.0, course: float = 0.0) -> float:
+        return float(last_safe_turn(fence, before, motion(north, 0.0, course)).action)
+
+    # The wider turn has R = 125 m, after 10 m of lag and at most 34 m of roll (1.35 s). The edge is at 1300 m, margin 12.5 m.
+    assert action(1300.0 - 12.5 - 125.0 - 10.0 - 34.0) == 0.0
+    assert action(1300.0 - 12.5 - 125.0 - 10.0) == RIGHT  # both turns are equal
+    assert action(1150.0, LEFT, math.radians(-170.0)) == HOME  # 10 deg before the course to home
+    assert action(1150.0, LEFT, math.radians(-100.0)) == LEFT
+    assert action(1150.0, HOME, math.pi) == HOME
+    right, left = turn_clearance(fence, motion(1000.0, 350.0))
+    assert left > right
+    right, left = turn_clearance(fence, motion(1000.0, -350.0))
+    assert right > left
+
+
+def calm(duration: float, wind: tuple[float, float] = (0.0, 0.0), **section: Any) -> Scenario:
+    """The osprey without noise, in larger steps than the scenario's."""
+    return find_scenario("osprey_route").vary(
+        flight={"duration": duration},
+        aircraft={"rate": 100.0, "step": 0.005, "wind": list(wind), "turbulence": None, "sensors": {}},
+        reference_model={"rate": 100.0},
+        guidance={"route": None, "wind": math.hypot(*wind)} | section,
+    )
+
+
+def commanded(course: float) -> dict[str, Any]:
+    return {"course": {"start": [1.0], "value": [course]}}
+
+
+def distances(tape: Tape, scenario: Scenario) -> FloatArray:
+    """True distances from the fence, m."""
+    assert scenario.guidance is not None
+    fence = scenario.guidance.fence_zones()
+    assert fence is not None
+    return np.asarray(clearance(fence.zones, tape["pose"]["north"], tape["pose"]["east"]))
+
+
+HOLE = {"hole": {"north": [700.0, 1000.0, 1000.0, 700.0], "east": [-150.0, -150.0, 150.0, 150.0], "exclude": True}}
+
+
+@pytest.mark.parametrize(
+    ("duration", "wind", "zones", "margin"),
+    [
+        pytest.param(58.0, (7.5, 0.0), {}, 16.2, id="head on in a wind of 0.3 V"),
+        pytest.param(42.0, (0.0, 0.0), HOLE, 12.5, id="no-fly zone ahead"),
+    ],
+)
+def test_flight_towards_fence_stays_inside(
+    duration: float, wind: tuple[float, float], zones: dict[str, Any], margin: float
+) -> None:
+    scenario = calm(duration, wind, program=commanded(0.0), fence=BOX | zones, home={"north": 100.0})
+    tape = simulate(scenario)
+    least = distances(tape, scenario).min()
+    assert (
+        margin - 3.0 < least < margin + 8.0
+    )  # the margin of half a second over ground; the flown turn is not exactly the predicted
+    log = tape["guidance"]
+    assert log["fence.action"][-1] == HOME
+    assert (log["mode.lateral"][-1], log["target.north"][-1]) == (Lateral.ORBIT, 100.0)
+    (notice,) = guidance_notices(tape, scenario.guidance)
+    assert "turns to the" in notice
+    assert replay_guidance(tape, scenario.guidance).differing == 0
+
+
+class Fenced(Guidance):
+    """Guidance with a fence that the route of the scenario leaves."""
+
+    def __init__(self, parameters: GuidanceConfig) -> None:
+        super().__init__(parameters)
+        self._params = self._params._replace(fence=FLEET_FENCE)
+
+
+FLEET_FENCE = Fence((Zone((-400.0, 500.0, 500.0, -400.0), (-500.0, -500.0, 500.0, 500.0)),), (0.0, 0.0))
+
+
+def test_fleet_keeps_fence_as_one_process_does() -> None:
+    route = {"north": [0.0, 2000.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
+    scenario = find_scenario("osprey_route").vary(flight={"duration": 26.0}, guidance={"route": route})
+    course, uncertain = build_course(scenario), {"A": 0.3, "B": 0.3, "seed": 5, "number": 1}
+    A, B = sampled_matrices(load_airframe("osprey"), 0.3, 0.3, 5, 0, 2)
+    mission = missions.build(scenario, course)
+    mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
+    control_law, params = scenario.controller.tuned_law()
+    assembled = fleet.assemble(A, B, scenario.aircraft.plant(), course)
+    result = fleet.fly(assembled, fleet.vehicle(scenario), course, control_law, fleet.shared(params), mission)
+    assert result.mission is not None
+    tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)
+    assert tape["guidance"]["fence.action"][-1] != 0.0
+    bank = float(np.abs(tape["guidance"]["pose.phi"]).max())
+    assert float(result.mission["max.phi"][1]) == pytest.approx(bank, rel=1e-3)
+    assert tape["guidance"]["fence.clearance"].min() > 0.0
+    assert np.asarray(result.mission["max.breach"]).tolist() == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("section", "sentence"),
+    [
+        (
+            {"route": {"north": [0.0, 1250.0, 1250.0], "east": [0.0, 0.0, 300.0], "altitude": [0.0] * 3}},
+            r"guidance.route: found leg 1, 9 m inside of the fence at north 1291 m, east 75 m, expected at least 12 m inside",
+        ),
+        (
+            {"home": {"north": 1200.0}},
+            r"guidance.home: found home 100 m inside of the fence, expected at least 15. m",
+        ),
+        ({"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0]}}}, r"fence.a.north: found 2 points without a radius"),
+        (
+            {"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0], "radius": 9.0}}},
+            r"found 2 points with a radius",
+        ),
+        ({"fence": {"a": {"north": [0.0, 0.0, 9.0], "east": [1.0, 1.0, 9.0]}}}, r"found the corner .* twice in succession"),
+    ],
+)
+def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        GuidanceConfig.validate_mapping(SECTION | {"fence": BOX} | section, "guidance")
+
+
+def test_home_is_target_and_choice_after_loss() -> None:
+    home = {"north": 300.0, "east": -40.0, "altitude": 80.0, "after_loss": True}
+    made = Guidance(GuidanceConfig.validate_mapping(SECTION | {"home": home, "hold": 0.1}, "guidance"))
+
+    def step(k: int, *, with_pose: bool = True) -> dict[str, float]:
+        now = 20 * MS * k
+        if with_pose:
+            made.take_pose(StampedVector(now, np.array([0.0, 0.0, 0.0, 0.5 * k, 0.0, 50.0, 25.0, 0.0, 0.0, 0.0])), now)
+        made.take_y(StampedVector(now, np.zeros(4)), now)
+        output = made.step(now, now)
+        assert output is not None
+        return dict(zip(made.names, output.log.tolist(), strict=True))
+
+    assert step(0)["mode.lateral"] == Lateral.HEADING
+    assert made.home()
+    log = step(1)
+    assert [log[f"target.{name}"] for name in ("north", "east", "radius", "altitude")] == [300.0, -40.0, 144.0, 80.0]
+    made.take_target({"heading": 0.0})
+    assert step(2)["mode.lateral"] == Lateral.HEADING
+    for k in range(3, 40):
+        step(k, with_pose=False)
+    assert step(40)["mode.lateral"] == Lateral.ORBIT
