@@ -19,11 +19,23 @@ from tests.conftest import REPOSITORY
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
 from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
-from flight_analysis.c_export.proof import FLAGS, FLOAT32_BOUND, SOURCE, Program, compilers, prove, report, write_code
+from flight_analysis.c_export.library import FMU
+from flight_analysis.c_export.proof import (
+    CODE,
+    FLAGS,
+    FLOAT32_BOUND,
+    PARAMETERS,
+    SOURCE,
+    Program,
+    compilers,
+    prove,
+    report,
+    write_code,
+)
 from flight_analysis.closed_loop.replay import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_cli.export import export
+from flight_cli.export import REPORT, export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_log.tape_reader import read_run
@@ -247,11 +259,22 @@ def test_log_is_replayed_by_c(name: str, tmp_path: Path) -> None:
 
 def test_command_writes_code_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(typer.Exit) as status:
-        export("osprey_servo", tmp_path, duration=1.0, drawn=1000, compiler=["gcc"], as_json=True)
+        export("osprey_servo", tmp_path, duration=1.0, drawn=1000, compiler=["gcc"], fmu=True, as_json=True)
     result = json.loads(capsys.readouterr().out)
     assert (status.value.exit_code, result["proved"]) == (0, True)
-    assert {Path(name).name for name in result["files"]} == {"rise_di.h", "rise_di.c", "rise_di_parameters.h", "proof.txt"}
+    assert {Path(name).name for name in result["files"]} == {*CODE, PARAMETERS, REPORT, FMU}
     assert (tmp_path / "proof.txt").read_text(encoding="utf-8").endswith("PROVED: every bit is equal\n")
+
+
+def test_command_proves_with_a_recorded_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_gust.tar.xz", tmp_path, filter="data")
+    run = tmp_path / "osprey_gust"
+    with pytest.raises(typer.Exit) as status:
+        export("osprey_gust", tmp_path / "c", run=run, compiler=["gcc"])
+    assert status.value.exit_code == 0
+    assert "52 of 52 ticks have the u of the log to the bit" in capsys.readouterr().out  # the ticks of the log
+    with pytest.raises(ParameterError, match="--run: found a flight with other parameters, expected those of osprey_servo"):
+        export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 
 
 def test_wrong_code_is_not_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

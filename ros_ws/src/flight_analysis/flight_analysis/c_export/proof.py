@@ -187,10 +187,10 @@ FIGURES = {
     "parameters_bytes": "struct rise_di_parameters, bytes",
     "controller_bytes": "struct rise_di_controller, bytes, with the samples kept",
     "stack_bytes": "stack at most, bytes (sum of the frames of all functions)",
-    "add": "additions and subtractions of a call at most",
-    "multiply": "multiplications of a call at most",
-    "divide": "divisions of a call at most",
-    "compare": "comparisons of a call at most",
+    "add": "additions and subtractions, most of a call in the proof",
+    "multiply": "multiplications, most of a call in the proof",
+    "divide": "divisions, most of a call in the proof",
+    "compare": "comparisons, most of a call in the proof",
 }
 
 
