@@ -6,15 +6,14 @@ import os
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from importlib import import_module
-from typing import Any, Self
+from typing import Any
 
-import rclpy
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds
-from flight_ros.client import start_middleware
+from flight_ros.client import Client
 from flight_ros.event_loop import IDLE_POLL_PERIOD
 from flight_ros.flight_node import ACKNOWLEDGE_TIMEOUT
 from flight_ros.messages import STAMP, STAMP_PLACE, instant, stamp_of
@@ -29,8 +28,8 @@ Outgoing = tuple[int, str, bytes, bool]
 """A message: its instant in the log, ns; its topic; its bytes; whether they begin with a stamp."""
 
 
-class Player:
-    """Publishers on the topics of a log and on `/clock`. A context manager that shuts down the middleware.
+class Player(Client):
+    """Publishers on the topics of a log and on `/clock`.
 
     `shared` are topics that may have other publishers. Raises ParameterError if any other topic has one, or if a message type
     is not installed.
@@ -38,8 +37,7 @@ class Player:
 
     def __init__(self, types: Mapping[str, str], shared: Collection[str]) -> None:
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
-        start_middleware()
-        self._node = rclpy.create_node("player", start_parameter_services=False, enable_rosout=False)
+        super().__init__("player", rosout=False)
         try:
             self._require_no_publishers([topic for topic in (*types, CLOCK.name) if topic not in shared])
             self._publishers = {topic: self._node.create_publisher(kind, topic, LOCKSTEP) for topic, kind in kinds.items()}
@@ -48,13 +46,6 @@ class Player:
         except BaseException:
             self.__exit__()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._node.destroy_node()
-        rclpy.try_shutdown()
 
     def _require_no_publishers(self, topics: list[str]) -> None:
         end_ns = time.monotonic_ns() + nanoseconds(DISCOVERY_TIME)

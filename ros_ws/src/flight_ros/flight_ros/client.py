@@ -33,11 +33,11 @@ class Client:
     A context manager: the middleware always shuts down.
     """
 
-    def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None) -> None:
+    def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None, *, rosout: bool = True) -> None:
         if parent is None:
             start_middleware()
             try:
-                node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False)
+                node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False, enable_rosout=rosout)
             except (NameValidationException, *ARGUMENT_ERRORS) as error:
                 rclpy.try_shutdown()
                 key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
