@@ -153,6 +153,24 @@ def test_second_repair_keeps_first_damaged_file(run: Path) -> None:
     assert (run / "run_0.mcap.damaged-2").read_bytes() == second
 
 
+def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
+    """A folder from elsewhere may hold links: also to nothing, in the place of the copy of the damaged file."""
+    target, precious = tmp_path / "target", tmp_path / "precious"
+    precious.write_bytes(b"mine")
+    first = truncate(run, 0.9)
+    (run / "run_0.mcap.damaged").symlink_to(target)
+    (run / "run_0.mcap.damaged-2").symlink_to(precious)
+    (run / "metadata.yaml").symlink_to(precious)
+    with pytest.raises(ParameterError, match="a file of another program"):
+        repair(run)
+    (run / "metadata.yaml").unlink()
+    (run / "metadata.yaml").symlink_to(target)
+    repair(run)
+    assert (run / "run_0.mcap.damaged-3").read_bytes() == first
+    assert (precious.read_bytes(), target.exists()) == (b"mine", False)
+    assert not (run / "metadata.yaml").is_symlink()
+
+
 def test_command_prints_kept_messages_and_missing_time(run: Path) -> None:
     def command() -> str:
         words = [sys.executable, "-m", "flight_cli.cli", "repair", "run"]

@@ -14,6 +14,7 @@ from aircraft_sim.simulator import Simulator
 from flight_core import channels
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
+from flight_core.text import bounded
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, Decoder, instant, stamp_of
@@ -125,7 +126,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         publisher, u = self._publisher_lock.publisher, self._u
         valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
         if transfer := self._publisher_lock.publisher != publisher:
-            self.get_logger().info(f"receiving u from {self._publisher_lock.publisher}")
+            self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
         if self._u is not u:
             self._applied.take(self._u, now_ns, transfer=transfer)
         if self._timed_out(now_ns):
@@ -165,4 +166,4 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return DiagnosticStatus.WARN, "no u received yet: flying in trim", {}
         if not self.parameters.lockstep and self._timed_out(self.now_ns()):
             return DiagnosticStatus.ERROR, self._failsafe_message, {}
-        return DiagnosticStatus.OK, f"receiving u from {self._publisher_lock.publisher}", {}
+        return DiagnosticStatus.OK, bounded(f"receiving u from {self._publisher_lock.publisher}"), {}

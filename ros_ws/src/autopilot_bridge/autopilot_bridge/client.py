@@ -8,6 +8,7 @@ import rclpy
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 
+from flight_core.text import bounded
 from flight_ros.client import SERVICE_TIMEOUT, Client
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
@@ -59,14 +60,14 @@ class EngagementClient(Client):
         return ""
 
     def _engage_blind(self) -> str:
-        return str(self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message)
+        return bounded(self._call(Trigger, ENGAGE_BLIND, Trigger.Request(), "a flight with a bridge").message)
 
     def disengage(self) -> str:
         """Disengage the bridge. Returns its reason to refuse, or ""."""
         return self._set_engaged(engaged=False)
 
     def _set_engaged(self, *, engaged: bool) -> str:
-        return str(self._call(SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge").message)
+        return bounded(self._call(SetBool, ENGAGE, SetBool.Request(data=engaged), "a flight with a bridge").message)
 
     def _withdraw(self) -> None:
         """Request to disengage, and wait for an answer at most WITHDRAW_TIMEOUT: a bridge that is stopped answers later."""
@@ -83,7 +84,10 @@ class EngagementClient(Client):
 
     def _received_phases(self) -> list[tuple[str, str]]:
         """Phases of the bridge with their reasons, since the request."""
-        self._phases += [(received.message.key, received.message.value) for received in self._engagement_subscription.take()]
+        self._phases += [
+            (bounded(received.message.key), bounded(received.message.value))
+            for received in self._engagement_subscription.take()
+        ]
         return self._phases
 
     def _settled(self, progress: Callable[[str], None]) -> bool:

@@ -35,6 +35,7 @@ from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
+from flight_core.text import bounded
 from flight_core.vectors import ChannelError
 from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import FlightNode
@@ -265,7 +266,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             return
         sentence = phase.name if phase is before else f"{before.name} -> {phase.name}"
         if reason:
-            self.get_logger().warning(f"{sentence}: {reason}")
+            self.get_logger().warning(bounded(f"{sentence}: {reason}"))
         else:
             self.get_logger().info(sentence)
         if phase is not before and Phase.ENGAGED in (phase, before):

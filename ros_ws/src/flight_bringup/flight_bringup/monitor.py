@@ -7,6 +7,7 @@ import os
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import seconds
+from flight_core.text import bounded
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.client import Client
 from flight_ros.messages import Decoder, stamp_of
@@ -62,7 +63,7 @@ class FlightMonitor(Client):
     def engagement(self) -> list[tuple[str, str]]:
         """Phases of a bridge with their reasons, in order, since the last call."""
         messages = () if self._engagement is None else self._engagement.take()
-        return [(received.message.key, received.message.value) for received in messages]
+        return [(bounded(received.message.key), bounded(received.message.value)) for received in messages]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""

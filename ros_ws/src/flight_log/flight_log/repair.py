@@ -178,7 +178,8 @@ class _FileScan:
 def _keep_damaged(path: Path) -> Path:
     """Give the damaged file a second name for the time after the replacement; a copy on a file system without hard links."""
     number = 1
-    while (damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")).exists():
+    # A link to nothing also has the name.
+    while os.path.lexists(damaged := path.with_name(f"{path.name}.damaged{f'-{number}' if number > 1 else ''}")):
         number += 1
     try:
         damaged.hardlink_to(path)

@@ -21,6 +21,7 @@ from rclpy.validate_topic_name import validate_topic_name
 from flight_core.files import dump_yaml, is_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
+from flight_core.text import bounded
 from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
@@ -86,7 +87,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
         self._heard, self._heard_ns = 0, time.monotonic_ns()  # messages of LOOP, and when the last message arrived
-        self.get_logger().info(f"recording to {self._bag.path}")
+        self.get_logger().info(bounded(f"recording to {self._bag.path}"))
 
     def _full_name(self, name: str) -> str:
         try:
@@ -261,7 +262,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             message = getattr(import_module(f"{package}.msg"), kind)
             definition(message_type)
         except (ImportError, AttributeError, ParameterError):
-            self.get_logger().warning(f"{name} is not recorded: its type {message_type} is not installed")
+            self.get_logger().warning(bounded(f"{name} is not recorded: its type {message_type} is not installed"))
             return
         offered = self._offered(name, message_type)
         topic = self._poll(Topic(name, message, foreign=True), strongest_compatible(offered))
@@ -306,7 +307,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self.get_logger().error(f"{self._ended}{sentence}")
         for name in self._missing:
             self.get_logger().warning(f"{name} is not in the log: it had no publisher")
-        self.get_logger().info(f"{self._bag.contents().messages} messages in {self._bag.path}")
+        self.get_logger().info(bounded(f"{self._bag.contents().messages} messages in {self._bag.path}"))
 
 
 def _file(name: str, key: str) -> Path | None:

@@ -10,6 +10,7 @@ from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 
 from flight_core.rates import NANOSECONDS
+from flight_core.text import bounded
 from flight_ros.throttle import Throttle
 
 LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
@@ -64,4 +65,4 @@ class EndpointMonitor:
         for peer in peers:
             sentence = mismatch(topic, peer, message_type, qos)
             if sentence and self._throttle.due(sentence):
-                self._node.get_logger().error(sentence)
+                self._node.get_logger().error(bounded(sentence))

@@ -20,6 +20,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.scheduling import disable_timer_slack, request_short_slices
 from flight_core.signals import handle_shutdown
+from flight_core.text import bounded
 from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
@@ -109,7 +110,7 @@ def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: in
         try:
             execute()
         except Exception as error:  # rclpy cannot serve the request, e.g. an invalid lifecycle transition
-            node.get_logger().error(f"request rejected: {' '.join(str(error).split())}")
+            node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
         if time.monotonic_ns() >= until_ns:
             return
 

@@ -20,6 +20,7 @@ from flight_core.outcome import LOST_CONTACT, FlightEnded
 from flight_core.parameters import NodeConfig, ParameterError
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, seconds
+from flight_core.text import bounded
 from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import Encoder
@@ -164,7 +165,7 @@ class FlightNode(Node, Generic[P]):
             return SetParametersResult(successful=False, reason=str(error))
         for change in changes:
             old = self.get_parameter_or(change.name).value
-            self.get_logger().info(f"{change.name}: {old} -> {change.value}")
+            self.get_logger().info(bounded(f"{change.name}: {old} -> {change.value}"))
         self.parameters = parameters
         return SetParametersResult(successful=True)
 

@@ -12,6 +12,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from flight_core.text import bounded
+
 Participant: TypeAlias = Any  # the node of rclpy's C extension, without a Node
 
 DeserializationError = _rclpy.RMWError  # the exception of `deserialize_message` for bytes that are not a message of the type
@@ -69,7 +71,7 @@ def answer_invalid_transitions(node: Node) -> None:
         try:
             return change_state(request, response)
         except _rclpy.RCLError as error:
-            node.get_logger().error(f"request rejected: {' '.join(str(error).split())}")
+            node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
             response.success = False
             return response
 
