@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from flight_analysis.report import comparison
+from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
@@ -32,6 +33,17 @@ def report(
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
+    ] = None,
+    width: Annotated[str, typer.Option(help="Width of the figure: 88mm, 3.5in.")] = WIDTH,
+    channels: Annotated[
+        str,
+        typer.Option(help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by default each output."),
+    ] = "",
+    mat: Annotated[Path | None, typer.Option(help="Write all signals as a MAT-file, a structure a topic.")] = None,
+    tables: Annotated[Path | None, typer.Option(help="Folder for a CSV a topic.")] = None,
+    latex: Annotated[Path | None, typer.Option(help="Write the tables of errors and inputs as LaTeX.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, a list for several runs.")] = False,
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
@@ -39,7 +51,7 @@ def report(
     Exit status: 0, or 2 bad input.
     """
     given = scenario_file(scenario)
-    with options("html", "output", "png", "csv", "parquet"):
+    with options("html", "output", "png", "csv", "parquet", "figure", "width", "channels", "mat", "tables", "latex"):
         page, flights = write_report(
             *(runs or [LATEST]),
             html=html,
@@ -47,6 +59,12 @@ def report(
             png=png,
             csv=csv,
             parquet=parquet,
+            figure=figure,
+            width=width,
+            channels=channels,
+            mat=mat,
+            tables=tables,
+            latex=latex,
             namespace=namespace,
             scenario=given,
         )

@@ -2,11 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of recorded runs: the page of one run or of a comparison, and the data for other programs."""
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from flight_analysis.report.export import write_csv, write_parquet, write_png
 from flight_analysis.report.html import write_page
+from flight_analysis.report.paper import WIDTH, write_figure, write_latex, write_mat, write_tables
 from flight_analysis.report.run_folder import read_flight, write_report
 from flight_analysis.report.summary import RecordedFlight
 from flight_core.arguments import FilePath, as_path
@@ -31,6 +34,12 @@ def report(
     png: FilePath | None = None,
     csv: FilePath | None = None,
     parquet: FilePath | None = None,
+    figure: FilePath | None = None,
+    width: str | float = WIDTH,
+    channels: str | Sequence[str] = (),
+    mat: FilePath | None = None,
+    tables: FilePath | None = None,
+    latex: FilePath | None = None,
     namespace: str | None = None,
     scenario: FilePath | None = None,
 ) -> Report:
@@ -43,6 +52,12 @@ def report(
         png: File for y over y_m, e and u as one figure.
         csv: File for all signals, one row an instant, one column a channel.
         parquet: File for the same table as Parquet.
+        figure: File for a figure of a paper: .pdf, .svg or .eps as vectors, or .png.
+        width: Width of the figure, with a unit ("88mm") or in m.
+        channels: Channels of the figure: outputs, inputs, and "e.NAME" for the error of an output; empty: each output.
+        mat: File for the signals as a MAT-file, a structure a topic.
+        tables: Folder for a CSV a topic.
+        latex: File for the tables of errors and inputs as LaTeX.
         namespace: Namespace of the aircraft, for logs with several aircraft.
         scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in each log.
 
@@ -50,7 +65,18 @@ def report(
     """
     require(bool(runs), "runs", "none", A_RUN)
     folders = [as_path(run, "run", A_RUN) for run in runs]
-    wanted = (("html", html, write_page), ("png", png, write_png), ("csv", csv, write_csv), ("parquet", parquet, write_parquet))
+    wanted = (
+        ("html", html, write_page),
+        ("png", png, write_png),
+        ("csv", csv, write_csv),
+        ("parquet", parquet, write_parquet),
+        ("figure", figure, partial(write_figure, width=width, channels=channels)),
+        ("mat", mat, write_mat),
+        ("tables", tables, write_tables),
+        ("latex", latex, write_latex),
+    )
+    if figure is None:
+        require(not channels and width == WIDTH, "channels" if channels else "width", "it without a figure", "figure beside it")
     files = [(key, as_path(path, key, A_FILE), write) for key, path, write in wanted if path is not None]
     alone = len(folders) == 1 and html is None
     require(output is None or alone, "output", "a comparison", "one run; html for several")
