@@ -74,13 +74,9 @@ class NodesInMemory:
         """Kept."""
         return self._keep("route", points)
 
-    def hold(self) -> str:
-        """Kept."""
-        return self._keep("hold")
-
-    def skip(self) -> str:
-        """Refused."""
-        return "no route with a further leg is flown"
+    def guide(self, service: str) -> str:
+        """Kept; skip is refused."""
+        return "no route with a further leg is flown" if service == "skip" else self._keep(service)
 
     def engage(self) -> str:
         """Waits until it is cancelled."""

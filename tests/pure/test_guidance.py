@@ -11,10 +11,11 @@ from numpy.polynomial import Polynomial
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_guidance import path, protection
+from flight_guidance import modes, path, protection
 from flight_guidance.attitude import AttitudeParams, body_rates
 from flight_guidance.lateral import (
     PathError,
@@ -26,6 +27,7 @@ from flight_guidance.lateral import (
     path_acceleration,
     slip_estimate,
 )
+from flight_guidance.modes import Vertical
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed
@@ -289,3 +291,29 @@ def test_protection_follows_from_the_stall_speed() -> None:
     assert protection.climb_limit(4.0, 3.0, 30.0, floor) == 4.0
     assert protection.climb_limit(4.0, 3.0, 0.95 * floor, floor) == pytest.approx(0.5)
     assert protection.climb_limit(4.0, 3.0, 0.8 * floor, floor) == -3.0
+
+
+def test_protection_from_overspeed_mirrors_the_stall() -> None:
+    assert protection.sink_limit(4.0, 3.0, 50.0, 50.0) == -3.0
+    assert protection.sink_limit(4.0, 3.0, 52.5, 50.0) == pytest.approx(0.5)
+    assert protection.sink_limit(4.0, 3.0, 56.0, 50.0) == 4.0
+
+
+@pytest.mark.parametrize("command", [{"climb": 3.0}, {"theta": 0.2}, {"altitude": 300.0}])
+def test_ceiling_holds_in_every_vertical_mode(command: dict[str, float]) -> None:
+    """A point that climbs as commanded stays below the ceiling, and reaches it."""
+    section = GuidanceConfig(natural_frequency=(4.0, 1.2, 5.0, 4.0), speed=SPEED, ceiling=300.0)
+    params, altitude, dt = section.params(), 250.0, 0.02
+    pose = {**dict.fromkeys(POSE, 0.0), "altitude": altitude, "v_north": SPEED}
+    state = modes.holding(0, pose, SPEED, params)
+    vertical = {"climb": Vertical.CLIMB, "theta": Vertical.THETA, "altitude": Vertical.ALTITUDE}[next(iter(command))]
+    state = state._replace(vertical=vertical, target=state.target._replace(**command))
+    highest = altitude
+    for _ in range(3000):
+        state, commands = modes.command(state, pose, dict.fromkeys(section.outputs, 0.0), 0.0, dt, params)
+        climb = SPEED * math.sin(commands.theta_c - state.alpha)
+        altitude += dt * climb
+        pose = pose | {"altitude": altitude, "climb": climb, "theta": commands.theta_c}
+        state, highest = state._replace(theta=commands.theta_c), max(highest, altitude)
+    assert highest < 300.1
+    assert altitude == pytest.approx(300.0, abs=0.5)

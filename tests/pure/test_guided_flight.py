@@ -330,15 +330,17 @@ def test_new_command_bounds_slew() -> None:
         ({"pitch": 0.1}, "target: found pitch, expected some of phi, heading"),
         ({"phi": 0.1, "heading": 0.1}, "expected one lateral and one vertical command at most"),
         ({"north": 0.0, "east": 0.0}, "expected north, east and radius of an orbit together"),
-        ({"phi": 1.0}, r"target.phi: found 1, expected -0.523599 to 0.523599"),
-        ({"V": 10.0}, "target.V: found 10, expected 20 to inf"),
+        ({"phi": 1.0}, r"target.phi: found 57.2958, expected -30 to 30 deg"),
+        ({"V": 10.0}, "target.V: found 10, expected 20 to 35 m/s"),
+        ({"V": 36.0}, "target.V: found 36, expected 20 to 35 m/s"),
+        ({"altitude": 400.0}, "target.altitude: found 400, expected 20 to 300 m"),
         ({"north": 0.0, "east": 0.0, "radius": -20.0}, "target.radius: found -20 m, expected at least 144 m either way"),
         ({"leg": 0.0}, "target.leg: found no route, expected one"),
     ],
 )
 def test_refused_command_changes_nothing(values: dict[str, float], sentence: str) -> None:
     """A command that cannot be flown is refused."""
-    made = flying()
+    made = flying(altitude_floor=20.0, ceiling=300.0)
     with pytest.raises(ChannelError, match=sentence):
         made.take_target(values)
     assert run(made, 1, 2)["given"][0] == 0.0
@@ -351,10 +353,20 @@ def test_refused_command_changes_nothing(values: dict[str, float], sentence: str
         ({"outputs": ["q", "V", "p"]}, r"guidance.outputs: found q, V, p, expected q, V, p, r"),
         ({"stall_speed": 24.0}, r"guidance.stall_speed: found 24.0 m/s, expected a floor of 1.15 V_s below 25 m/s"),
         ({"program": program(bank=0.1)}, r"guidance.program.bank: found a channel, expected one of phi"),
-        ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.5"),
+        ({"program": program(phi=0.9)}, r"guidance.program at 1 s.phi: found 0.9, expected -0.523599 to 0.523599 rad"),
         ({"program": program(leg=1.0)}, "guidance.program at 1 s.leg: found no route, expected one"),
         ({"program": {"phi": {"start": [1.0, 1.0], "value": [0.1, 0.2]}}}, "expected times in rising order"),
         ({"route": {"north": [0.0], "east": [0.0, 1.0], "altitude": [0.0]}}, "guidance.route.east: found 2 values, expected 1"),
+        (
+            {"route": {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": [25.0, 36.0]}},
+            r"guidance.route\[1\].V: found 36 m/s, expected at most 35 m/s",
+        ),
+        ({"speed_limit": 25.0}, "guidance.speed_limit: found 25 m/s, expected more than the trim speed, 25 m/s"),
+        ({"altitude_floor": 50.0, "ceiling": 40.0}, "guidance.ceiling: found 40 m, expected more than altitude_floor, 50 m"),
+        (
+            {"ceiling": 40.0, "route": {"north": [0.0, 1e3], "east": [0.0, 0.0], "altitude": [0.0, 41.0]}},
+            r"guidance.route\[1\].altitude: found 41 m, expected -inf to 40 m",
+        ),
         ({"pitch": [0.2, 0.1]}, "guidance.pitch: found .* expected the least before the largest"),
         ({"lockstep": True}, "guidance.y_rate: found 0 Hz, expected the rate of y in lockstep"),
         (

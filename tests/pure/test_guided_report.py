@@ -198,7 +198,7 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     assert isinstance(route.legs[0], Line)
     assert isinstance(route.legs[1], Arc)
     bounds = guided_figures.bounds_of(flight.scenario)
-    assert bounds["V"] == (0.8 * 25.0, math.inf)  # by rule, without a stall speed
+    assert bounds["V"] == (0.8 * 25.0, 1.4 * 25.0)  # by rule, without a stall speed and a limit
     assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
 
 

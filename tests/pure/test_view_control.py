@@ -344,6 +344,8 @@ REQUESTS: Mapping[str, Mapping[str, Any]] = {
     "route": {"points": [[0, 0, 50], [500, 0, 60]]},
     "hold": {},
     "skip": {},
+    "resume": {},
+    "home": {},
     "activate": {},
     "deactivate": {},
     "engage": {"map": "plane"},

@@ -38,6 +38,7 @@ COMMANDS = MappingProxyType(
         "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
+        "guidance": "Hold, skip a waypoint, resume, fly home or another route, in a running guided flight.",
         "engage": "Engage or disengage the autopilot behind a running bridge.",
         "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
         "compare": "Compare RISE-DI with other control laws on the same aircraft.",

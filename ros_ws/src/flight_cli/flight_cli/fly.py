@@ -74,7 +74,7 @@ def fly(
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     if route is not None:
-        chosen = with_route(chosen, read_route(route, _origin(origin)))
+        chosen = with_route(chosen, read_route(route, parse_origin(origin)))
     require(origin is None or route is not None, "--origin", "no --route", "the file of a route: --route FILE")
     _require_flyable(chosen, autopilot, in_process=in_process)
     run = new_run(chosen, runs)
@@ -131,7 +131,7 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
         require_limits(autopilot, scenario)
 
 
-def _origin(text: str | None) -> Origin | None:
+def parse_origin(text: str | None) -> Origin | None:
     """The origin of a route, from "47.38,8.54"."""
     if text is None:
         return None

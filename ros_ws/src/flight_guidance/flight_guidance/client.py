@@ -1,54 +1,100 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Client of guidance, for `rise-di target` and the live page."""
+"""Clients of guidance, for `rise-di target`, `rise-di guidance` and the live page."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
 import numpy as np
+from geometry_msgs.msg import Point, Pose, PoseStamped
+from nav_msgs.msg import Path
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from std_srvs.srv import Trigger
 
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
-from flight_guidance.modes import bits
+from flight_guidance.modes import TARGETS
+from flight_guidance.odometry import MAP
 from flight_ros.client import Client
 from flight_ros.messages import Encoder, NamedDecoder
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import GUIDANCE, NEWEST_SAMPLES, PUBLISH, TARGET
+from flight_ros.topics import GUIDANCE, NEWEST_SAMPLES, PUBLISH, RECORD_FOREIGN, ROSOUT, ROUTE, TARGET, Topic
 
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 TARGET_PERIOD = 0.2  # s, between two equal targets
+REFUSED = "sample refused: "  # before the reason in the log of a node
+ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
+ROUTE_POLL_PERIOD = Duration(seconds=0.05)
+NAME = "guidance"
 
 
-class TargetClient(Client):
-    """Commands the guidance of a running flight."""
+class GuidanceClient(Client):
+    """Commands the guidance of a running flight. Methods return why something is refused, or ""."""
 
-    def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
-        super().__init__("operator", namespace, parent)
+    def __init__(self, name: str = "operator", namespace: str = "", parent: Client | None = None) -> None:
+        super().__init__(name, namespace, parent)
         self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
-        self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
-        self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
+        self._log = PolledSubscription(self._node, ROSOUT, RECORD_FOREIGN)
 
-    def send(self, values: Mapping[str, float]) -> str:
-        """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
-        silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
-        self._spin_until(lambda: bool(self._received()), silent)
+    def call(self, service: str) -> str:
+        """Call a service of guidance without arguments: hold, skip, resume, home."""
+        return str(self._call(Trigger, f"{NAME}/{service}", Trigger.Request(), "a flight with guidance").message)
+
+    def send_route(self, points: Sequence[Sequence[float]]) -> str:
+        """Publish a route of waypoints, each north, east and altitude in m."""
+        places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
+        route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
+        route.header.frame_id = MAP
+        publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
         try:
-            self._spin_until(lambda: self._published(values), "", TARGET_TIMEOUT)
+            subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
+            self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
+            self._log.take()
+            publisher.publish(route)
+            unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
+            self._spin_until(lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT)
+            return self._reason(ROUTE, lambda: self._has_taken({"leg": 0.0}), "")
+        finally:
+            self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
+
+    def _reaches_guidance(self, publisher: Publisher) -> bool:
+        """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
+        known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
+        return NAME in known and len(known) <= publisher.get_subscription_count()
+
+    def _reason(self, topic: Topic, taken: Callable[[], bool], unknown: str) -> str:
+        """Wait until guidance has taken a message, or has refused it. Returns the reason, `unknown` after TARGET_TIMEOUT."""
+        reasons: list[str] = []
+
+        def answered() -> bool:
+            if taken():
+                reasons.clear()
+                return True
+            reasons.extend(self._refusals(topic))
+            return bool(reasons)
+
+        try:
+            self._spin_until(answered, "", TARGET_TIMEOUT)
         except ParameterError:
             if self._cancelled.is_set():
                 raise
-            return f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
-        return ""
+            return unknown
+        return reasons[-1] if reasons else ""
 
-    def _published(self, values: Mapping[str, float]) -> bool:
-        if time.monotonic() - self._sent > TARGET_PERIOD:
-            self._sent = time.monotonic()
-            encoder = Encoder([*values], self._node.get_fully_qualified_name())
-            self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
-        given = bits(values)
+    def _refusals(self, topic: Topic) -> list[str]:
+        """Why guidance has refused messages of a topic since the last call, from the log of the nodes."""
+        texts = [received.message.msg for received in self._log.take() if received.message.name.split(".")[-1] == NAME]
+        ours = [text.partition(REFUSED) for text in texts]
+        namespace = self._node.get_namespace().rstrip("/")
+        return [reason for before, _, reason in ours if reason and before == f"{namespace}/{topic.name}: "]
+
+    def _has_taken(self, values: Mapping[str, float]) -> bool:
+        """Whether a sample of guidance since the last call has taken these commands."""
+        mask = sum(1 << TARGETS.index(name) for name in values)
         return any(
-            int(sample.get("given", 0.0)) & given == given
+            int(sample.get("given", 0.0)) & mask == mask
             and all(sample.get(f"target.{name}") == value for name, value in values.items())
             for sample in self._received()
         )
@@ -60,3 +106,27 @@ class TargetClient(Client):
             with suppress(ChannelError):
                 samples.append(self._decoder.decode(received.message).channels)
         return samples
+
+
+class TargetClient(GuidanceClient):
+    """Commands what guidance holds."""
+
+    def __init__(self, namespace: str = "", parent: Client | None = None) -> None:
+        super().__init__("operator", namespace, parent)
+        self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
+        self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
+
+    def send(self, values: Mapping[str, float]) -> str:
+        """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
+        silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
+        self._spin_until(lambda: bool(self._received()), silent)
+        self._log.take()
+        unknown = f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
+        return self._reason(TARGET, lambda: self._published(values), unknown)
+
+    def _published(self, values: Mapping[str, float]) -> bool:
+        if time.monotonic() - self._sent > TARGET_PERIOD:
+            self._sent = time.monotonic()
+            encoder = Encoder([*values], self._node.get_fully_qualified_name())
+            self._publisher.publish(encoder.encode(time.time_ns(), np.array([*values.values()])))
+        return self._has_taken(values)

@@ -30,6 +30,9 @@ class Performance(NamedTuple):
     climb: float  # largest climb rate, m/s
     sink: float  # largest sink rate, m/s
     wind: float  # largest wind from any side, m/s
+    largest_speed: float = math.inf  # m/s
+    lowest: float = -math.inf  # m, least altitude
+    highest: float = math.inf  # m
 
 
 def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
@@ -44,18 +47,21 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
 def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
-    Raises ParameterError for a waypoint not finite or beyond LARGEST, a speed below the floor or not above HEADWIND times the
-    wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for the fillets, and an
-    altitude out of reach of the climb or sink along the straight part of the leg, with the wind from behind. phi_max is the
-    largest bank at V for the stall speed.
+    Raises ParameterError for a waypoint not finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed of at
+    most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for
+    the fillets, and an altitude out of reach of the climb or sink along the straight part of the leg, the wind from behind.
+    phi_max is the largest bank at V for the stall speed.
     """
     for k, (north, east, altitude, _) in enumerate(waypoints):
         known = all(abs(value) <= LARGEST for value in (north, east, altitude))
         found = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
         require(known, f"route[{k}]", found, f"finite values, at most {LARGEST:g} m either way")
+        permitted = can.lowest <= altitude <= can.highest
+        require(permitted, f"route[{k}].altitude", f"{altitude:g} m", f"{can.lowest:g} to {can.highest:g} m")
     floor, flown = protection.speed_floor(can.stall_speed), speeds(waypoints, can.speed)
     for k, speed in enumerate(flown):
         require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
+        require(speed <= can.largest_speed, f"route[{k}].V", f"{speed:g} m/s", f"at most {can.largest_speed:g} m/s")
         expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
         found = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
         require(speed > HEADWIND * can.wind, f"route[{k}].V", found, expected)

@@ -180,7 +180,7 @@ class Guidance:
 
     def take_target(self, values: Mapping[str, float]) -> None:
         """Take commands by channel of `modes.Target`; commands of the same instant come in one call. Raises ChannelError."""
-        modes.read_target(values, self._params, self.route)
+        modes.read_target(values, self._params, self.route, degrees=True)
         # A lateral or vertical command replaces the command of the mode before.
         for table in (modes.LATERAL, modes.VERTICAL):
             if any(name in table for name in values):

@@ -107,6 +107,9 @@ class Limits(NamedTuple):
     floor: float  # m/s, of the airspeed
     stall_speed: float  # m/s
     radius: float  # m, least radius of an orbit
+    largest_speed: float  # m/s
+    lowest: float  # m, least altitude
+    highest: float  # m, largest altitude
 
 
 class GuidanceParams(NamedTuple):
@@ -191,8 +194,17 @@ def bits(names: Collection[str]) -> int:
     return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
 
 
-def read_target(values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target") -> None:
-    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond the limits."""
+ANGLES = ("phi", "heading", "course", "theta")
+"""Channels of Target in rad."""
+
+
+def read_target(
+    values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target", *, degrees: bool = False
+) -> None:
+    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond the limits.
+
+    `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
+    """
     modes = [{table[name] for name in values if name in table} for table in (LATERAL, VERTICAL)]
     unknown = [name for name in values if name not in TARGETS]
     if unknown or not values:
@@ -209,10 +221,14 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, route: Rout
         ("phi", -limits.bank, limits.bank),
         ("theta", limits.least_pitch, limits.largest_pitch),
         ("climb", -vertical.sink, vertical.climb),
-        ("V", limits.floor, math.inf),
+        ("altitude", limits.lowest, limits.highest),
+        ("V", limits.floor, limits.largest_speed),
     ):
         if name in values and not least <= values[name] <= largest:
-            raise ChannelError("bounds", f"{what}.{name}: found {values[name]:g}, expected {least:.6g} to {largest:.6g}")
+            factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
+            unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
+            found, expected = f"{values[name] * factor:.6g}", f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
+            raise ChannelError("bounds", f"{what}.{name}: found {found}, expected {expected}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
@@ -233,9 +249,13 @@ def read_target(values: Mapping[str, float], params: GuidanceParams, route: Rout
 
 
 def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands to hold the heading, the altitude and the airspeed of now; no airspeed below the floor."""
-    floor = array_namespace(speed).maximum(speed, params.limits.floor)
-    return {"heading": pose["psi"], "altitude": pose["altitude"], "V": floor}
+    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the airspeed."""
+    return {"heading": pose["psi"], "altitude": pose["altitude"], "V": _permitted_speed(speed, params)}
+
+
+def _permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
+    xp = array_namespace(speed)
+    return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
 
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
@@ -348,12 +368,18 @@ def command(
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
-    V_wanted = xp.maximum(state.target.V, limits.floor)
+    V_wanted = _permitted_speed(state.target.V, params)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 
     phi_c = clip(phi_wanted, bank)
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
-    theta_wanted = state.target.theta if flies and state.vertical is Vertical.THETA else pitch_for(climb_c, speed, state.alpha)
+    theta_wanted = pitch_for(climb_c, speed, state.alpha)
+    if flies and state.vertical is Vertical.THETA:
+        least, largest = (pitch_for(rate, speed, state.alpha) for rate in _climb_within(pose["altitude"], params))
+        theta_wanted = state.target.theta
+        theta_bounded = xp.minimum(xp.maximum(theta_wanted, least), largest) if _is_bounded(limits) else theta_wanted
+        climb_limited = theta_bounded != theta_wanted
+        theta_wanted = theta_bounded
     theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
 
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
@@ -571,6 +597,22 @@ def _climb(
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
     least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)
     xp = array_namespace(speed)
+    lower, upper = _climb_within(pose["altitude"], params)
+    least, largest = xp.maximum(least, lower), xp.minimum(largest, upper)
+    fast = protection.sink_limit(vertical.climb, vertical.sink, speed, params.limits.largest_speed)
+    least = xp.maximum(least, fast)
     largest = xp.minimum(largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor))
     permitted = xp.minimum(xp.maximum(wanted, least), largest)
     return slewed(state.climb_c, permitted, vertical.acceleration, dt), permitted != wanted
+
+
+def _is_bounded(limits: Limits) -> bool:
+    return math.isfinite(limits.lowest) or math.isfinite(limits.highest)
+
+
+def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
+    """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for` to the bounds."""
+    vertical, limits = params.vertical, params.limits
+    if not _is_bounded(limits):
+        return -vertical.sink, vertical.climb
+    return climb_for(limits.lowest - altitude, vertical), climb_for(limits.highest - altitude, vertical)

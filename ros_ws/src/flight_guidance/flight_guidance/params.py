@@ -130,6 +130,11 @@ class GuidanceConfig(NodeConfig):
     stall_speed: Positive | None = Field(
         default=None, description="V_s, m/s, true airspeed; none: the speed floor 1.15 V_s is 0.8 V0"
     )
+    speed_limit: Positive | None = Field(
+        default=None, description="largest airspeed, m/s, such as V_ne as a true airspeed; none: 1.4 V0"
+    )
+    ceiling: float | None = Field(default=None, description="largest altitude, m, as `pose` counts it; none: no bound")
+    altitude_floor: float | None = Field(default=None, description="least altitude, m, as `pose` counts it; none: no bound")
     wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
 
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
@@ -186,6 +191,10 @@ class GuidanceConfig(NodeConfig):
         fits = self.period is None or self.period >= least
         rule = f"at least {least:g} s: max(14 s, 1.5 V0 / (g tan(bank)), 11 bank / roll_rate)"
         require(fits, "period", f"{self.period} s", rule)
+        fastest = self._largest_speed()
+        require(fastest > self.speed, "speed_limit", f"{fastest:g} m/s", f"more than the trim speed, {self.speed:g} m/s")
+        lowest, highest = self._altitudes()
+        require(lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m")
         self._check_home()
         params, route = self.params(), None if self.route is None else self.plan(self.waypoints())
         for start, target in self.program_steps():
@@ -215,6 +224,16 @@ class GuidanceConfig(NodeConfig):
 
     def _floor(self) -> float:
         return FLOOR_FRACTION * self.speed if self.stall_speed is None else protection.speed_floor(self.stall_speed)
+
+    def _largest_speed(self) -> float:
+        return self.speed_limit or protection.FASTEST * self.speed
+
+    def _altitudes(self) -> tuple[float, float]:
+        """Least and largest altitude, m."""
+        return (
+            -math.inf if self.altitude_floor is None else self.altitude_floor,
+            math.inf if self.ceiling is None else self.ceiling,
+        )
 
     def largest_roll_rate(self) -> float:
         """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the authority."""
@@ -267,7 +286,16 @@ class GuidanceConfig(NodeConfig):
             attitude=AttitudeParams(roll, pitch, roll_rate, self.load, 20.0, self.k_beta()),
             vertical=self._vertical(climb, sink),
             path=PathParams(self.period or self.least_period(), self.damping, self.capture),
-            limits=Limits(self.bank, self.pitch[0], self.pitch[1], floor, floor / protection.FLOOR, self.least_radius()),
+            limits=Limits(
+                self.bank,
+                self.pitch[0],
+                self.pitch[1],
+                floor,
+                floor / protection.FLOOR,
+                self.least_radius(),
+                self._largest_speed(),
+                *self._altitudes(),
+            ),
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
@@ -296,7 +324,8 @@ class GuidanceConfig(NodeConfig):
         """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
         floor, (climb, sink) = self._floor(), self.climb_limits()
         stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
-        can = Performance(self.speed, stall, self.bank, self.largest_roll_rate(), climb, sink, self.wind)
+        roll_rate, fastest = self.largest_roll_rate(), self._largest_speed()
+        can = Performance(self.speed, stall, self.bank, roll_rate, climb, sink, self.wind, fastest, *self._altitudes())
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         # an empty route is refused below
         radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)

@@ -11,6 +11,9 @@ STALL_MARGIN = 1.1
 FLOOR = 1.15
 """Speed floor over the stall speed."""
 
+FASTEST = 1.4
+"""Largest airspeed over the trim speed where no limit of the aircraft is given."""
+
 SHORTFALL = 0.05
 """Largest error of V over the trim speed before the climb or sink is limited; at twice the value the limit is zero."""
 
@@ -34,6 +37,16 @@ def climb_limit(climb: float, sink: float, speed: Scalar, floor: float) -> Scala
     xp = array_namespace(speed)
     ratio = xp.minimum(xp.maximum((speed - 0.9 * floor) / (0.1 * floor), 0.0), 1.0)
     return ratio * climb - (1.0 - ratio) * sink
+
+
+def sink_limit(climb: float, sink: float, speed: Scalar, largest: float) -> Scalar:
+    """Least climb rate, m/s: (1 - ratio) climb - ratio sink, ratio = clip((1.1 V_max - V) / (0.1 V_max), 0, 1).
+
+    The mirror of `climb_limit`: beyond the largest airspeed pitch flies the speed.
+    """
+    xp = array_namespace(speed)
+    ratio = xp.minimum(xp.maximum((1.1 * largest - speed) / (0.1 * largest), 0.0), 1.0)
+    return (1.0 - ratio) * climb - ratio * sink
 
 
 def climb_range(climb: float, sink: float, shortfall: Scalar, speed: float) -> tuple[Scalar, Scalar]:

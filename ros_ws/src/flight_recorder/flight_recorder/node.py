@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import Log, ParameterEvent
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
@@ -32,7 +32,7 @@ from flight_ros.messages import instant, sender_of, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
-from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, TRUTH, Y_M, Topic, U, Y
+from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, ROSOUT, TRUTH, Y_M, Topic, U, Y
 
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # the longest loss when the recorder is killed; also the period of the graph checks
 DISK_PERIOD_NS = NANOSECONDS
@@ -42,7 +42,6 @@ LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
 # Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
-ROSOUT = Topic("/rosout", Log, foreign=True)
 PARAMETER_EVENTS = Topic("/parameter_events", ParameterEvent, foreign=True)
 
 

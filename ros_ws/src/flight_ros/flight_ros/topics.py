@@ -8,6 +8,7 @@ from typing import NamedTuple
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
 from nav_msgs.msg import Odometry, Path
+from rcl_interfaces.msg import Log
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -85,6 +86,7 @@ ODOMETRY, PATH, MARKERS = Topic("odometry", Odometry), Topic("path", Path), Topi
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
+ROSOUT = Topic("/rosout", Log, foreign=True)  # of ROS 2 itself
 CLOCK = Topic("/clock", Clock)
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged

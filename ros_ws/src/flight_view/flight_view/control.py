@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,6 +32,7 @@ LEASE = 5.0  # s that a page controls after its last request
 RATE, BURST = 5.0, 10.0  # requests a second, and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
+GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
 AT_ONCE = ("deactivate", "disengage")  # actions that do not queue
 OVER = ("ended", "interrupted")  # states of a recording: the flight can be commanded no more
 GUST_LEAD = 0.2  # s from the request to the begin of a gust
@@ -60,11 +62,8 @@ class Link(Protocol):
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
         """Publish a route."""
 
-    def hold(self) -> str:
-        """Hold what is flown now."""
-
-    def skip(self) -> str:
-        """Fly the next leg."""
+    def guide(self, service: str) -> str:
+        """Call a service of guidance: one of GUIDED."""
 
     def engage(self) -> str:
         """Engage the bridge."""
@@ -135,13 +134,15 @@ class Control:
             "gust": self._begin_gust,
             "target": self._send_target,
             "route": self._send_route,
-            "hold": lambda _: self._link.hold(),
-            "skip": lambda _: self._link.skip(),
+            **{name: partial(self._guide, name) for name in GUIDED},
             "activate": lambda _: self._activate(active=True),
             "deactivate": lambda _: self._activate(active=False),
             "engage": self._engage,
             "disengage": lambda _: self._link.disengage(),
         }
+
+    def _guide(self, service: str, _: Mapping[str, Any]) -> str:
+        return self._link.guide(service)
 
     async def answer(self, request: Any, key: str, lease: str) -> dict[str, Any]:
         """Carry out a request and answer with the state. Raises RefusedError."""

@@ -5,24 +5,14 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from geometry_msgs.msg import Point, Pose, PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from nav_msgs.msg import Path
 from rcl_interfaces.srv import GetParameters, SetParametersAtomically
-from rclpy.duration import Duration
 from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.publisher import Publisher
-from std_srvs.srv import Trigger
 
 from autopilot_bridge.client import EngagementClient
 from flight_guidance.client import TargetClient
-from flight_guidance.odometry import MAP
 from flight_ros.client import Client
-from flight_ros.topics import PUBLISH, ROUTE
-
-ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
-ROUTE_POLL_PERIOD = Duration(seconds=0.05)
 
 
 class ControlClient(Client):
@@ -68,37 +58,19 @@ class ControlClient(Client):
 
     def send_target(self, values: Mapping[str, float]) -> str:
         """Command guidance, as `rise-di target`."""
-        self._targets = self._targets or TargetClient(parent=self)
-        return self._targets.send(values)
+        return self._operator().send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
         """Publish a route of waypoints, each north, east and altitude in m."""
-        places = [Point(x=float(east), y=float(north), z=float(altitude)) for north, east, altitude in points]
-        route = Path(poses=[PoseStamped(pose=Pose(position=place)) for place in places])
-        route.header.frame_id = MAP
-        publisher = self._node.create_publisher(ROUTE.type, ROUTE.name, PUBLISH)
-        try:
-            subscribed = f"{publisher.topic_name}: no subscriber, expected a flight with guidance in this domain"
-            self._spin_until(lambda: self._reaches_guidance(publisher), subscribed)
-            publisher.publish(route)
-            unconfirmed = f"guidance did not confirm its reception in {ROUTE_TIMEOUT:g} s"
-            self._spin_until(lambda: publisher.wait_for_all_acked(ROUTE_POLL_PERIOD), unconfirmed, ROUTE_TIMEOUT)
-        finally:
-            self._node.destroy_publisher(publisher)  # else guidance that starts later would receive the route, and fly it
-        return ""
+        return self._operator().send_route(points)
 
-    def _reaches_guidance(self, publisher: Publisher) -> bool:
-        """Whether guidance is among the subscribers in the graph, and each of them has been matched."""
-        known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
-        return "guidance" in known and len(known) <= publisher.get_subscription_count()
+    def guide(self, service: str) -> str:
+        """Call a service of guidance: hold, skip, resume, home."""
+        return self._operator().call(service)
 
-    def hold(self) -> str:
-        """Hold heading, altitude and airspeed of now."""
-        return str(self._call(Trigger, "guidance/hold", Trigger.Request(), "a flight with guidance").message)
-
-    def skip(self) -> str:
-        """Fly the next leg."""
-        return str(self._call(Trigger, "guidance/skip", Trigger.Request(), "a flight with guidance").message)
+    def _operator(self) -> TargetClient:
+        self._targets = self._targets or TargetClient(parent=self)
+        return self._targets
 
     def engage(self) -> str:
         """Engage the bridge, as `rise-di engage`."""

@@ -56,7 +56,8 @@ def bounds_of(scenario: Scenario) -> Bounds:
         return {}
     limits = scenario.guidance.params().limits
     return {
-        "V": (limits.floor, math.inf),
+        "V": (limits.floor, limits.largest_speed),
+        "altitude": (limits.lowest, limits.highest),
         "phi": (-limits.bank, limits.bank),
         "theta": (limits.least_pitch, limits.largest_pitch),
     }

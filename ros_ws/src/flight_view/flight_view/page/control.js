@@ -172,7 +172,8 @@ function guidance() {
   const fly = () => act({do: "route", points: route.value.trim().split(/\n+/).map(line => line.trim().split(/[\s,;]+/).map(Number))}, "sent; the events say if guidance refuses it");
   return element("details", {open: true}, element("summary", {textContent: "Guidance"}),
     element("div", {className: "row"}, choice, value, button("Add", add), listed, button("Command", command, {id: "control-command"})),
-    element("div", {className: "row"}, button("Hold", () => act({do: "hold"}, "holds")), button("Next leg", () => act({do: "skip"}, "next leg"))),
+    element("div", {className: "row"}, button("Hold", () => act({do: "hold"}, "holds")), button("Skip waypoint", () => act({do: "skip"}, "skips the waypoint ahead")),
+      button("Resume route", () => act({do: "resume"}, "resumes the last leg")), button("Home", () => act({do: "home"}, "flies home"))),
     route, element("div", {className: "row"}, button("Fly this route", fly)));
 }
 

@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di guidance`: hold, skip, resume, home and a route for a guided flight."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flight_cli.fly import parse_origin
+from flight_core.parameters import ParameterError
+from flight_guidance.route_file import read_route
+
+if TYPE_CHECKING:
+    from flight_guidance.client import GuidanceClient
+
+REFUSED = 1
+Namespace = Annotated[str, typer.Option(help="Namespace of the aircraft.")]
+
+guidance = typer.Typer(no_args_is_help=True)
+
+
+def _ask(namespace: str, request: "Callable[[GuidanceClient], str]", done: str) -> None:
+    """Send a request to guidance. Exit status: 0 done, 1 refused, 2 bad input or no guidance."""
+    from flight_guidance.client import GuidanceClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+    with GuidanceClient(namespace=namespace) as client:
+        refusal = request(client)
+    if refusal:
+        print(f"error: refused: {refusal}", file=sys.stderr)
+        raise typer.Exit(REFUSED)
+    print(done)
+
+
+@guidance.command()
+def hold(namespace: Namespace = "") -> None:
+    """Hold the heading, the altitude and the airspeed of now."""
+    _ask(namespace, lambda client: client.call("hold"), "holds heading, altitude and airspeed")
+
+
+@guidance.command()
+def skip(namespace: Namespace = "") -> None:
+    """Leave the waypoint ahead out and fly to the next waypoint."""
+    _ask(namespace, lambda client: client.call("skip"), "skips the waypoint ahead")
+
+
+@guidance.command()
+def resume(namespace: Namespace = "") -> None:
+    """Fly the last leg of the route again, from the nearest point."""
+    _ask(namespace, lambda client: client.call("resume"), "resumes the last leg")
+
+
+@guidance.command()
+def home(namespace: Namespace = "") -> None:
+    """Fly home and orbit there."""
+    _ask(namespace, lambda client: client.call("home"), "flies home")
+
+
+@guidance.command()
+def route(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Route file, as of `rise-di fly --route`.")],
+    origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for FILE.")] = None,
+    namespace: Namespace = "",
+) -> None:
+    """Fly a route from its first leg on. An airspeed of a waypoint is refused: the topic has none."""
+    waypoints = read_route(file, parse_origin(origin))
+    for k, waypoint in enumerate(waypoints):
+        if waypoint.speed is not None:
+            raise ParameterError(f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di target V=VALUE")
+    points = [(waypoint.north, waypoint.east, waypoint.altitude) for waypoint in waypoints]
+    _ask(namespace, lambda client: client.send_route(points), f"flies the route of {len(points)} waypoints")
