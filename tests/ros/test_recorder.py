@@ -140,6 +140,27 @@ def test_flight_that_falls_silent_named_each_time(recorder: Recorder, peer_node:
     pause(2)
 
 
+def test_topic_that_stops_while_others_go_on_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+    """A WARN, an entry of the log, and in a record of the log; the outcome that the flight left is in the log, too."""
+    process = recorder("run").wait_for("ready")
+
+    def send(*topics: str) -> None:
+        for topic in topics:
+            peer_node.publish(topic, to_message(time.time_ns(), OUTPUTS, np.zeros(4), f"/{topic}#1"))
+
+    peer_node.until(lambda: recorded(peer_node, "/y") > 100, each=lambda: send("y", "y_m", "truth"))
+    named = "/y: no message for 1 s while others go on"
+    peer_node.until(lambda: named in process.output, each=lambda: send("y_m", "truth"))
+    assert "no message for 1 s" not in process.output.replace(named, "")
+    (tmp_path / "run" / "outcome").write_text("interrupted", encoding="utf-8")
+    process.interrupt().succeed()
+    log = read_run(tmp_path / "run")
+    assert log.tape.outcome == "interrupted"
+    assert re.fullmatch(r"/y: the recorder received nothing for [\d.]+ s, to the end", log.tape.notes[-1])
+    texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/rosout"]
+    assert any(named.encode() in text for text in texts)
+
+
 def test_topic_whose_type_is_not_installed_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
     (tmp_path / "lifecycle_msgs").mkdir()

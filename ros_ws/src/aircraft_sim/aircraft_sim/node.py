@@ -127,6 +127,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
+            if publisher is None and not self.parameters.lockstep:
+                self.publish_state(NodeState.FLYING)
         if self._u is not u:
             self._applied.take(self._u, now_ns, transfer=transfer)
         if self._timed_out(now_ns):

@@ -18,13 +18,13 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
-from flight_bringup.graph import Autopilot
-from flight_bringup.processes import FlightProcesses, handle_signals
+from flight_bringup.graph import CONTROLLER, Autopilot
+from flight_bringup.processes import READY_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
 from flight_core.files import writing
-from flight_core.outcome import COMPLETED, INTERRUPTED
+from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
 from flight_core.parameters import ParameterError, require
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 
 POLL_PERIOD = 0.05  # s, of the progress bar
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
+
+FIRST_U = 5.0  # s, from the time at which each node is ready to the first u that the aircraft takes
+LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
+STAMP_ERROR = 1e-5  # s, of a time of day as a float
 
 STALL_TIMEOUT = 40.0
 """s. A lockstep flight without progress for so long ends; lost contact with a node ends it within three seconds."""
@@ -83,10 +87,52 @@ def fly_over_topics(
             ) as processes,
         ):
             if lockstep:
-                return _follow_lockstep(scenario, processes, monitor, progress)
-            return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for)
+                processes.outcome = _follow_lockstep(scenario, processes, monitor, progress)
+            else:
+                begins = autopilot is None and scenario.controller.autostart and scenario.controller.start_active
+                span = _Span(scenario, processes, monitor) if begins else None
+                processes.outcome = _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
+            return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
+    except NotReadyError as error:
+        return f"{NEVER_FLEW}: {error}"
+
+
+class _Span:
+    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u to the end."""
+
+    def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor") -> None:
+        self._duration, self._processes, self._monitor = scenario.flight.duration, processes, monitor
+        self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
+        self._moved = 0.0  # s, flight time of the last change
+        self._ready = math.inf  # s, flight time at which each node was ready
+        self._flies = False
+        self.engaged = False  # the controller has published
+
+    def complete(self, t: float) -> bool:
+        """Whether the log holds the flight, or is not going to."""
+        if (stamp := self._monitor.recorded()) is not None and stamp - self._processes.start_time > self._until:
+            self._until, self._moved = stamp - self._processes.start_time, t
+        return self._until >= self._duration - STAMP_ERROR or (
+            self._flies and t >= max(self._duration, self._moved + LOG_TIMEOUT)
+        )
+
+    def failed(self, t: float) -> str:
+        """Why the flight has not begun; empty while it may begin, and from the first u on."""
+        self._flies = self._flies or self._processes.is_flying()
+        if self._flies:
+            return ""
+        if self._ready == math.inf and not (waiting := self._processes.waiting()):
+            self._ready = max(t, 0.0)
+        if self._ready == math.inf:
+            return f"{NEVER_FLEW}: {', '.join(waiting)} not ready at t = {t:.0f} s" if t > READY_TIMEOUT else ""
+        if t < self._ready + FIRST_U:
+            return ""
+        if self.engaged:
+            return f"{NEVER_FLEW}: u did not reach the aircraft"
+        why = self._processes.last_words(CONTROLLER)
+        return f"{NEVER_FLEW}: y did not reach the controller{f' ({why})' if why else ''}"
 
 
 def _follow_real_time(
@@ -96,12 +142,19 @@ def _follow_real_time(
     progress: Progress,
     announce: Callable[[str], None],
     engaged_for: float,
+    span: _Span | None = None,
 ) -> str:
+    """Without a `span` the flight ends after the duration."""
     units, outputs = display_units(scenario), scenario.controller.outputs
     text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
-    while (t := time.monotonic() - processes.started) < scenario.flight.duration:
+    while True:
+        t = time.monotonic() - processes.started
+        if t >= scenario.flight.duration if span is None else span.complete(t):
+            return COMPLETED
         if (reason := processes.ended_early()) is not None:
+            return reason
+        if span is not None and (reason := span.failed(t)):
             return reason
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
@@ -118,11 +171,12 @@ def _follow_real_time(
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:
             mode, values = status
+            if span is not None:
+                span.engaged = True
             errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
             text = f"{mode}  e: {', '.join(errors)}"
-        progress(max(t, 0.0), text)
+        progress(min(max(t, 0.0), scenario.flight.duration), text)
         time.sleep(POLL_PERIOD)
-    return COMPLETED
 
 
 def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:

@@ -44,9 +44,16 @@ class FlightMonitor(Client):
 
     def is_ready(self, node: str, pid: int) -> bool:
         """Whether the loop of a node runs. The process id tells it from a node of that name in another flight."""
+        return self._state(node, pid) in {*NodeState}
+
+    def is_flying(self, node: str, pid: int) -> bool:
+        """Whether the aircraft has taken a u."""
+        return self._state(node, pid) == NodeState.FLYING
+
+    def _state(self, node: str, pid: int) -> str:
         for received in self._node_state.take():
             self._states[received.message.key] = received.message.value
-        return self._states.get(f"/{node}#{pid}") in {NodeState.READY, NodeState.COMPLETED}
+        return self._states.get(f"/{node}#{pid}", "")
 
     def newest(self) -> tuple[str, FloatArray] | None:
         """Mode and e of the controller's newest sample since the last call, None without one."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import (
+    AIRCRAFT,
     BRIDGE,
     FIRST_STAGE,
     ONE_PROCESS,
@@ -30,10 +31,12 @@ from flight_bringup.graph import (
     start_instant,
     start_lead,
 )
-from flight_core.outcome import LOST_CONTACT
+from flight_core.files import write_file
+from flight_core.outcome import INTERRUPTED, LOST_CONTACT
 from flight_core.parameters import ParameterError
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
+from flight_log.bag import OUTCOME_FILE
 
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
@@ -61,6 +64,10 @@ def handle_signals(handler: Any) -> Iterator[None]:
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+class NotReadyError(ParameterError):
+    """A node is not ready in time."""
 
 
 class NodeProcess:
@@ -128,6 +135,7 @@ class FlightProcesses:
         if one_process:
             self._first, self._second = (), (ONE_PROCESS,)
         self.processes: list[NodeProcess] = []
+        self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # system time of t = 0, s; set once the first stage is ready
         self.started = math.inf  # the same on the monotonic clock, as the nodes count: a step of the system clock is none of t
 
@@ -164,16 +172,12 @@ class FlightProcesses:
         self.processes.append(NodeProcess(node, self._scenario.path, overrides, log))
 
     def _wait_until_ready(self, deadline: float) -> None:
-        while waiting := [
-            process.node.executable
-            for process in self.processes
-            if not self._monitor.is_ready(process.node.executable, process.popen.pid)
-        ]:
+        while waiting := self.waiting():
             if (reason := self.ended_early()) is not None:
                 raise ParameterError(reason)
             if time.monotonic() > deadline:
                 late = f"timed out waiting for {', '.join(waiting)}: not ready after {READY_TIMEOUT:g} s"
-                raise ParameterError(f"{late}; see the logs in {self._run / 'log'}")
+                raise NotReadyError(f"{late}; see the logs in {self._run / 'log'}")
             time.sleep(POLL_PERIOD)
 
     def ended_early(self) -> str | None:
@@ -184,9 +188,38 @@ class FlightProcesses:
         reasons = [reason for process in self.processes if (reason := _end(process)) is not None]
         return min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
 
+    def waiting(self) -> list[str]:
+        """The nodes that are not ready."""
+        return [
+            process.node.executable
+            for process in self.processes
+            if not self._monitor.is_ready(process.node.executable, process.popen.pid)
+        ]
+
+    def is_flying(self) -> bool:
+        """Whether the aircraft has taken a u."""
+        return any(
+            self._monitor.is_flying(process.node.executable, process.popen.pid)
+            for process in self.processes
+            if process.node is AIRCRAFT
+        )
+
+    def last_words(self, node: NodeSpec) -> str:
+        """The last line of a node on a topic that it waits for, or on a refused sample; empty without one."""
+        lines = [line for process in self.processes if process.node is node for line in process.lines]
+        line = next((line for line in reversed(lines) if "waiting for" in line or "refused" in line), "")
+        return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
+
+    def _leave_outcome(self) -> None:
+        """Leave the outcome for the recorder. A full disk costs the log the outcome alone."""
+        with suppress(OSError, ParameterError):
+            write_file(self._run / OUTCOME_FILE, self.outcome)
+
     def stop(self) -> None:
         """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT."""
         with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it would truncate the log
+            if self.processes:
+                self._leave_outcome()
             for recorder, timeout in ((False, STOP_TIMEOUT), (True, CLOSE_TIMEOUT)):
                 deadline = time.monotonic() + timeout
                 group = [process for process in self.processes if (process.node in {RECORDER, ONE_PROCESS}) is recorder]

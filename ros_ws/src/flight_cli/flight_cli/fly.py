@@ -15,21 +15,17 @@ from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
-    ENDED_EARLY,
-    INTERRUPTED,
     flight_progress,
     parse_numbers,
     print_json,
     show_flight,
 )
-from flight_core import outcome as ends
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
+from flight_core.outcome import exit_status
 from flight_core.parameters import ParameterError, require
 from flight_guidance.route_file import Origin, read_route
-
-STATUS = {ends.COMPLETED: 0, ends.INTERRUPTED: INTERRUPTED}
 
 
 def fly(
@@ -62,7 +58,7 @@ def fly(
 ) -> None:
     """Fly a scenario: aircraft, reference model, controller, recorder, guidance as processes over ROS 2 topics, in real time.
 
-    Exit status: 0 completed, 2 bad input, 3 ended early, 130 interrupted.
+    Exit status: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log, 130 interrupted.
     """
     chosen = find_scenario(scenario, duration)
     require(
@@ -99,7 +95,7 @@ def fly(
             )
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
-    status = STATUS.get(outcome, ENDED_EARLY)
+    status = exit_status(outcome)
     try:
         result = write_report(run, outcome)
     except ParameterError:
@@ -114,7 +110,7 @@ def fly(
     else:
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
-    raise typer.Exit(STATUS.get(outcome, ENDED_EARLY))
+    raise typer.Exit(exit_status(outcome))
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

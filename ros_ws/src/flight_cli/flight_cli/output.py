@@ -40,6 +40,8 @@ LATEST = Path("runs/latest")  # the run of a command that is given none
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
     summary, units = flight.summary, display_units(flight.scenario)
+    if busy := (summary["account"] or {}).get("busy"):
+        console.print(busy, style="bold", highlight=False, soft_wrap=True)
     title = f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
     columns = columns_of(ERROR_COLUMNS, summary["errors"])
     console.print(grouped_table(title, "channel", columns, table_rows(summary["errors"], columns, units)))

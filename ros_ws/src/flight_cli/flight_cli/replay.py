@@ -60,7 +60,7 @@ def replay(
     if csv_file is not None:
         _write_csv(csv_file, result, parameters.inputs)
     of = log_account(recorded)
-    lacks = () if of is None else tuple(f"the log lacks {lack}" for lack in of.lacks)
+    lacks = () if of is None else of.notes()
     ticks = max(len(result.number), 0 if of is None else of.topics["internals"].expected or 0)
     notes = (*recorded.tape.notes, *lacks, *result.notes, *_parameter_notes(result, open_loop=others is not None))
     notes += () if guided is None else guided.notes

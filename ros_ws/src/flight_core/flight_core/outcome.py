@@ -9,7 +9,15 @@ INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
+STATUS_INTERRUPTED, STATUS_ENDED_EARLY, STATUS_INCOMPLETE = 130, 3, 4  # exit statuses of a flight, 0 completed
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
+
+
+def exit_status(outcome: str) -> int:
+    """Exit status of a flight by the outcome."""
+    if outcome.startswith(f"{COMPLETED}, "):
+        return STATUS_INCOMPLETE
+    return {COMPLETED: 0, INTERRUPTED: STATUS_INTERRUPTED}.get(outcome, STATUS_ENDED_EARLY)
 
 
 class FlightEnded(RuntimeError):  # noqa: N818 - the end of a flight is not a program error

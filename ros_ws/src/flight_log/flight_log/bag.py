@@ -24,6 +24,8 @@ from flight_log.scan import RECORD
 
 SCENARIO_MEDIA_TYPE, FILE_MEDIA_TYPE = "application/yaml", "text/yaml"  # of attachments: the scenario, and other files
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
+SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
+OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
 LOST_MESSAGES = "rise_di_lost"  # name of the metadata record that counts the messages the recorder lost, by topic
 CHUNK_BYTES = 256 * 1024
 

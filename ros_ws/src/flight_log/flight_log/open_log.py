@@ -181,7 +181,8 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
         alike = list(group)
         end = begin + len(alike)
         table = np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
-        yield MessageBatch(batch.channel_id, table, batch.log_ns[begin:end], batch.publish_ns[begin:end])
+        times = batch.log_ns[begin:end], batch.publish_ns[begin:end]
+        yield MessageBatch(batch.channel_id, table, *times, batch.sequence[begin:end])
         begin = end
 
 
@@ -220,7 +221,8 @@ class SqliteScan:
                     alike = list(group)
                     table = np.frombuffer(b"".join(data for _, data in alike), dtype=np.uint8).reshape(len(alike), size)
                     log_ns = np.array([time_ns for time_ns, _ in alike], dtype=np.int64)
-                    yield MessageBatch(channel, table, log_ns, np.zeros(len(alike), dtype=np.int64))
+                    unknown = np.zeros(len(alike), dtype=np.int64)
+                    yield MessageBatch(channel, table, log_ns, unknown, unknown)
 
     def _rows(self) -> Iterator[Schema | Channel | tuple[int, int, bytes]]:
         # Takes 70 ms, which no bag of ours needs.

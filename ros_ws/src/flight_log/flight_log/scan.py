@@ -104,6 +104,7 @@ class MessageBatch(NamedTuple):
     data: NDArray[np.uint8]  # (N, length)
     log_ns: NDArray[np.int64]  # (N,)
     publish_ns: NDArray[np.int64]  # (N,), 0 where the log has no time of sending
+    sequence: NDArray[np.int64]  # (N,), number of the message by the publisher, 0 where the log has none
 
     @property
     def sent_ns(self) -> NDArray[np.int64]:
@@ -311,8 +312,11 @@ def decode_batches(parts: Sequence[Part]) -> Iterator[McapRecord | MessageBatch]
         return
     for record in decode(parts[0].opcode, parts[0].content):
         if isinstance(record, Message):
-            times = (np.array([time], dtype=np.uint64).view(np.int64) for time in (record.log_time, record.publish_time))
-            yield MessageBatch(record.channel_id, np.frombuffer(record.data, dtype=np.uint8)[None], *times)
+            log_ns, publish_ns = (
+                np.array([time], dtype=np.uint64).view(np.int64) for time in (record.log_time, record.publish_time)
+            )
+            number = np.array([record.sequence], dtype=np.int64)
+            yield MessageBatch(record.channel_id, np.frombuffer(record.data, dtype=np.uint8)[None], log_ns, publish_ns, number)
         else:
             yield record
 
@@ -347,8 +351,11 @@ def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterato
     for first, end in pairwise([0, *cuts.tolist(), len(places)] if len(places) else []):
         size = int(sizes[first])
         windows = np.ndarray((len(data) - size + 1, size), np.uint8, data, strides=(1, 1))
-        times = (heads[name][first:end].copy() for name in ("log_ns", "publish_ns"))
-        yield MessageBatch(int(heads["channel"][first]), windows[places[first:end] + HEAD.itemsize], *times)
+        log_ns, publish_ns = (heads[name][first:end].copy() for name in ("log_ns", "publish_ns"))
+        rows = windows[places[first:end] + HEAD.itemsize]
+        yield MessageBatch(
+            int(heads["channel"][first]), rows, log_ns, publish_ns, heads["sequence"][first:end].astype(np.int64)
+        )
 
 
 def _heads(data: bytes) -> NDArray[np.void]:

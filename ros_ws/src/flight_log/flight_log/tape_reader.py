@@ -23,7 +23,7 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
-from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE
+from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
@@ -214,12 +214,17 @@ class _TopicSamples:
         self._batch: list[tuple[Table, NDArray[np.int64]]] = []  # of one length, and their log times
         self._batched = 0  # messages
         self._clock = StampClock()
+        self._number: int | None = None  # of the last message, by the publisher
+        self._numbered, self._lost = False, 0
         self._unset = 0  # samples with a zero stamp, left out at the end
         self._samples: dict[tuple[str, ...], _Collected] = {}  # by names
         self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
-    def add(self, table: Table, log_ns: NDArray[np.int64]) -> None:
+    def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
+        steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
+        self._lost += int((steps[steps > 1] - 1).sum())
+        self._numbered, self._number = self._numbered or bool(sequence.any()), int(sequence[-1])
         alike = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not alike:
             self._decode_batch(more=alike)
@@ -301,7 +306,7 @@ class _TopicSamples:
 
     def recording(self) -> Recording:
         """The stamps in the order of the recording; after `signal`."""
-        return self._clock.recording(self._unset)
+        return self._clock.recording(self._unset)._replace(lost=self._lost if self._numbered else None)
 
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
@@ -333,7 +338,7 @@ class _Log:
             times = self.sent.setdefault(topic, [])
 
             def take(batch: MessageBatch) -> None:
-                samples.add(batch.data, batch.log_ns)
+                samples.add(batch.data, batch.log_ns, batch.sequence)
                 if batch.data.shape[1] >= STAMP.stop:
                     self.times = Times(stamps_of(batch.data), batch.sent_ns)
                     if batch.publish_ns.all():
@@ -341,7 +346,7 @@ class _Log:
 
             return take
         if samples is not None:
-            return lambda batch: samples.add(batch.data, batch.log_ns)
+            return lambda batch: samples.add(batch.data, batch.log_ns, batch.sequence)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(
@@ -383,7 +388,8 @@ class _Log:
         more = f"; {missing:.3f} s are missing after it" if missing > 0 else ""
         truncated = [f"{name} is truncated: read up to its last complete chunk{where}{more}" for name in self.truncated]
         lost = [f"{topic}: the recorder lost {count} messages" for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()]
-        return [*truncated, *self.notes, *lost]
+        silent = [f"{topic}: the recorder received nothing {text}" for topic, text in self.metadata.get(SILENCES, {}).items()]
+        return [*truncated, *self.notes, *lost, *silent]
 
 
 def _read(run: Path) -> _Log:

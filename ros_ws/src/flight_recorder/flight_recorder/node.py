@@ -18,11 +18,11 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
-from flight_core.files import dump_yaml, is_file, writing
+from flight_core.files import dump_yaml, is_file, read_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
-from flight_log.bag import LOST_MESSAGES, BagChannel, BagWriter, LogAttachments
+from flight_log.bag import LOST_MESSAGES, OUTCOME, OUTCOME_FILE, SILENCES, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderConfig
@@ -32,7 +32,21 @@ from flight_ros.messages import instant, sender_of, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
-from flight_ros.topics import FLIGHT, PUBLISH, RECORD, RECORD_FOREIGN, RECORDED, ROSOUT, TRUTH, Y_M, Topic, U, Y
+from flight_ros.topics import (
+    FLIGHT,
+    INTERNALS,
+    POSE,
+    PUBLISH,
+    RECORD,
+    RECORD_FOREIGN,
+    RECORDED,
+    ROSOUT,
+    TRUTH,
+    Y_M,
+    Topic,
+    U,
+    Y,
+)
 
 FLUSH_PERIOD_NS = nanoseconds(0.1)  # the longest loss when the recorder is killed; also the period of the graph checks
 DISK_PERIOD_NS = NANOSECONDS
@@ -40,6 +54,13 @@ MEGABYTE = 1e6
 
 LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
+
+STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)  # topics that no mode of a flight stops while the publisher runs
+STEADY_MESSAGES, STEADY_INTERVAL_NS = 20, NANOSECONDS // 5  # a topic is steady after so many messages at such intervals
+TOPIC_SILENCE_NS = NANOSECONDS
+
+DRAIN_NS = 10 * NANOSECONDS  # at most, at the end, for the messages that were sent before
+QUIET_NS = NANOSECONDS // 5  # without a message: none is left
 
 # Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
 PARAMETER_EVENTS = Topic("/parameter_events", ParameterEvent, foreign=True)
@@ -54,6 +75,11 @@ class _RecordedTopic:
     next_sequence: int = 0  # 0 before the first message
     publisher: str | None = None  # of the last message
     publishers: int = 0  # number of publishers at the last check
+    first_ns: int = 0  # monotonic time of the first and the last message
+    heard_ns: int = 0
+    stamp_ns: int = -1  # of the last message
+    sent_ns: int = 0  # time of sending of the last message
+    silent_ns: int = 0  # begin of a silence; 0 without a silence
 
     @property
     def name(self) -> str:
@@ -80,8 +106,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         ]
         recorded = {topic.name for topic in self._topics}
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
-        self._publish_recorded = self.advertise(RECORDED) if self.parameters.lockstep else None
+        self._publish_recorded = self.advertise(RECORDED)
         self.lost: Counter[str] = Counter()
+        self.silent: Counter[str] = Counter()  # ns, by topic
         self._ended = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
@@ -146,15 +173,19 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """Drain the subscriptions. Every FLUSH_PERIOD_NS also flush, and check the graph and the disk."""
         now_ns = self._drained_ns = time.monotonic_ns()
         self._drain_subscriptions()
-        if now_ns - self._flushed_ns < FLUSH_PERIOD_NS or self._ended:
+        if now_ns - self._flushed_ns < FLUSH_PERIOD_NS:
             return
         self._flushed_ns = now_ns
+        self._publish_span()
+        if self._ended:
+            return
         self._write_or_end(self._bag.flush)
         if self._ended:
             return
         self._subscribe_missing(now_ns)
         self._warn_of_a_part()
         self._warn_of_silence(now_ns)
+        self._warn_of_topic_silence(now_ns)
         self._check_publisher_counts()
         if now_ns - self._disk_checked_ns > DISK_PERIOD_NS:
             self._disk_checked_ns = now_ns
@@ -169,12 +200,31 @@ class RecorderNode(FlightNode[RecorderConfig]):
         recorded = b""
         for topic in self._topics:
             received = topic.subscription.take()
-            if received and topic.subscription.topic is TRUTH:
+            if received:
+                self._hear(topic, received)
+            if received and topic.subscription.topic is TRUTH and self.parameters.lockstep:
                 recorded = instant(stamp_of(received[-1].message))
             if not self._ended:
                 self._write_or_end(partial(self._append, topic, received))
-        if recorded and self._publish_recorded is not None:
+        if recorded:
             self._publish_recorded(recorded)
+
+    def _hear(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
+        """Note the time of the newest message of a topic."""
+        now_ns, last = time.monotonic_ns(), received[-1]
+        topic.first_ns, topic.heard_ns, topic.sent_ns = topic.first_ns or now_ns, now_ns, last.sent_ns
+        if topic.subscription.topic in LOOP:
+            topic.stamp_ns = stamp_of(last.message)
+        if topic.silent_ns:
+            silent_ns, topic.silent_ns = now_ns - topic.silent_ns, 0
+            self.silent[topic.name] += silent_ns
+            self.get_logger().info(f"{topic.name}: received again after {silent_ns / NANOSECONDS:.1f} s")
+
+    def _publish_span(self) -> None:
+        """In real time: the stamp up to which y, y_m and u are in the log. A flight ends once these span it."""
+        stamps = [topic.stamp_ns for topic in self._topics if topic.subscription.topic in LOOP]
+        if not self.parameters.lockstep and min(stamps) >= 0:
+            self._publish_recorded(instant(min(stamps)))
 
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, topic.channel
@@ -210,10 +260,36 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """Finish the bag. Return the error text when the bag cannot be finished."""
         try:
             self._bag.add_metadata(LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()})
+            self._add_silences()
+            if outcome := self._told_outcome():
+                self._bag.add_metadata(OUTCOME, {"outcome": outcome})
             self._bag.close()
         except OSError as error:
             return f"; {self._bag.path.name} is truncated: it cannot be written ({error.strerror})"
         return ""
+
+    def _add_silences(self) -> None:
+        """Store the silences of topics, also those that last."""
+        now_ns = time.monotonic_ns()
+        lasting = {topic.name: now_ns - topic.silent_ns for topic in self._topics if topic.silent_ns}
+        silent = Counter(self.silent)
+        silent.update(lasting)
+        if silent:
+            texts = {
+                name: f"for {length_ns / NANOSECONDS:.1f} s{', to the end' if name in lasting else ''}"
+                for name, length_ns in silent.items()
+            }
+            self._bag.add_metadata(SILENCES, texts)
+
+    def _told_outcome(self) -> str:
+        """The outcome that the flight left for the log; empty without one."""
+        file = self._bag.directory / OUTCOME_FILE
+        try:
+            outcome = read_file(file, OUTCOME_FILE, "a text").decode(errors="replace") if is_file(file) else ""
+            file.unlink(missing_ok=True)
+        except (OSError, ParameterError):
+            return ""
+        return bounded(outcome.strip())
 
     # Foreign topics may appear late, and with any QoS
 
@@ -255,6 +331,23 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 "process is blocked: start the recorder again"
             )
 
+    def _warn_of_topic_silence(self, now_ns: int) -> None:
+        """Warn of a steady topic that has stopped while the publisher is there and others go on.
+
+        A reader may miss all of a topic: a full queue, or a message of the middleware that was forged.
+        """
+        steady = [topic for topic in self._topics if topic.subscription.topic in STEADY and topic.channel.messages]
+        newest_ns = max((topic.heard_ns for topic in steady), default=0)
+        for topic in steady:
+            count = topic.channel.messages
+            rested = count < STEADY_MESSAGES or topic.heard_ns - topic.first_ns > count * STEADY_INTERVAL_NS
+            if rested or topic.silent_ns or newest_ns - topic.heard_ns < TOPIC_SILENCE_NS:
+                continue
+            if now_ns - newest_ns < TOPIC_SILENCE_NS and self.count_publishers(topic.name):
+                topic.silent_ns = topic.heard_ns
+                why = "the publisher has stopped, or this process receives nothing more of it"
+                self.get_logger().warning(f"{topic.name}: no message for 1 s while others go on: {why}")
+
     def _subscribe(self, name: str, message_type: str) -> None:
         package, _, kind = message_type.partition("/msg/")
         try:
@@ -295,11 +388,31 @@ class RecorderNode(FlightNode[RecorderConfig]):
         figures |= {f"missing {name}": "no publisher" for name in self._missing}
         if self._ended:
             return DiagnosticStatus.ERROR, self._ended, figures
-        level = DiagnosticStatus.WARN if self.lost or self._missing else DiagnosticStatus.OK
+        figures |= {f"silent {topic.name}": "no message" for topic in self._topics if topic.silent_ns}
+        level = (
+            DiagnosticStatus.WARN
+            if self.lost or self._missing or any(topic.silent_ns for topic in self._topics)
+            else DiagnosticStatus.OK
+        )
         return level, f"recording to {self._bag.path}", figures
 
-    def close(self) -> None:
+    def _drain(self) -> None:
+        """Write the messages that were sent before the end: this process may be seconds behind on a busy host."""
+        end_ns, sent_ns = time.monotonic_ns(), time.time_ns()
+        heard_ns = end_ns
         self._drain_subscriptions()
+        while (now_ns := time.monotonic_ns()) - end_ns < DRAIN_NS and now_ns - heard_ns < QUIET_NS:
+            waiting = [topic for topic in self._topics if topic.subscription.topic in STEADY and topic.channel.messages]
+            if all(topic.sent_ns >= sent_ns for topic in waiting):
+                return
+            time.sleep(QUIET_NS / 20 / NANOSECONDS)
+            before = sum(channel.messages for channel in self._bag.channels)
+            self._drain_subscriptions()
+            if sum(channel.messages for channel in self._bag.channels) != before:
+                heard_ns = time.monotonic_ns()
+
+    def close(self) -> None:
+        self._drain()
         if not self._ended:
             self._ended = "recording ended"
             if sentence := self._close_bag():

@@ -60,9 +60,13 @@ def publisher_qos(period_ns: int) -> QoSProfile:
 
 
 class NodeState(StrEnum):
-    """State of a node on `node_state`. READY: its event loop runs. COMPLETED: the aircraft has completed a lockstep flight."""
+    """State of a node on `node_state`. READY: its event loop runs.
+
+    FLYING: the aircraft has taken the first u of a flight in real time. COMPLETED: it has completed a lockstep flight.
+    """
 
     READY = "ready"
+    FLYING = "flying"
     COMPLETED = "completed"
 
 

@@ -225,7 +225,7 @@ class Flight:
             if self._given is not None:
                 recorded = recorded._replace(scenario=self._given)
             of = log_account(recorded)
-            lacks = () if of is None else (f"the log lacks {lack}" for lack in of.lacks)
+            lacks = () if of is None else of.notes()
             self._lacks = [_text(sentence) for sentence in (*recorded.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:

@@ -3,7 +3,7 @@
 """The account of a flight: the samples that its log should hold and holds, by topic, and the outcome that follows."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,14 +11,16 @@ import numpy as np
 from aircraft_sim.pose import every
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, UNKNOWN
+from flight_core.outcome import COMPLETED, INCOMPLETE, NEVER_FLEW, UNKNOWN
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
+from flight_log.clock import SINCE_EPOCH_NS
 
 WHOLE = 0.99  # least share of the samples of a topic without a remark
 SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
+GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 
@@ -36,6 +38,7 @@ class TopicAccount(NamedTuple):
     unset: int  # samples with a zero stamp, left out
     step: float  # of the clock of the stamps, s; 0 without a step
     left_out: int  # samples after the step
+    unsent: int  # samples that the publisher left out on a busy host, by the numbers of the messages
 
     @property
     def share(self) -> float | None:
@@ -49,6 +52,8 @@ class Account(NamedTuple):
     end: float  # s, flight time of the end
     topics: dict[str, TopicAccount]
     lacks: tuple[str, ...]
+    busy: str = ""  # the sentence on a host that left out samples and ticks
+    unguided: bool = False  # the controller was engaged, and guidance took no step
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -58,15 +63,21 @@ class Account(NamedTuple):
         ]
         return f"over {', '.join(parts)}" if parts else ""
 
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user of a log."""
+        return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in self.lacks))
+
     def as_json(self) -> dict[str, Any]:
         """The account for `summary.json`."""
         topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
-        return {"end": self.end, "topics": topics, "lacks": list(self.lacks)}
+        return {"end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy}
 
 
 def final_outcome(outcome: str, account: Account) -> str:
     """The outcome with what the log lacks: "completed, log incomplete: ...". An early end stays as it is."""
     base = outcome.partition(f", {INCOMPLETE}")[0]
+    if base == COMPLETED and account.unguided:
+        return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
     if not account.lacks or not base.startswith((COMPLETED, UNKNOWN)):
         return base
     return f"{base}, {INCOMPLETE}: {'; '.join(account.lacks)}"
@@ -112,6 +123,9 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     expected = {} if scenario is None else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
     topics = {name: _topic(tape, name, expected.get(name), end_ns) for name in names}
+    if scenario is not None and tape.start_ns > SINCE_EPOCH_NS:  # in real time
+        for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
+            topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)))
     end = seconds(end_ns - tape.start_ns)
     failsafe = 0
     if "internals" in tape and "mode" in tape["internals"].names:
@@ -120,11 +134,22 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         # Stamps rest during a failsafe. Further equal stamps are of a clock that stands, and no sample is known to be new.
         repeated = max(topic.repeated - (failsafe if name in TICKS else 0), 0)
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
+    guided = [topics[name] for name in GUIDED if name in topics]
+    unguided = bool(guided) and all(topic.expected and not topic.found and not topic.unset for topic in guided)
     lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end))]
-    return Account(end, topics, (*_lost_parts(tape.notes), *lacks))
+    busy = [
+        f"{topic.unsent} of {topic.expected} {name} were never sent"
+        for name, topic in topics.items()
+        if topic.expected is not None and topic.unsent > (1.0 - WHOLE) * topic.expected
+    ]
+    return Account(end, topics, (*_lost_parts(tape.notes), *lacks), _too_busy(busy), unguided)
 
 
 RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
+
+
+def _too_busy(parts: Sequence[str]) -> str:
+    return f"this host is too busy: {', '.join(parts)}; see docs/faults.md" if parts else ""
 
 
 def _lost_parts(notes: Iterable[str]) -> list[str]:
@@ -133,14 +158,8 @@ def _lost_parts(notes: Iterable[str]) -> list[str]:
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
     """The number of samples by topic that the log of a flight should hold, where this is known."""
-    aircraft, sensors = scenario.aircraft, scenario.aircraft.sensors
-    y_ns = period_ns(aircraft.rate, "aircraft.rate")
-    periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
-    if simulated:
-        periods |= {"y": y_ns} | {name: y_ns for name in ("truth",) if name in tape or name in tape.recording}
-        periods |= {"pose": every(aircraft.rate) * y_ns} if "pose" in tape or "pose" in tape.recording else {}
-    expected = {}
-    for name, step_ns in periods.items():
+    sensors, expected = scenario.aircraft.sensors, {}
+    for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
         first_ns = tape.start_ns
         if not from_start and name in tape:
             first_ns = int(tape[name].stamp_ns[0])
@@ -156,8 +175,26 @@ def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, 
     expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
         steps = max(math.floor(engaged * scenario.guidance.rate / scenario.controller.rate) - 2, 0)
-        expected |= dict.fromkeys(("guidance", "u_m"), steps)
+        expected |= dict.fromkeys(GUIDED, steps)
     return expected
+
+
+def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
+    """Periods of the topics with a sample at each instant of a rate, ns. Another aircraft may have no truth and no pose."""
+    periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
+    if simulated:
+        y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
+        of_aircraft = {"y": y_ns, "truth": y_ns, "pose": every(scenario.aircraft.rate) * y_ns}
+        periods |= {name: step for name, step in of_aircraft.items() if name in {"y", *tape.signals, *tape.recording}}
+    return periods
+
+
+def _with_unsent(topic: TopicAccount, step_ns: int, of: Recording) -> TopicAccount:
+    """The account of a topic with the instants between the first and the last sample that the publisher left out."""
+    if topic.first is None or topic.last is None or of.lost is None or topic.expected is None:
+        return topic
+    instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
+    return topic._replace(unsent=max(instants - topic.found - of.lost, 0))
 
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
@@ -189,7 +226,7 @@ def _topic(tape: Tape, name: str, expected: int | None, end_ns: int) -> TopicAcc
         expected, count,
         float(t[0]) if count else None, float(t[-1]) if count else None,
         None if longest is None else float(gaps[longest]), None if longest is None else float(t[longest]),
-        of.repeated if of.found else int(np.count_nonzero(gaps == 0.0)), of.unset, seconds(of.step_ns), of.left_out,
+        of.repeated if of.found else int(np.count_nonzero(gaps == 0.0)), of.unset, seconds(of.step_ns), of.left_out, 0,
     )  # fmt: skip
 
 
@@ -202,7 +239,7 @@ def _lack(name: str, topic: TopicAccount, end: float) -> str:
         facts.append(f"{topic.unset} samples without a stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
-    missing = topic.share is not None and topic.share < WHOLE
+    missing = topic.expected is not None and topic.found + topic.unsent < WHOLE * topic.expected
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE):

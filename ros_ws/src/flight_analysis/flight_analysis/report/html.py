@@ -131,7 +131,7 @@ def _description(flight: RecordedFlight) -> str:
 
 
 def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
-    floors = {name: metrics["floor"] for name, metrics in flight.summary["errors"].items()}
+    floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
     limits = figures.input_limits(flight.scenario, flight.tape)
     run, colour = (flight.tape, flight.period_ns), figures.PLANT
     spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)

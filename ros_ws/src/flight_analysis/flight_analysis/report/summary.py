@@ -14,6 +14,7 @@ from flight_analysis.metrics import (
     GUIDED_LEGEND,
     PARTS_LEGEND,
     TRUE_ERROR,
+    TickMetrics,
     Transient,
     best_error,
     engagements,
@@ -35,6 +36,7 @@ from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
 from flight_core.units import si_per_unit
+from flight_log.clock import SINCE_EPOCH_NS
 
 NO_VALUE = "-"
 OLD_ORDER = "summarise(scenario, tape, outcome): the order is summarise(tape, scenario, outcome), and summarise(tape) is enough"
@@ -135,6 +137,8 @@ def summarise(
     events = transients(scenario, tape)
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_metrics(tape)
+    if tape.start_ns > SINCE_EPOCH_NS:  # in real time
+        of = _with_late_ticks(of, ticks, scenario)
     summary = empty_summary(scenario, final_outcome(outcome, of)) | {
         "duration": _duration(tape, of),
         "error": best_error(tape)[0],
@@ -148,9 +152,21 @@ def summarise(
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "guidance": guidance_summary(tape),
         "account": of.as_json(),
-        "notes": [*tape.notes, *guidance_notices(tape, scenario.guidance)],
+        "notes": [*([of.busy] if of.busy else []), *tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
+
+
+def _with_late_ticks(of: Account, ticks: TickMetrics | None, scenario: Scenario) -> Account:
+    """The account with the ticks that found no new y although the log has every y: the host is too busy."""
+    whole = not (of.over("y", "internals") and not of.busy) and not of.lacks and not scenario.aircraft.sensors.dropout
+    if ticks is None or not whole or ticks.without_new_y <= BUSY * ticks.ticks:
+        return of
+    late = f"{ticks.without_new_y} ticks without a new y"
+    return of._replace(busy=f"{late}: this host is too busy; see docs/faults.md" if not of.busy else f"{late}; {of.busy}")
 
 
 def _duration(tape: Tape, of: Account) -> float | None:
