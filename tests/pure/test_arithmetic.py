@@ -13,6 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.scenarios import find_scenario
 from flight_core.arithmetic import (
     ARITHMETIC,
     ARITHMETIC_OF_HOST,
@@ -26,6 +30,7 @@ from flight_core.arithmetic import (
 )
 from flight_core.parameters import ParameterError
 from flight_log.provenance import provenance, recorded_arithmetic
+from flight_log.tape_reader import RecordedRun, StoredFile
 
 pytestmark = pytest.mark.package("flight_core")
 
@@ -100,6 +105,23 @@ def test_jax_is_near() -> None:
             assert (np.abs(jax.jit(product)(matrix, vector) - product(matrix, vector)) <= 8 * 2.0**-53 * scale).all()
             x = rng.normal(size=50) * 100.0
             assert np.abs(jax.jit(sine)(x) - sine(x)).max() < 1e-15
+
+
+def test_log_replays_with_arithmetic_of_its_provenance() -> None:
+    """A flight with feedforward and observer as an earlier version computed it, and as this version does."""
+    scenario = find_scenario("osprey_observer", 2.0)
+    stored = StoredFile("osprey_observer.yaml", scenario_yaml(scenario).encode())
+    for flown, different in ((ARITHMETIC_OF_HOST, ARITHMETIC), (ARITHMETIC, ARITHMETIC_OF_HOST)):
+        with arithmetic(flown):
+            tape = simulate(scenario)
+        equal = {}
+        for number in (flown, different):
+            names = {} if number == ARITHMETIC_OF_HOST else {"arithmetic": number}
+            run = RecordedRun(tape, stored, {"rise_di_versions": {"python": "3.12", **names}})
+            result = replay(run)
+            assert result.checked.all()
+            equal[number] = result.equal()
+        assert equal == {flown: True, different: False}
 
 
 def test_arithmetic_of_host_is_for_logs_without_number() -> None:

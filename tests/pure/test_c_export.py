@@ -27,6 +27,7 @@ from flight_analysis.c_export.proof import (
     PARAMETERS,
     SOURCE,
     Program,
+    build,
     compilers,
     prove,
     report,
@@ -96,6 +97,15 @@ def test_sanitizers_find_nothing(case: Case, tmp_path: Path) -> None:
     program = Program(case.code, ["gcc"], case.sets, tmp_path, flags=flags)
     for recording in case.recordings[:5]:
         assert program.compare(recording).differing == 0
+
+
+@pytest.mark.parametrize(
+    "flags", [("-O0",), ("-O3", "-march=native"), ("-Os", "-Wconversion", "-Wdouble-promotion", "-Wundef")]
+)
+def test_bits_do_not_depend_on_optimisation(flags: tuple[str, ...], case: Case, tmp_path: Path) -> None:
+    build(["gcc", *FLAGS, *flags, "-c", "-o", str(tmp_path / "rise_di.o"), "rise_di.c"], case.code)  # without a warning
+    program = Program(case.code, ["gcc"], case.sets, tmp_path / "program", flags=[*FLAGS, *flags, "-Wno-error"])
+    assert all(program.compare(recording).differing == 0 for recording in case.recordings[2:6])
 
 
 def test_contraction_changes_bits(case: Case, tmp_path: Path) -> None:
