@@ -3,12 +3,17 @@
 """Sections `controller` of osprey_servo under other laws: those of docs/laws.md, and that of the example package."""
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 from tests.conftest import REPOSITORY
 
 from flight_bringup.scenarios import find_scenario
+from rise_di_controller import laws
 from rise_di_controller.params import ControllerConfig
 
 EXAMPLE = REPOSITORY / "examples" / "pid_law"
@@ -29,3 +34,18 @@ _BLOCKS = re.findall(r"```yaml\n(.*?)```", (REPOSITORY / "docs" / "laws.md").rea
 
 SECTIONS = {law["law"]: COMMON | law for law in map(yaml.safe_load, _BLOCKS)}
 SECTIONS["pid"] = _section((EXAMPLE / "osprey_pid.yaml").read_text(encoding="utf-8"))
+
+
+@contextmanager
+def example_installed(folder: Path) -> Iterator[None]:
+    """The example as an installed package: its modules, and the metadata with its entry point in a folder."""
+    metadata = folder / "pid_law-0.1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8")
+    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(EXAMPLE))
+        patch.syspath_prepend(str(folder))
+        laws._registered.cache_clear()
+        yield
+    laws._registered.cache_clear()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.feedforward import both
+from tests.closed_loop import PROTOTYPE_SERVO
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -35,7 +36,7 @@ pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
 
 app = application([*COMMANDS])
 MS = 1_000_000
-SERVO = find_scenario("osprey_servo")
+SERVO = PROTOTYPE_SERVO
 BY_HAND = nominal_model(
     A=np.array([[-1.0, 2.0], [4.0, -3.0]]),
     B=np.array([[2.0], [0.0]]),

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pytest
+from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY
-from tests.other_laws import COMMON, EXAMPLE, SECTIONS
+from tests.other_laws import COMMON, SECTIONS, example_installed
 from tests.pure.test_replay import BUSY, FLY, LOST, SHORT, Tick, driven, equal, without
 
 from aircraft_sim.airframe import load_airframe
@@ -24,7 +25,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from flight_analysis.report import layouts
-from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
@@ -42,7 +42,7 @@ from rise_di_controller.saturation import Limits
 pytestmark = pytest.mark.package("control_laws")
 
 AIRFRAME = load_airframe("osprey")
-SERVO = find_scenario("osprey_servo").vary(
+SERVO = PROTOTYPE_SERVO.vary(
     flight={"duration": 2.0},
     aircraft={"rate": 100.0, "step": 0.005, "gusts": {"vertical": {"start": 1.0, "speed": 10.12, "length": 15.24}}},
     reference_model={"rate": 100.0, "pulses": BUSY},
@@ -53,18 +53,8 @@ NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo
 
 @pytest.fixture(scope="module", autouse=True)
 def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The example as an installed package: its modules, and the metadata with its entry point."""
-    installed = tmp_path_factory.mktemp("installed")
-    metadata = installed / "pid_law-0.1.0.dist-info"
-    metadata.mkdir()
-    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: pid_law\nVersion: 0.1.0\n", encoding="utf-8")
-    (metadata / "entry_points.txt").write_text(f"[{laws.GROUP}]\npid = pid_law.pid:PidConfig\n", encoding="utf-8")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(EXAMPLE))
-        patch.syspath_prepend(str(installed))
-        laws._registered.cache_clear()
+    with example_installed(tmp_path_factory.mktemp("installed")):
         yield
-    laws._registered.cache_clear()
 
 
 @cache

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from tests.builders import rms
+from tests.closed_loop import PROTOTYPE_SERVO
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -31,7 +32,7 @@ from rise_di_controller.rise_di import RiseDiConfig
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
 
 OSPREY = load_airframe("osprey")
-SERVO = find_scenario("osprey_servo")
+SERVO = PROTOTYPE_SERVO
 NOISE = np.array([0.0017, 0.0017, 0.0017, 0.03])  # of osprey_servo in the law's order q, p, r, V
 SIZE = np.array([0.1, 0.1, 0.1, 1.0])
 SHIPPED = ("osprey_observer", "osprey_turbulence")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.builders import MS, aircraft_parameters, rms
-from tests.closed_loop import error
+from tests.closed_loop import PROTOTYPE_SERVO, error
 
 from aircraft_sim import sensors as sensor_maths
 from aircraft_sim.sensors import DelayLine, Drift, Sensors, arrives, initial_drift, measure, noise, transmit, walk
@@ -15,7 +15,6 @@ from aircraft_sim.simulator import Simulator, StateSpaceModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, tracking_error, true_error
-from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
@@ -220,7 +219,7 @@ def test_ideal_sensors_give_y_to_last_bit() -> None:
 @pytest.fixture(scope="module")
 def servo() -> Scenario:
     slow, controller = {"rate": 100.0}, {"delay": 0.0, "softening": 3.0}
-    return find_scenario("osprey_servo").vary(aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller)
+    return PROTOTYPE_SERVO.vary(aircraft=slow | {"step": 0.005}, reference_model=slow, controller=controller)
 
 
 def with_sensors(scenario: Scenario, **sensors: Any) -> Scenario:

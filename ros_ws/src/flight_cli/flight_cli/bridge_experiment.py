@@ -27,6 +27,7 @@ from flight_analysis.design.bridge_identification import (
     require_envelope,
 )
 from flight_analysis.design.open_loop_fit import ChannelModel
+from flight_analysis.design.requirement import Requirement
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
@@ -40,7 +41,14 @@ from flight_log.tape_reader import read_run
 
 
 def identify_behind_bridge(
-    map_name: str, speed: float, folder: Path, amplitude: float, log: Path | None, as_json: bool
+    map_name: str,
+    speed: float,
+    folder: Path,
+    amplitude: float,
+    log: Path | None,
+    as_json: bool,
+    needed: Requirement,
+    accept: bool,
 ) -> None:
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
     channel_map = load_map(map_name)
@@ -59,7 +67,8 @@ def identify_behind_bridge(
     _show_models(console, response, models)
     found = join(channel_map, response, models)
     airframe = folder / "airframe.yaml"
-    flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()))
+    flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()), needed)
+    require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --accept beside --bridge")
     written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
     _write(folder, files)

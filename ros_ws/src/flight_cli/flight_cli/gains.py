@@ -6,28 +6,33 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import Condition, failing
-from flight_analysis.design.gain_selection import GainAssessment, Study
+from flight_analysis.design.gain_selection import GainAssessment, Selection, Study
+from flight_analysis.design.requirement import PHASE_MARGIN
+from flight_analysis.design.trade import trade
 from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
+from flight_analysis.report.summary import display_unit
+from flight_campaign.statistics import score_units
 from flight_cli.output import new_table, options, parse_numbers, print_json, write_text
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from rise_di.gain_design import check_gains, select_gains
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin")
+PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "phase_margin")
 """Options of which `select_gains` says what is wrong, beside those of the loop."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
     " it is the phase in deg that the lag costs at the crossover",
     "softening": "width of the softened sign in time, beside the lag of the loop: narrower than that the loop is unstable",
-    "response": "how much one unit of scaled input changes y_dot, abs(Omega_ii) input_scale; bandwidth = K x response",
+    "beta": "for inputs scaled by 1 / abs(Omega_ii) in every table; a file has a smaller scale where (22) asks for a larger K",
 }
 """Terms of the table and their meaning."""
 Assessment = GainAssessment[Any]
@@ -62,6 +67,12 @@ def gains(
         str | None, typer.Option(help="Airframe that the observer takes as its model, as rise-di identify --log writes it.")
     ] = None,
     margin: Annotated[float, typer.Option(help="Least delay margin of the nominal loop with the observer, s.")] = 0.03,
+    phase_margin: Annotated[
+        float, typer.Option(help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.")
+    ] = PHASE_MARGIN,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+    ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
     ] = False,
@@ -101,22 +112,49 @@ def gains(
                 observer=observer,
                 model=model,
                 margin=margin,
+                phase_margin=phase_margin,
+                accept=accept,
             )
             both = {"theorem": selection.theorem, "engineering": selection.engineering}
             answers, origin = {"observer": selection.engineering} if observer else both, selection.origin
             if write is not None:
+                _require_margins(selection.engineering, accept)
                 write_text("--write", write, HEADER + gain_selection.as_yaml(selection))
     found = next(iter(answers.values())).study
     if as_json:
         print_json(_as_json(found, answers, seed))
     else:
         _show(console, found, answers)
+        if not check and not observer and selection.engineering.margins is not None:
+            _show_trade(console, selection)
         if origin:
             console.print(origin, highlight=False, soft_wrap=True)
         if write is not None:
             console.print(f"gains: {write}")
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def _require_margins(found: Assessment, accept: bool) -> None:
+    """Raises ParameterError for gains whose margins fall short of the requirement, without --accept."""
+    if found.unmet and not accept:
+        lacking = "; ".join(condition.sentence(found.controller.outputs) for condition in found.unmet)
+        raise ParameterError(f"--write: {lacking}; --accept writes them all the same")
+
+
+def _show_trade(console: Console, selection: Selection) -> None:
+    """The error of the linear loop along the manoeuvre against the phase margin."""
+    controller, frame = selection.engineering.controller, selection.study.airframe
+    units, outputs = score_units(controller.outputs, frame.states), controller.outputs
+    shown = [display_unit(frame.states[name]) for name in outputs]
+    of_outputs = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
+    heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *of_outputs, "score"]
+    table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left=())
+    for row in trade(selection):
+        errors = (f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True))
+        margins = f"{row.phase_margin:g}", f"{row.found:.0f}", _milliseconds(row.delay_margin)
+        table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
+    console.print(table)
 
 
 def _parse_lags(text: str) -> list[float]:
@@ -165,14 +203,14 @@ def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> Non
 def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
     """K, Lambda and beta of RISE-DI, a row a channel."""
     headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
-    title = f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2"
+    title = f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2, for inputs scaled by 1 / abs(Omega_ii)"
     table = new_table(title, ["channel", "D", *headings], left=("channel",))
     first = next(iter(answers.values())).controller
     for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
         row = [f"{output} by {name}", f"{first.D[i]:+d}"]
         for answer in answers.values():
-            params = answer.controller.law_params()
-            row += [f"{params.K[i]:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i]:.4g}"]
+            params, response = answer.controller.law_params(), gain_selection.response(answer.study, answer.controller)[i]
+            row += [f"{params.K[i] * response:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i] * response:.4g}"]
         table.add_row(*row)
     return table
 

@@ -26,6 +26,7 @@ from flight_analysis.design.identification import identify as identify_aircraft
 from flight_analysis.design.innovation_filters import Actuation, recording
 from flight_analysis.design.model_identification import Identification, model_yaml
 from flight_analysis.design.model_identification import identify as identify_model
+from flight_analysis.design.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
@@ -34,7 +35,7 @@ from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
 from flight_cli.log_options import scenario_file
-from flight_cli.output import COUNT_COLUMNS, new_table, print_json, progress_bar, write_text
+from flight_cli.output import COUNT_COLUMNS, new_table, options, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
@@ -89,6 +90,12 @@ def identify(
     amplitude: Annotated[
         float | None, typer.Option(help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.")
     ] = None,
+    phase_margin: Annotated[
+        float | None, typer.Option(help="Without --log, or with --bridge: least phase margin of the loop, deg; 45.")
+    ] = None,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
@@ -99,6 +106,8 @@ def identify(
 
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
     """
+    with options("phase_margin"):
+        needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
     if bridge is not None:
         of_others = {
             "aircraft": aircraft,
@@ -115,7 +124,7 @@ def identify(
             raise ParameterError("identify: found too few arguments, expected --speed and --write beside --bridge")
         require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
-        identify_behind_bridge(bridge, speed, write, part, log, as_json)
+        identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
         return
     require(amplitude is None, "--amplitude", amplitude, "--bridge beside it")
     of_tests = {
@@ -125,6 +134,8 @@ def identify(
         "--output": output,
         "--observer": observer or None,
         "--guidance": guidance or None,
+        "--phase-margin": phase_margin,
+        "--accept": accept or None,
     }
     of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
     of_log |= {"--refly": refly or None}
@@ -140,7 +151,7 @@ def identify(
         raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
     else:
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer else None
-        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, guidance, as_json)
+        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, guidance, as_json, needed, accept)
 
 
 def _identify_by_steps(
@@ -151,6 +162,8 @@ def _identify_by_steps(
     observer_margin: float | None,
     guided: bool,
     as_json: bool,
+    needed: Requirement,
+    accept: bool,
 ) -> None:
     require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
     name = require_aircraft(airframe)
@@ -163,10 +176,13 @@ def _identify_by_steps(
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
-            found = identify_aircraft(name, speed, altitude, status.update, observer_margin, guided=guided)
+            found = identify_aircraft(name, speed, altitude, status.update, observer_margin, guided=guided, needed=needed)
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
+    chosen = found.selection.engineering
+    lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
+    require(accept or not lacking, "identify", lacking, "the margins, or --accept, which writes the gains all the same")
     write_text("--output", path, found.text)
     if as_json:
         print_json(_as_json(found, path))

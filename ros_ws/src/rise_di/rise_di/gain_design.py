@@ -13,6 +13,7 @@ from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import gains_by_rule, gains_of_search, model_for, with_aircraft_observer
+from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, PHASE_MARGIN, Requirement, requirement
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
@@ -45,6 +46,8 @@ def select_gains(
     observer: bool = False,
     model: FilePath | Airframe | None = None,
     margin: float = 0.03,
+    phase_margin: float = PHASE_MARGIN,
+    accept: bool = False,
 ) -> Selection:
     """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
 
@@ -67,6 +70,9 @@ def select_gains(
         observer: Whether they have a feedforward and an observer, and gains beside these.
         model: Airframe that the observer takes as its model; None: the airframe itself.
         margin: Least delay margin of the nominal loop with the observer, s.
+        phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a sensitivity of at most 2 and
+            a damping of 0.4; 35 deg with the observer.
+        accept: Whether less than 40 deg are accepted.
 
     Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
     """
@@ -76,6 +82,7 @@ def select_gains(
         inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
+        requirement=requirement(phase_margin, accept=accept),
     )
     require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
@@ -83,7 +90,8 @@ def select_gains(
     selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
     if not observer:
         return selection
-    controller, origin = observed(selection.engineering.controller, chosen, known_model, margin)
+    needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
+    controller, origin = observed(selection.engineering.controller, chosen, known_model, margin, needed)
     return selection._replace(engineering=gain_selection.assess_gains(selection.study, controller, setting), origin=origin)
 
 
@@ -170,12 +178,18 @@ def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
     return dict(zip(names, values, strict=True))
 
 
-def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, margin: float) -> tuple[RiseDiConfig, str]:
+def observed(
+    controller: RiseDiConfig,
+    scenario: Scenario,
+    model: Airframe,
+    margin: float,
+    needed: Requirement = OBSERVER_REQUIREMENT,
+) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
     The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
     where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
-    delay margin changes least, then the one of the least cost.
+    margins change least, then the one of the least cost.
     """
     noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
     by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
@@ -197,7 +211,7 @@ def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, marg
     selected, refusal = [], None
     for gains, origin in candidates:
         try:
-            selected.append((with_aircraft_observer(controller, model, gains, noise, margin), origin))
+            selected.append((with_aircraft_observer(controller, model, gains, noise, margin, needed), origin))
         except ParameterError as error:  # another gain set may have the margin
             refusal = error
     if refusal is not None and not selected:
@@ -206,8 +220,9 @@ def observed(controller: RiseDiConfig, scenario: Scenario, model: Airframe, marg
     found, origin = min(selected, key=lambda one: float(np.prod(one[0].relaxation)))
     factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
-    lowered = f"; for the margin K / and effort x {relaxed}" if relaxed else ""
-    return found.controller, f"observer of {model.name}: {origin}{lowered}; delay margin {1e3 * found.delay_margin:.0f} ms"
+    lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
+    margins = f"delay margin {1e3 * found.delay_margin:.0f} ms, phase margin {np.degrees(found.phase_margin):.0f} deg"
+    return found.controller, f"observer of {model.name}: {origin}{lowered}; {margins}"
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:

@@ -14,14 +14,17 @@ import yaml
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.jsbsim_aircraft import OUTPUTS
+from aircraft_sim.uncertainty import nominal_and_sampled
 from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.params import ChannelMap
 from control_laws.excitation import ExcitationConfig
+from flight_analysis.closed_loop.margins import LoopMargins, linear_loop, loop_assessment
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import bandwidths
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
-from flight_analysis.design.identification import SOFTENING, reference_parameters
+from flight_analysis.design.identification import reference_parameters
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
+from flight_analysis.design.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
 from flight_analysis.design.response_identification import MIN_RATIO, Response, Spans
 from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError, require
@@ -30,6 +33,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
+from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -44,6 +48,7 @@ REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequenc
 MAX_NATURAL_FREQUENCY: Mapping[str, float] = {"q": 4.0, "p": 5.0, "r": 4.0, "V": 1.2}  # rad/s, those of `osprey_servo`
 HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V needs in the end; the rest is for disturbances
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+UNCERTAINTY, SAMPLES = 0.3, 20  # of the uncertain aircraft whose phase margin counts
 MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
 AGE, HOLD, RAMP = (
@@ -195,16 +200,20 @@ class Flyable(NamedTuple):
     """A controller for an identified aircraft, and the files for a flight."""
 
     controller: RiseDiConfig
-    delay_margin: float | None  # s, of y_dot = Omega u with the lags and the delay; None for the literal sign
+    delay_margin: float | None  # s, of the identified channels with the lags and the delay; None without a softened sign
+    lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
     airframe: str  # text of the airframe file
     scenario: str  # text of the scenario file
 
 
-def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str) -> Flyable:
+def flying_scenario(
+    channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str, needed: Requirement = REQUIREMENT
+) -> Flyable:
     """Gains for identified channels, and the texts of airframe and scenario.
 
     The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. The integrals follow
-    from damping and stiffness. The feedforward has the airframe as model, in coordinated turns without sideslip.
+    from damping and stiffness. Integrals and bandwidths fall until the loop around the identified channels has the margins
+    `needed`. The feedforward has the airframe as model, in coordinated turns without sideslip.
     """
     pairing, _ = channel_pairs(channel_map)
     delay = float(np.min(found.delay))
@@ -225,7 +234,7 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     base = RiseDiConfig.validate_mapping(
         _controller(channel_map, pairing)
         | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
-        | {"k_g": 1.0, "k_d": ones[1:], "D": [1] * len(ones), "sign": "auto", "softening": SOFTENING}
+        | {"k_g": 1.0, "k_d": ones[1:], "D": [1] * len(ones), "sign": "auto", "softening": gain_selection.SOFTENING}
         | {"lag": list(lag.values()), "delay": delay},
         "controller",
     )
@@ -242,14 +251,44 @@ def flying_scenario(channel_map: ChannelMap, found: Channels, speed: float, airf
     # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
     studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
-    selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}))
-    flown = _with_integrals(selection.engineering.controller, pairing, found, loop)
+    selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}, requirement=needed))
+    flown, margins = _within_margins(_with_integrals(selection.engineering.controller, pairing, found, loop), frame, needed)
     turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
     model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
     heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
+    heading += f"\n# {gain_selection.margins_sentence(flown, margins)}"
     text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
-    return Flyable(flown, selection.engineering.delay_margin, airframe, text)
+    lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
+    return Flyable(flown, None if margins is None else margins.delay, lacking, airframe, text)
+
+
+def _within_margins(
+    controller: RiseDiConfig, airframe: Airframe, needed: Requirement
+) -> tuple[RiseDiConfig, LoopMargins | None]:
+    """The controller with slower integrals and lower bandwidths where the loop around an airframe lacks margins; the margins.
+
+    A bandwidth falls with the input scale: K of (22) stays.
+    """
+    if controller.sampled_sign()[0] is not Sign.SOFT:
+        return controller, None
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, SAMPLES, 1)
+
+    def build(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
+        ones = np.ones(len(controller.outputs))
+        changes: dict[str, FloatArray] = {
+            "Lambda": np.array(controller.Lambda) / (slower * lower) * ones,
+            "softening": np.array(controller.softening) * (slower * lower) * ones,
+            "input_scale": np.array(controller.input_scale) / lower * ones,
+            "omega": np.array(controller.omega) / lower * ones,
+            "beta": np.array(controller.beta) * lower * ones,  # the same rate of u
+        }
+        values = controller.model_dump() | {key: value.tolist() for key, value in changes.items()}
+        chosen = RiseDiConfig.validate_mapping(values, "controller")
+        return Candidate(chosen, linear_loop(chosen, airframe, A, B))
+
+    chosen = within_requirement(build, needed)
+    return chosen.controller, loop_assessment(chosen.loop)
 
 
 def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:

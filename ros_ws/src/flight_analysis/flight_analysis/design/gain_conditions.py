@@ -226,26 +226,26 @@ def split_gain(K: FloatArray) -> tuple[float, FloatArray]:
 
 
 def engineering_gains(
-    bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray
+    bandwidth: FloatArray, slew: FloatArray, factor: float, rate_limit: FloatArray, slower: FloatArray | float = 1.0
 ) -> tuple[GainSet, FloatArray]:
-    """Gains for a loop with lag, from bandwidths (rad/s) of which the last is the smallest; all arguments shape (m,).
+    """Gains for a loop with lag, from bandwidths (rad/s); all arguments shape (m,).
 
     The second result is response_i, abs(Omega_ii) in scaled inputs: 1, or less in a channel too slow for (22).
 
-        K_i = max(bandwidth_i, 1.5),  response_i = bandwidth_i / K_i      K_i response_i is the bandwidth
-        Lambda_i = bandwidth_i / 4
+        K_m = max(bandwidth_m, 1.5),  K_i = max(bandwidth_i, K_m),  response_i = bandwidth_i / K_i
+        Lambda_i = bandwidth_i / (4 slower_i)                             K_i response_i is the bandwidth
         beta_i = min(factor slew_i, 0.7 rate_limit_i) / response_i
 
     `slew` is the largest rate of the ideal control and `rate_limit` that of the actuator (infinite without one), both in
-    inputs of unit response, units of y / s^2. Raises ParameterError as `split` does, and for a factor below 1.
+    inputs of unit response, units of y / s^2. Raises ParameterError for a factor below 1.
     Source: this project; beta follows from N_d = -D U v*_dot at e = 0, see `N_d`.
     """
     require(factor >= 1.0, "factor", factor, "at least 1: beta above the slew of the ideal control")
-    K = np.maximum(bandwidth, MIN_K)
+    K = np.maximum(bandwidth, max(MIN_K, float(bandwidth[-1])))
     response = bandwidth / K
     k_g, k_d = split_gain(K)
     beta = np.maximum(np.minimum(factor * slew, MAX_BETA_TO_RATE_LIMIT * rate_limit) / response, MIN_GAIN)
-    return GainSet(k_g, k_d, bandwidth / 4.0, beta), response
+    return GainSet(k_g, k_d, bandwidth / (4.0 * slower), beta), response
 
 
 def N_d(Omega: FloatArray, v_dot: FloatArray) -> FloatArray:
@@ -265,8 +265,8 @@ def check_loop(
 
         lag product:      K_i response_i total_i <= 0.8      rad: the lag costs at most 46 degrees of phase
         Lambda below K:   Lambda_i <= 0.5 K_i response_i
-        beta above slew:  beta_i >= slew_i
-        beta below rate:  beta_i <= 0.7 rate_limit_i         if there is a limit
+        beta above slew:  beta_i >= slew_i                   shown in inputs of unit response
+        beta below rate:  beta_i <= 0.7 rate_limit_i         if there is a limit; the same
         softening:        eps_i K_i / beta_i >= total_i      softened sign: else the linear loop is unstable
         implicit: lag:    lag_i + delay <= period / 2        implicit sign: else it chatters
         implicit: omega:  omega_i >= largest_i               the same
@@ -284,8 +284,8 @@ def check_loop(
 
     add("lag product", params.K * response * total, np.full(len(total), MAX_CROSSOVER_LAG_PRODUCT), at_least=False)
     add("Lambda below K", params.Lambda, MAX_LAMBDA_TO_BANDWIDTH * params.K * response, at_least=False)
-    add("beta above slew", params.beta, slew, at_least=True)
-    add("beta below rate", params.beta, MAX_BETA_TO_RATE_LIMIT * rate_limit, at_least=False)
+    add("beta above slew", params.beta * response, slew * response, at_least=True)  # in the same inputs for every gain set
+    add("beta below rate", params.beta * response, MAX_BETA_TO_RATE_LIMIT * rate_limit * response, at_least=False)
     if params.sign is Sign.SOFT:
         add("softening", params.eps * params.K / params.beta, total, at_least=True)
     elif params.sign is Sign.IMPLICIT:

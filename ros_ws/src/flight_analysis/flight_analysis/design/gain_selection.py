@@ -34,6 +34,14 @@ from flight_analysis.design import gain_conditions
 from flight_analysis.design.airframe_properties import invariant_zeros, output_coordinates
 from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
 from flight_analysis.design.lyapunov import KnownPlant, decay_matrix
+from flight_analysis.design.requirement import NAMES as REQUIRED
+from flight_analysis.design.requirement import (
+    OBSERVER_REQUIREMENT,
+    Candidate,
+    Requirement,
+    conditions,
+    within_requirement,
+)
 from flight_core.arguments import as_instance
 from flight_core.integrators import rk4
 from flight_core.parameters import ParameterError, require
@@ -48,12 +56,15 @@ from rise_di_controller.linear_loop import Loop, is_stable
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
-CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.32, "V": 0.23}
-"""Bandwidth of a channel times the lag of its loop, rad, by output. 0.63, 0.32 and 0.23 cost 36, 18 and 13 degrees of phase at
-the crossover. Yaw has a margin for the dutch roll, speed for the engine. The softened sign, 2.75 lags wide, is an integral and
-costs a further 27 to 43 degrees: `GainAssessment.margins` has the phase margin."""
+CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46}
+"""Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search: 0.63 and 0.46 cost 36 and 26
+degrees of phase at the crossover. Yaw has a margin for the dutch roll, speed for the engine. The integral, Lambda and the slope
+of the softened sign, costs more: the search makes the integral slower, and lowers the bandwidth, until the margins meet the
+requirement."""
 
 DEFAULT_CROSSOVER_LAG_PRODUCT = 0.23  # rad, for an output that is not in CROSSOVER_LAG_PRODUCTS
+
+SOFTENING = 2.75  # 1, width of the softened sign in total lags at the begin of the search
 
 BETA_TO_SLEW = 1.25
 """beta / largest slew of the ideal control. The law needs at least 1; more than 1.5 gained nothing on the `osprey`."""
@@ -92,7 +103,7 @@ class ChannelPairing(NamedTuple):
 class LoopSetting(NamedTuple):
     """The loop that the gains are selected for, and the settings of the selection."""
 
-    base: ControllerConfig  # source of all parameters that are not selected: softening, max_age, limits
+    base: ControllerConfig  # source of all parameters that are not selected: max_age, limits
     rate: float  # Hz
     lag: Mapping[str, float]  # s, by input; 0 for an input without lag
     delay: float  # s
@@ -102,6 +113,7 @@ class LoopSetting(NamedTuple):
     crossover_lag_products: Mapping[str, float] = CROSSOVER_LAG_PRODUCTS
     inputs: tuple[str, ...] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
     feedforward: bool = False  # whether the result has the published airframe as model of a feedforward
+    requirement: Requirement = Requirement()
 
 
 class Study(NamedTuple):
@@ -143,6 +155,11 @@ class GainAssessment(NamedTuple, Generic[Controller]):
     def channel_margins(self) -> tuple[float, ...]:
         """Delay margins of the nominal aircraft with the delay in one channel alone, s; none for the literal sign."""
         return () if self.margins is None else self.margins.channel_delay
+
+    @property
+    def unmet(self) -> tuple[Condition, ...]:
+        """The margins of the requirement that the loop does not have."""
+        return tuple(condition for condition in gain_conditions.failing(self.loop) if condition.name in REQUIRED)
 
     @property
     def failing(self) -> tuple[Condition, ...]:
@@ -333,7 +350,9 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
 
     Both have the same channels (the fastest first, so that the last has the smallest K), inputs scaled by 1 / abs(Omega_ii)
     and D from the minors. The theorem's set is `theorem_gains` with Lambda = 1 1/s, which needs the smallest k_g. The other
-    one is `engineering_gains` with the slew of the nominal airframe. `omega` is the largest abs(Omega_ii) of the samples.
+    one is `engineering_gains` with the slew of the nominal airframe; behind servos, `within_requirement` makes the integral
+    slower and the bandwidth lower until the margins meet the setting's requirement, on the samples too. `omega` is the largest
+    abs(Omega_ii) of the samples.
     Raises ParameterError as `require_channels` does, and for parameters that the controller does not accept.
     """
     airframe = study.airframe
@@ -352,11 +371,11 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     D = require_channels(Omega[np.ix_(places, places)], channels)
     unit = 1.0 / np.abs(np.diag(Omega))[places]
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
-    selected = gain_conditions.engineering_gains(bandwidth[places], slew[places] / unit, setting.factor, rate_limit / unit)
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
-    def controller(gains: GainSet, response: FloatArray) -> RiseDiConfig:
+    def controller(gains: GainSet, response: FloatArray, slower: FloatArray) -> RiseDiConfig:
         scale, base_inputs = unit * response, setting.base.inputs
+        softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
         has_limits = set(channels.inputs) <= set(base_inputs)
         limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
         values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
@@ -373,18 +392,27 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "sign": "auto",
             "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
             "delay": setting.delay,
+            "softening": softening if len(set(softening)) > 1 else softening[0],
             "feedforward": None,
             "observer": None,
         }
         values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
-        chosen = RiseDiConfig.validate_mapping(values, "controller")
-        return with_feedforward(chosen, airframe) if setting.feedforward else chosen
+        return RiseDiConfig.validate_mapping(values, "controller")
+
+    def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
+        limits = slew[places] / unit, setting.factor, rate_limit / unit
+        selected = gain_conditions.engineering_gains(bandwidth[places] / lower, *limits, slower)
+        chosen = controller(*selected, slower * lower)  # both parts of the integral fall with the bandwidth
+        return Candidate(chosen, linear_loop(chosen, airframe, study.A, study.B))
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
-    literal = controller(gain_conditions.theorem_gains(bounds, ones), ones)
-    engineering = controller(*selected)
-    return Selection(study, setting, assess_gains(study, literal, setting), assess_gains(study, engineering, setting))
+    literal = controller(gain_conditions.theorem_gains(bounds, ones), ones, ones)
+    first = engineering(ones, ones)
+    behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
+    chosen = (within_requirement(engineering, setting.requirement) if behind_servos else first).controller
+    chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
+    return Selection(study, setting, assess_gains(study, literal, setting), assess_gains(study, chosen, setting))
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
@@ -440,7 +468,8 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
 
     Theorem: see `_theorem`. Loop: `check_loop` without an observer, the fraction of the samples for which the linear loop is
     stable, and its delay margin on the nominal airframe, which should be at least one period, a missed tick, or what an
-    observer requires beyond the delay. With the implicit sign the linear loop is the one inside the width of the sign,
+    observer requires beyond the delay, and the margins of the setting's requirement, 35 degrees of phase with an observer.
+    With the implicit sign the linear loop is the one inside the width of the sign,
     dt^2 omega beta. Its margin is then the delay at which chatter begins, and at most half a period. A law other than RISE-DI
     has the conditions of the linear loop alone.
     """
@@ -448,19 +477,21 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     theorem: tuple[Condition, ...] = ()
-    conditions: tuple[Condition, ...] = ()
+    of_loop: tuple[Condition, ...] = ()
     bounds = None
     if isinstance(controller, RiseDiConfig):
-        theorem, conditions, bounds = _rise_di_conditions(study, controller, setting, D)
+        theorem, of_loop, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
-        return GainAssessment(controller, theorem, conditions, bounds, None, study)
+        return GainAssessment(controller, theorem, of_loop, bounds, None, study)
     margins = loop_assessment(linear_loop(controller, study.airframe, study.A, study.B))
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
-    conditions += (Condition("linear stability", None, stable, 1.0),)
+    of_loop += (Condition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
-        least = 1.0 / controller.rate if controller.observer is None else controller.observer.margin - controller.delay
-        conditions += (Condition("delay margin", None, margins.delay, least),)
-    return GainAssessment(controller, theorem, conditions, bounds, margins, study)
+        observer, needed = controller.observer, setting.requirement
+        least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
+        needed = needed if observer is None else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+        of_loop += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))
+    return GainAssessment(controller, theorem, of_loop, bounds, margins, study)
 
 
 def _rise_di_conditions(
@@ -494,6 +525,13 @@ def _rise_di_conditions(
     limits = tuple(values / params.input_scale for values in (study.slew[columns], rate_limit))
     conditions = gain_conditions.check_loop(params, loop_of(controller), responses[0], responses.max(axis=0), *limits)
     return theorem, conditions, bounds
+
+
+def response(study: Study, controller: ControllerConfig) -> FloatArray:
+    """abs(Omega_ii) in the scaled inputs of a controller, law's order, (m,): 1, or less in a channel too slow for (22)."""
+    rows, columns = law_order(study.airframe, controller)
+    scale = getattr(controller, "input_scale", 1.0)
+    return np.asarray(np.abs(study.Omega[rows, columns]) * scale)
 
 
 def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
@@ -570,6 +608,10 @@ def yaml_template(text: str) -> Template:
 CONTROLLER_YAML = yaml_template("""\
 # Gains for the airframe {{ airframe }} {{ "beside an observer" if observed else "by the engineering procedure" }}.
 {%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
+{%- if margins %}
+
+# {{ margins }}
+{%- endif %}
 
 /**/controller:
   ros__parameters:
@@ -590,11 +632,11 @@ def as_yaml(selection: Selection) -> str:
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     controller, study = selection.engineering.controller, selection.study
     params = controller.law_params()
-    rows, columns = law_order(study.airframe, controller)
-    response = np.abs(study.Omega[rows, columns]) * controller.input_scale  # abs(Omega_ii) in the inputs of the controller
+    _, columns = law_order(study.airframe, controller)
+    responses = response(study, controller)
     K, bandwidth, slew = (
         ", ".join(f"{value:.3g}" for value in values)
-        for values in (params.K, params.K * response, study.slew[columns] / params.input_scale)
+        for values in (params.K, params.K * responses, study.slew[columns] / params.input_scale)
     )
     comments = {
         "rate": "Hz",
@@ -602,15 +644,15 @@ def as_yaml(selection: Selection) -> str:
         "inputs": "",
         "k_g": f"1/s; K = ({K}) by (22), bandwidths ({bandwidth}) rad/s",
         "k_d": "1/s",
-        "Lambda": "1/s, a quarter of the bandwidths",
+        "Lambda": "1/s, a quarter of the bandwidths, or less for the phase margin",
         "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
         "D": "signs of the leading minors of C B",
-        "input_scale": "units of u s / units of y: 1 / abs(Omega_ii), Omega = C B",
+        "input_scale": f"units of u s / units of y: {_shown_response(responses)} / abs(Omega_ii), Omega = C B",
         "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * study.uncertainty:g} %",
         "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
         "lag": "s, actuators",
         "delay": "s, beyond sampling",
-        "softening": "1, width of the softened sign in total lags",
+        "softening": "1, width of the softened sign in total lags: wider for the phase margin",
     }
     if controller.observer is not None:
         unscaled = "units of u s / units of y; for a K of (22) that is above 1"
@@ -628,9 +670,28 @@ def as_yaml(selection: Selection) -> str:
         airframe=study.airframe.name,
         observed=controller.observer is not None,
         delay_margin=selection.engineering.delay_margin,
+        margins=margins_sentence(controller, selection.engineering.margins),
         parameters=parameters,
         sections=_sections(controller, study.airframe),
     )
+
+
+def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
+    """The margins of a loop in a sentence: nominal and worst phase margins; "" without a softened sign, or unstable."""
+    implicit = isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
+    if margins is None or implicit or not margins.nominal.stable:
+        return ""
+    each = zip(margins.inputs, np.degrees(margins.nominal.phase).tolist(), strict=True)
+    phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
+    largest, damping = float(margins.nominal.sensitivity.max()), float(margins.nominal.damping)
+    worst = "" if margins.worst is None else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
+    return f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping {damping:.2f}."
+
+
+def _shown_response(responses: FloatArray) -> str:
+    """The factors of 1 / abs(Omega_ii): 1, or less in a channel that is too slow for a K of (22)."""
+    factors = [f"{value:.3g}" for value in responses]
+    return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
 
 
 def _sections(controller: RiseDiConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:

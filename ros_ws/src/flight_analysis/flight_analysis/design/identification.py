@@ -27,6 +27,7 @@ from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import with_extended_state_observer
+from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
 from flight_analysis.metrics import best_error, error_metrics
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
@@ -50,7 +51,6 @@ SPAN = 0.025  # s, length of a chord
 TANGENT_CUTOFF = 0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
 
 RATE, CONTROL_RATE, STEP = 200.0, 100.0, 0.005  # Hz, Hz, s: of y, of the law, of the integration
-SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of osprey_servo
 SAMPLES = 5  # uncertain aircraft around the identified one: only the largest response of them is used
 DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of transport
 
@@ -248,6 +248,7 @@ def identify(
     observer_margin: float | None = None,
     *,
     guided: bool = False,
+    needed: Requirement = REQUIREMENT,
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
@@ -255,7 +256,8 @@ def identify(
     and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
     f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control
     and gives beta; that of V is K Lambda times the rms of light turbulence. With `observer_margin`, the delay margin in s of
-    the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. 6. Simulations of the result:
+    the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. The margins of that loop meet
+    `needed`, with 35 degrees of phase beside an observer. 6. Simulations of the result:
     in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by
     90 degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft
     whose `sideslip_zero` is positive, too.
@@ -285,7 +287,7 @@ def identify(
     gain_selection.require_channels(scaled, ChannelPairing(outputs, inputs))
     studied = _study(condition, measured.Omega, commands)
     V_bandwidth = airspeed_bandwidth(float(authority), float(measured.lag[throttle]))
-    setting = _setting(trim, measured.lag, V_bandwidth)
+    setting = _setting(trim, measured.lag, V_bandwidth)._replace(requirement=needed)
 
     def scenario_text(selection: Selection) -> str:
         return _text(condition, trim, measured, commands, selection, stall)
@@ -328,7 +330,9 @@ def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Se
     rows = [list(OUTPUTS).index(name) for name in controller.outputs]
     columns = [list(INPUTS).index(name) for name in controller.inputs]
     size = sizes(OUTPUTS[name] for name in controller.outputs)
-    observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin)
+    needed = selection.setting.requirement
+    needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
+    observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed)
     return selection._replace(engineering=gain_selection.assess_gains(selection.study, observed.controller, selection.setting))
 
 
@@ -395,7 +399,7 @@ def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
     base = RiseDiConfig.validate_mapping(
         dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
         | {"rate": CONTROL_RATE, "outputs": list(OUTPUTS), "inputs": inputs, "k_g": 1.0, "k_d": ones[1:]}
-        | {"D": [1] * len(inputs), "sign": "auto", "lag": lag.tolist(), "delay": DELAY, "softening": SOFTENING}
+        | {"D": [1] * len(inputs), "sign": "auto", "lag": lag.tolist(), "delay": DELAY, "softening": gain_selection.SOFTENING}
         | {"max_age": 0.1, "hold": 0.5, "ramp": 2.0, "lower": trim.lower.tolist(), "upper": trim.upper.tolist()},
         "controller",
     )

@@ -3,10 +3,12 @@
 """Observer selection: the sections feedforward and observer of a controller, and the gains of the law beside it.
 
 `with_aircraft_observer` takes the model of an airframe, `with_extended_state_observer` Omega and the lags alone. Both give a
-controller whose nominal linear loop has a delay margin: while it has less, `effort` is raised and K is lowered in the channel
-in which that gains most, and the disturbances of the extended-state observer are taken as slower.
+controller whose nominal linear loop has a delay margin and meets a requirement on phase, gain, sensitivity and damping. Until
+then `effort` is raised, and K and the integral are lowered, in the channel in which that gains most, and the disturbances of
+the extended-state observer are taken as slower.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.turbulence import MODERATE, dryden
+from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
     ExtendedStateWeights,
@@ -27,21 +30,25 @@ from flight_analysis.closed_loop.margins import law_order, loop_of
 from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
+from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, Requirement, least_fraction
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import gain
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law, spectral_radius
+from rise_di_controller.margins import loop_margins
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 RELAXATION = 1.05
-"""Factor by which `effort` rises, and K falls, in a step of the search for the delay margin."""
+"""Factor by which `effort` rises, and K and the integral fall, in a step of the search for the margins."""
 
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
 
+
+WORST_OF, WORST_UNCERTAINTY, WORST_SEED = 50, 0.3, 1  # uncertain aircraft whose least phase margin counts
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
 
@@ -105,7 +112,9 @@ class SelectedObserver(NamedTuple):
 
     controller: RiseDiConfig
     delay_margin: float  # s, of the nominal linear loop, the declared delay included
-    relaxation: FloatArray  # (m,) factors by which the search for the margin raised `effort` and lowered K; 1: not at all
+    phase_margin: float  # rad, the least of the nominal linear loop
+    fraction: float  # the least of what is found over what is needed
+    relaxation: FloatArray  # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
 
 
 def with_aircraft_observer(
@@ -114,11 +123,12 @@ def with_aircraft_observer(
     gains: ObserverGains,
     noise: FloatArray,
     margin: float,
+    needed: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
-    Raises ParameterError for an airframe with another D or without a wind, one that a feedforward refuses, and for a delay
-    margin that no relaxation reaches.
+    The phase margin is also that of WORST_OF uncertain aircraft. Raises ParameterError for an airframe with another D or
+    without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
     require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
     rows, columns = law_order(airframe, controller)
@@ -132,7 +142,9 @@ def with_aircraft_observer(
         effort = slower * gains.weights.effort
         return aircraft_observer(model, names, gains.weights._replace(effort=effort))
 
-    return _within_margin(base, model, LinearPlant(model.A + model.gravity, model.B, model.C), gains, design, margin)
+    A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF, WORST_SEED)
+    plant = LinearPlant(A + model.gravity, B[:, :, columns], model.C)
+    return _within_margin(base, model, plant, gains, design, margin, needed)
 
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
@@ -164,7 +176,12 @@ def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> Feedfor
 
 
 def with_extended_state_observer(
-    controller: RiseDiConfig, Omega: FloatArray, noise: FloatArray, size: FloatArray, margin: float
+    controller: RiseDiConfig,
+    Omega: FloatArray,
+    noise: FloatArray,
+    size: FloatArray,
+    margin: float,
+    needed: Requirement = OBSERVER_REQUIREMENT,
 ) -> SelectedObserver:
     """The controller with an observer from Omega and lags alone: no A, no f, no wind. Its gains stay, but for the margin.
 
@@ -207,7 +224,7 @@ def with_extended_state_observer(
         changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
         return extended_state_observer(model, names, changed)
 
-    return _within_margin(base, model, LinearPlant(none, Omega, eye), gains, design, margin)
+    return _within_margin(base, model, LinearPlant(none[None], Omega[None], eye), gains, design, margin, needed)
 
 
 def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) -> None:
@@ -225,24 +242,45 @@ def _within_margin(
     gains: ObserverGains,
     design: Callable[[FloatArray], ObserverDesign],
     margin: float,
+    needed: Requirement,
 ) -> SelectedObserver:
-    """The first relaxation with the delay margin: steps in the channel that gains most, or in all where none gains."""
-    loop = Loop(model.lag, 0.0, model.period)  # the margin counts the declared delay too
-    m = len(model.lag)
+    """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
+
+    The plant is the nominal aircraft, then uncertain aircraft: the channel with the least phase margin of these is next.
+    """
+    loop = Loop(model.lag, 0.0, model.period)  # the delay margin counts the declared delay too
+    m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
 
     def relaxed(relaxation: FloatArray) -> SelectedObserver:
         controller = _parameters(base, model, gains, design(relaxation), relaxation)
-        found = delay_margin(plant, linear_law(controller.tuned_law(), m, model.period), loop)
-        return SelectedObserver(controller, found, relaxation)
+        law = linear_law(controller.tuned_law(), m, model.period)
+        delay, margins = delay_margin(nominal, law, loop), loop_margins(nominal, law, loop_of(controller))
+        of_delay = delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
+        return SelectedObserver(
+            controller, delay, float(margins.phase.min()), min(of_delay, least_fraction(margins, needed)), relaxation
+        )
+
+    def worst_phases(controller: RiseDiConfig) -> FloatArray:
+        law, uncertain = linear_law(controller.tuned_law(), m, model.period), plant._replace(A=plant.A[1:], B=plant.B[1:])
+        return np.asarray(loop_margins(uncertain, law, loop_of(controller)).phase.min(axis=0, initial=math.inf))
+
+    def stepped(channel: int) -> SelectedObserver:
+        return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])
 
     selected = relaxed(np.ones(m))
-    while selected.delay_margin < margin + RESOLUTION:
+    while True:
         if selected.relaxation.max() > MAX_RELAXATION:
-            found = f"at most {1e3 * selected.delay_margin:.0f} ms of delay"
-            raise ParameterError(f"--margin: found {found}, expected less than {1e3 * margin:g} ms")
-        each = [relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel]) for channel in range(m)]
-        best = max(each, key=lambda one: one.delay_margin)
-        selected = best if best.delay_margin > selected.delay_margin else relaxed(selected.relaxation * RELAXATION)
+            phase = np.degrees(selected.phase_margin)
+            found = f"at most {1e3 * selected.delay_margin:.0f} ms of delay and {phase:.0f} deg of phase"
+            expected = f"less than {1e3 * margin:g} ms and {np.degrees(needed.phase):.0f} deg"
+            raise ParameterError(f"--margin: found {found}, expected {expected}")
+        if selected.fraction < 1.0:
+            best = max((stepped(channel) for channel in range(m)), key=lambda candidate: candidate.fraction)
+            selected = best if best.fraction > selected.fraction else relaxed(selected.relaxation * RELAXATION)
+        elif (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
+            selected = stepped(int(np.argmin(worst)))
+        else:
+            break
     checked = selected.controller.model_dump()
     checked["observer"]["margin"] = margin
     return selected._replace(controller=RiseDiConfig.validate_mapping(checked, "controller"))
@@ -263,9 +301,9 @@ def _parameters(
     changes: dict[str, Any] = {
         "k_g": k_g,
         "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
-        "Lambda": tuple(gains.Lambda.tolist()),
+        "Lambda": tuple((gains.Lambda / relaxation).tolist()),
         "beta": tuple((gains.beta / relaxation / share).tolist()),
-        "softening": tuple(gains.softening.tolist()),
+        "softening": tuple((gains.softening * relaxation).tolist()),
         "input_scale": tuple((model.input_scale * share).tolist()),
         "omega": tuple(share.tolist()),
         "sign": "soft",
