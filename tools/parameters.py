@@ -96,7 +96,8 @@ def _type(annotation: Any) -> str:
 
 def _bounds(rules: Mapping[str, Any]) -> str:
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    return ", ".join(f"{sign} {rules[name]:g}" for name, sign in signs.items() if name in rules)
+    shown = signs if "ge" not in rules else {name: sign for name, sign in signs.items() if name != "gt"}
+    return ", ".join(f"{sign} {rules[name]:g}" for name, sign in shown.items() if name in rules)
 
 
 def _value(default: object) -> str:

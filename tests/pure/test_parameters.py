@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.builders import aircraft_parameters
+from tools.parameters import page
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
@@ -72,8 +73,20 @@ BAD = {
         "reference_model.pulses.V.start: found 0 values, expected at least 1 value"
     ),
     ("natural_frequency: [4.0,", "natural_frequency: [1.0e+200,"): (
-        "reference_model.second_order: found an A_m that is not finite, expected frequencies and dampings whose"
+        "natural_frequency[0]: found 1e+200, expected less than or equal to 1000000000"
     ),
+    # Values that take hours to integrate, or overflow in the law.
+    ("step: 0.002", "step: 1.0e-9"): "aircraft.step: found 1e-09, expected greater than or equal to 1e-05",
+    ("k_g: 1.0", "k_g: 1.0e+308"): "controller.k_g: found 1e+308, expected less than or equal to 1000000000",
+    ("omega: [1.0,", "omega: [5.0e-324,"): "controller.omega[0]: found 5e-324, expected greater than or equal to 1e-09",
+    (
+        "input_scale: [0.0178096,",
+        "input_scale: [5.0e-324,",
+    ): "controller.input_scale[0]: found 5e-324, expected greater",
+    (
+        "speed: 10.12",
+        "speed: 1.0e+308",
+    ): "aircraft.gusts.vertical.speed: found 1e+308, expected less than or equal to 1000000000",
 }
 
 
@@ -258,3 +271,14 @@ def test_output_that_cannot_be_written_is_one_sentence() -> None:
         with pytest.raises(ParameterError) as rejected, writing(key, path, "the path of a file"):
             Path(path).write_text("")
         assert str(rejected.value) == f"{place} cannot be written (No such file or directory), expected the path of a file"
+
+
+WITHOUT_END = {f"`actuators.{key}`" for key in ("lower", "upper", "rate", "stuck_at", "lost_at")}  # .inf: no limit, or never
+
+
+def test_each_numeric_key_has_bounds() -> None:
+    """The page of parameters states a lower and an upper bound of each number."""
+    rows = [[cell.strip() for cell in line.split("|")[1:5]] for line in page().splitlines() if line.startswith("| `")]
+    numbers = {key: bounds for key, kind, _, bounds in rows if kind in {"number", "list of number"}}
+    assert len(numbers) > 100
+    assert {key for key, bounds in numbers.items() if not (">" in bounds and "<" in bounds)} == WITHOUT_END

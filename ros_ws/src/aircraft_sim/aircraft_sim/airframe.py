@@ -17,7 +17,7 @@ from aircraft_sim.disturbance import AXES
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
-from flight_core.parameters import Config, Names, Numbers, Positive, require
+from flight_core.parameters import Config, Names, Number, Numbers, Positive, require
 from flight_core.units import quantity, si_per_unit
 from flight_core.vectors import FloatArray
 
@@ -41,7 +41,7 @@ class Gravity(Config):
 
     into: str = Field(description="the state whose derivative it adds to")
     angle: str = Field(description="the angle, a state")
-    gain: float = Field(description="the gain, SI")
+    gain: Number = Field(description="the gain, SI")
 
 
 class Product(Config):
@@ -49,7 +49,7 @@ class Product(Config):
 
     into: str = Field(description="the state whose derivative it adds to")
     product: Names = Field(description="two states")
-    gain: float = Field(description="the gain, SI")
+    gain: Number = Field(description="the gain, SI")
 
 
 class Airframe(Config):

@@ -19,10 +19,12 @@ from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filte
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
 from flight_core.fields import Field
-from flight_core.parameters import Config, NodeConfig, NonNegative, Numbers, ParameterError, Positive, require
+from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numbers, ParameterError, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+
+SHORTEST_STEP = 1e-5  # s: 100,000 integrations a second of flight, which take about as long as 5 s
 
 
 class AircraftChannels(NamedTuple):
@@ -37,19 +39,19 @@ class AircraftChannels(NamedTuple):
 class Gust(Config):
     """A 1-cosine gust."""
 
-    start: float = Field(ge=0, description="the instant of entry, s")
-    speed: float = Field(description="the peak speed U_ds, m/s")
+    start: NonNegative = Field(description="the instant of entry, s")
+    speed: Number = Field(description="the peak speed U_ds, m/s")
     length: Positive = Field(description="the distance H from entry to peak, m")
 
 
 class TurbulenceConfig(Config):
     """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high altitude."""
 
-    altitude: float = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
-    wind: float | None = Field(
-        default=None, ge=0, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
+    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
+    wind: NonNegative | None = Field(
+        default=None, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
     )
-    sigma: float | None = Field(default=None, ge=0, description="the intensity at high altitude: standard deviation, m/s")
+    sigma: NonNegative | None = Field(default=None, description="the intensity at high altitude: standard deviation, m/s")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
     def _check(self) -> None:
@@ -65,17 +67,17 @@ class TurbulenceConfig(Config):
 class BiasConfig(Config):
     """A bias on x_dot of a state: a rise from 0 to the value along half a cosine, or a step with rise 0."""
 
-    start: float = Field(ge=0, description="the instant at which it begins, s")
-    value: float = Field(description="the final value, SI unit of the state per s")
-    rise: float = Field(ge=0, description="the rise time, s; 0 is a step, which lies outside the theorem")
+    start: NonNegative = Field(description="the instant at which it begins, s")
+    value: Number = Field(description="the final value, SI unit of the state per s")
+    rise: NonNegative = Field(description="the rise time, s; 0 is a step, which lies outside the theorem")
 
 
 class SineConfig(Config):
     """A sine on x_dot of a state: amplitude sin(frequency t + phase)."""
 
-    amplitude: float = Field(description="the amplitude, SI unit of the state per s")
+    amplitude: Number = Field(description="the amplitude, SI unit of the state per s")
     frequency: Positive = Field(description="the frequency, rad/s")
-    phase: float = Field(default=0.0, description="the phase, rad")
+    phase: Number = Field(default=0.0, description="the phase, rad")
 
 
 class UncertaintyConfig(Config):
@@ -92,11 +94,11 @@ class UncertaintyConfig(Config):
 
 
 # One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
-NonNegativesOrNone = tuple[Annotated[float, Field(ge=0)], ...]
+NonNegativesOrNone = tuple[NonNegative, ...]
 Lower = tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...]
 Upper = tuple[Annotated[float, Field(ge=0, allow_inf_nan=True)], ...]
 Rates = tuple[Annotated[float, Field(gt=0, allow_inf_nan=True)], ...]
-NumbersOrNone = tuple[float, ...]
+NumbersOrNone = tuple[Number, ...]
 Times = Upper  # from 0 on, .inf for never
 
 
@@ -141,7 +143,9 @@ class AircraftConfig(NodeConfig):
         default=None, description="of an aircraft of JSBSim: the altitude above sea level of its trim, m"
     )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
-    step: Annotated[float, Field(gt=0, le=1)] = Field(description="the integration step, s; a whole fraction of 1 / rate")
+    step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
+        description="the integration step, s; a whole fraction of 1 / rate"
+    )
     start_time: float = Field(
         default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
     )

@@ -13,7 +13,7 @@ from autopilot_bridge.channel_map import PATH, Line, to_raw
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
-from flight_core.parameters import Config, NodeConfig, NonNegative, Numbers, Positive, require
+from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
@@ -53,7 +53,7 @@ class Row(Config):
     frame: str = Field(description="the frame and the unit of the raw value, as a note for the reader")
     sign: Literal[-1, 1] = Field(description="+1, or -1 where the channel decreases for an increasing raw value")
     scale: Positive = Field(description="units of the channel (SI, radians) per unit of the raw value")
-    offset: float = Field(description="the value of the channel at raw = 0, SI")
+    offset: Number = Field(description="the value of the channel at raw = 0, SI")
     source: str = Field(min_length=1, description="where the row is from")
 
     @property
@@ -106,9 +106,9 @@ class InputRow(MovingRow):
     """A channel of u, the deviation from trim: message and field of its setpoint. trim + u = sign scale raw + offset."""
 
     message: str = Field(description="the message with the field, one of `messages`")
-    trim: float = Field(description="the command in trim, to which u is added, SI; a row of `trims` replaces it")
-    lower: Annotated[float, Field(le=0)] = Field(description="the lower limit of u around trim, SI")
-    upper: Annotated[float, Field(ge=0)] = Field(description="the upper limit of u around trim, SI")
+    trim: Number = Field(description="the command in trim, to which u is added, SI; a row of `trims` replaces it")
+    lower: Annotated[Number, Field(le=0)] = Field(description="the lower limit of u around trim, SI")
+    upper: NonNegative = Field(description="the upper limit of u around trim, SI")
     range: Range = Field(description="the lowest and the highest raw value of the field")
     neutral: float | Literal["trim"] = Field(description="failsafe: the raw value that is sent when u has timed out, or trim")
     release: Raw | None = Field(
@@ -157,8 +157,8 @@ class ConditionRow(WatchedRow):
 class OverrideRow(WatchedRow):
     """A pilot override: the bridge disengages at once where the field is beyond the threshold."""
 
-    above: float | None = Field(default=None, description="the override is active where the field is above this")
-    below: float | None = Field(default=None, description="the override is active where the field is below this")
+    above: Number | None = Field(default=None, description="the override is active where the field is above this")
+    below: Number | None = Field(default=None, description="the override is active where the field is below this")
     moved: Positive | None = Field(
         default=None, description="the override is active where the field has moved by more than this since engagement"
     )

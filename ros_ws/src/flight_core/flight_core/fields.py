@@ -76,8 +76,8 @@ LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = MappingProxyType(
     {
         "le": (operator.le, "less than or equal to"),
         "lt": (operator.lt, "less than"),
-        "ge": (operator.ge, "greater than or equal to"),
         "gt": (operator.gt, "greater than"),
+        "ge": (operator.ge, "greater than or equal to"),
     }
 )
 """Comparison and words of each limit of a number."""

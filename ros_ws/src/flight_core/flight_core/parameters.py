@@ -183,15 +183,18 @@ class NodeConfig(Config):
         return frozenset()
 
 
-Numbers = Annotated[tuple[float, ...], Field(min_length=1)]
-Positives = Annotated[tuple[Annotated[float, Field(gt=0)], ...], Field(min_length=1)]
+SMALLEST, LARGEST = 1e-9, 1e9
+"""Bounds of a quantity in SI units. A value beyond is an error of units, and overflows in products and quotients of the law."""
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+Numbers = Annotated[tuple[Number, ...], Field(min_length=1)]
+Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each above 0."""
-NonNegatives = Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1)]
+NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
 Signs = Annotated[tuple[int, ...], Field(min_length=1)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
 
 
 def require(condition: bool, key: str, found: object, expected: str) -> None:

@@ -16,6 +16,7 @@ from flight_core.parameters import (
     Names,
     NodeConfig,
     NonNegative,
+    Number,
     Numbers,
     Positive,
     Positives,
@@ -67,7 +68,7 @@ class RouteConfig(Config):
     north: Numbers = Field(description="m")
     east: Numbers = Field(description="m")
     altitude: Numbers = Field(description="m, as `pose` counts it")
-    V: tuple[Annotated[float, Field(gt=0)], ...] = Field(
+    V: tuple[Positive, ...] = Field(
         default=(), description="airspeed on the way to each waypoint, m/s; the trim speed where left out"
     )
 
@@ -102,9 +103,9 @@ class ZoneConfig(Config):
 class HomeConfig(Config):
     """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose by choice."""
 
-    north: float = Field(default=0.0, description="m")
-    east: float = Field(default=0.0, description="m")
-    altitude: float | None = Field(default=None, description="m; none: the altitude of then")
+    north: Number = Field(default=0.0, description="m")
+    east: Number = Field(default=0.0, description="m")
+    altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
     after_loss: bool = Field(default=False, description="fly home when pose returns after a loss; else level the wings")
 
 
@@ -133,8 +134,8 @@ class GuidanceConfig(NodeConfig):
     speed_limit: Positive | None = Field(
         default=None, description="largest airspeed, m/s, such as V_ne as a true airspeed; none: 1.4 V0"
     )
-    ceiling: float | None = Field(default=None, description="largest altitude, m, as `pose` counts it; none: no bound")
-    altitude_floor: float | None = Field(default=None, description="least altitude, m, as `pose` counts it; none: no bound")
+    ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose` counts it; none: no bound")
+    altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose` counts it; none: no bound")
     wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
 
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(

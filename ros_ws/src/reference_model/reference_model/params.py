@@ -13,6 +13,7 @@ from flight_core.parameters import (
     Config,
     Names,
     NodeConfig,
+    Number,
     Numbers,
     ParameterError,
     Positive,
@@ -43,9 +44,9 @@ class Pulses(Config):
 class Sine(Config):
     """A sine on a channel: amplitude sin(frequency t + phase)."""
 
-    amplitude: float = Field(description="the amplitude, in the channel's unit")
+    amplitude: Number = Field(description="the amplitude, in the channel's unit")
     frequency: Positive = Field(description="the frequency, rad/s")
-    phase: float = Field(default=0.0, description="the phase, rad")
+    phase: Number = Field(default=0.0, description="the phase, rad")
 
 
 class CoordinatedTurn(Config):

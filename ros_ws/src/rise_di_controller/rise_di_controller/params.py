@@ -19,6 +19,7 @@ from flight_core.parameters import (
     Config,
     Names,
     NodeConfig,
+    NonNegative,
     NonNegatives,
     Numbers,
     ParameterError,
@@ -125,7 +126,7 @@ class ControllerConfig(NodeConfig):
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
     lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
-    delay: Annotated[float, Field(ge=0)] = Field(description="pure delay from y to the actuators in addition to sampling, s")
+    delay: NonNegative = Field(description="pure delay from y to the actuators in addition to sampling, s")
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u then takes to ramp to trim, s")

@@ -3,7 +3,7 @@
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -32,9 +32,7 @@ class RiseDiConfig(ControllerConfig):
     """The controller under RISE dynamic inversion, the paper's law."""
 
     k_g: Positive = Field(description="k_g of equation (22), 1/s")
-    k_d: tuple[Annotated[float, Field(gt=0)], ...] = Field(
-        description="k_d of equation (22), one per channel except the last, 1/s"
-    )
+    k_d: tuple[Positive, ...] = Field(description="k_d of equation (22), one per channel except the last, 1/s")
     Lambda: Positives = Field(description="the diagonal of Lambda (4), 1/s")
     beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
     omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
