@@ -9,6 +9,7 @@ import os
 import runpy
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ from typing import Any, TypeVar
 import pytest
 import typer
 import yaml
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import KeyValue
 from tests import launch_stand_in as stand_in
 from tests.conftest import REPOSITORY
@@ -240,11 +242,52 @@ def test_node_that_is_not_ready_in_time_named(tmp_path: Path) -> None:
     assert warn.function(context) == []
 
 
-def test_flight_ends_after_duration_and_in_lockstep_when_aircraft_completes_it(tmp_path: Path) -> None:
+def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
+    """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
+    context.ros_node.subscriptions["/recorded"](Time(sec=int(instant), nanosec=round(instant % 1.0 * 1e9)))
+    return context.handle(actions)
+
+
+def test_flight_ends_once_log_holds_it(tmp_path: Path) -> None:
+    actions, context = started("fly", duration=5, runs=tmp_path)
+    follow = all_ready(actions, context)
+    start = overrides(nodes(follow)["reference_model"])["start_time"]
+    assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # the half second in which nodes discover each other
+    assert not any(ends(timer.actions) for timer in every(TimerAction, follow))
+    assert not flown_to(context, follow, start + 4.9)
+    flown = flown_to(context, follow, start + 5.0)
+    assert ends(flown)
+    (leave,) = every(OpaqueFunction, flown)
+    leave.function(context)
+    assert (next(tmp_path.glob("*-osprey_gust")) / "outcome").read_text(encoding="utf-8") == "completed"
+
+
+@pytest.mark.parametrize(
+    ("states", "reason"),
+    [
+        ({}, "never flew: aircraft, reference_model not ready after 20 s"),
+        ({"aircraft": "ready"}, "never flew: reference_model not ready after 20 s"),
+        ({"aircraft": "ready", "reference_model": "ready"}, "never flew: y did not reach the controller"),
+        ({"aircraft": "ready", "reference_model": "ready", "flying": "flying"}, ""),
+    ],
+)
+def test_flight_without_u_at_aircraft_never_flew(states: dict[str, str], reason: str, tmp_path: Path) -> None:
+    actions, context = started("fly", duration=5, runs=tmp_path)
+    follow = all_ready(actions, context)
+    timers = every(TimerAction, follow)[:1]
+    for name, state in states.items():
+        timers += every(TimerAction, publish(follow, context, f"/{'aircraft' if state == 'flying' else name}#{PID}", state))
+    checks = [check for timer in timers for check in every(OpaqueFunction, timer.actions)]
+    if not reason:
+        assert [check.function(context) for check in checks] == [None, None]
+        return
+    with pytest.raises(RuntimeError, match=reason):
+        [check.function(context) for check in checks]
+    assert (next(tmp_path.glob("*-osprey_gust")) / "outcome").read_text(encoding="utf-8").startswith(reason)
+
+
+def test_lockstep_flight_ends_when_aircraft_completes_it(tmp_path: Path) -> None:
     follow = all_ready(*started("fly", duration=5, runs=tmp_path))
-    (timer,) = every(TimerAction, follow)
-    assert timer.period == pytest.approx(5.5, abs=0.4)  # and the half second in which nodes discover each other
-    assert ends(timer.actions)
     assert {"start_time"} == overrides(nodes(follow)["reference_model"]).keys() - {"lockstep"}
 
     actions, context = started("fly", lockstep="true", duration=5, runs=tmp_path)

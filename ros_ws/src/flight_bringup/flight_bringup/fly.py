@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
-from flight_bringup.processes import READY_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
+from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 POLL_PERIOD = 0.05  # s, of the progress bar
 NUMBER = re.compile(r"-?\d+(\.\d+)?(e[-+]\d+)?")  # in a reason: "q is 0.30 s old"
 
-FIRST_U = 5.0  # s, from the time at which each node is ready to the first u that the aircraft takes
-LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
 STAMP_ERROR = 1e-5  # s, of a time of day as a float
 
 STALL_TIMEOUT = 40.0

@@ -46,6 +46,8 @@ CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host o
 READY_TIMEOUT = 20.0  # s
 DISCOVERY_TIME = 0.5  # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
+FIRST_U = 5.0  # s, from the time at which each node is ready to the first u that the aircraft takes
+LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
 POLL_PERIOD = 0.005  # s, while nodes start
 
 
@@ -64,6 +66,12 @@ def handle_signals(handler: Any) -> Iterator[None]:
     finally:
         for number, previous in before.items():
             signal.signal(number, previous)
+
+
+def leave_outcome(run: Path, outcome: str) -> None:
+    """Leave the outcome of a flight for the recorder. A full disk costs the log the outcome alone."""
+    with suppress(OSError, ParameterError):
+        write_file(run / OUTCOME_FILE, outcome)
 
 
 class NotReadyError(ParameterError):
@@ -210,16 +218,11 @@ class FlightProcesses:
         line = next((line for line in reversed(lines) if "waiting for" in line or "refused" in line), "")
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 
-    def _leave_outcome(self) -> None:
-        """Leave the outcome for the recorder. A full disk costs the log the outcome alone."""
-        with suppress(OSError, ParameterError):
-            write_file(self._run / OUTCOME_FILE, self.outcome)
-
     def stop(self) -> None:
         """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT."""
         with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it would truncate the log
             if self.processes:
-                self._leave_outcome()
+                leave_outcome(self._run, self.outcome)
             for recorder, timeout in ((False, STOP_TIMEOUT), (True, CLOSE_TIMEOUT)):
                 deadline = time.monotonic() + timeout
                 group = [process for process in self.processes if (process.node in {RECORDER, ONE_PROCESS}) is recorder]

@@ -3,7 +3,8 @@
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_gust.
 
 The same graph and the same scenario file as `rise-di fly`. The flight begins once recorder and controller are ready. It ends
-after the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a node ends.
+once the log holds the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a
+node ends, is not ready, or when no u reaches the aircraft.
 """
 
 import math
@@ -21,6 +22,7 @@ from flight_bringup.launch.stages import (
     BOOLEAN,
     argument,
     complete,
+    complete_when_flown,
     end_with_launch,
     flight_node,
     namespace_argument,
@@ -74,11 +76,14 @@ def _fly(context: LaunchContext) -> list[Action]:
         return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
+        nodes, duration = second_stage(scenario), scenario.flight.duration
         if lockstep:
-            end: Action = on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))
-        else:
-            end = TimerAction(period=lead + scenario.flight.duration, actions=complete(run))
-        return [end, *(node(spec, start_time) for spec in second_stage(scenario))]
+            end: list[Action] = [on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))]
+        elif scenario.controller.autostart and scenario.controller.start_active:
+            end = complete_when_flown(context, run, nodes, start_time, duration, by_rosbag2=by_rosbag2)
+        else:  # somebody activates the controller, or nobody
+            end = [TimerAction(period=lead + duration, actions=complete(run))]
+        return [*end, *(node(spec, start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     actions = watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in first}, follow)

@@ -153,6 +153,8 @@ class FlightNode(Node, Generic[P]):
         if now_ns < log_ns:
             return
         cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else "no publisher"
+        if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
+            cause = refused
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:

@@ -70,6 +70,15 @@ class Refusals:
         else:
             self._node.get_logger().warning(f"{subscription.name}: sample refused: {sentence}")
 
+    def since(self, subscription: PolledSubscription, begin_ns: int) -> str:
+        """The last refusal of a topic since an instant of the monotonic clock, with age and count; empty without one."""
+        refused_ns, sentence = self.last.get(subscription.name, (0, ""))
+        if not sentence or refused_ns < begin_ns:
+            return ""
+        count = sum(n for key, n in self.counts.items() if key.startswith(f"{subscription.topic.name}: "))
+        age = (time.monotonic_ns() - refused_ns) / NANOSECONDS
+        return f"{count} samples refused, the last {age:.1f} s ago: {sentence}"
+
     def conflict(self) -> str:
         """The last sample of a conflicting publisher since the last call, as a sentence; empty without a conflict."""
         sentence, self._conflict = self._conflict, ""

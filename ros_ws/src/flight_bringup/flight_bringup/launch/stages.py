@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import psutil
 from diagnostic_msgs.msg import KeyValue
@@ -29,13 +30,15 @@ from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
-from flight_bringup.graph import NodeSpec, start_instant, start_lead
-from flight_bringup.processes import READY_TIMEOUT, end_with_parent
+from flight_bringup.graph import AIRCRAFT, NodeSpec, start_instant, start_lead
+from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
 from flight_bringup.scenarios import scenarios
+from flight_core.outcome import COMPLETED, NEVER_FLEW
+from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
 from flight_ros import transport
-from flight_ros.topics import FLIGHT, NODE_STATE, STATES, NodeState
+from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, STATES, NodeState, U
 from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
@@ -50,6 +53,12 @@ class NodeStateEvent(Event):
     def __init__(self, node: str, state: str) -> None:
         self.node = node  # fully qualified name
         self.state = state
+
+
+class FlownEvent(Event):
+    """The flight has reached its end."""
+
+    name = "flight_bringup.FlownEvent"
 
 
 def scenario_argument(default: str, otherwise: str = "") -> DeclareLaunchArgument:
@@ -179,9 +188,72 @@ def start_in_stages(
     return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=warn)])]
 
 
+def complete_when_flown(
+    context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], start_time: float, duration: float, *, by_rosbag2: bool
+) -> list[Action]:
+    """End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end.
+
+    A node of the second stage that is not ready, and an aircraft that takes no u, end the launch with exit status 1.
+    """
+    waiting, flying, end_ns = dict.fromkeys(nodes), [], nanoseconds(start_time + duration)
+
+    def remaining(after: float) -> float:
+        return max(start_time - time.time(), 0.0) + after
+
+    def ready(spec: NodeSpec) -> Sequence[Action]:
+        del waiting[spec]
+        return [] if waiting else [TimerAction(period=remaining(FIRST_U), actions=[OpaqueFunction(function=require_flight)])]
+
+    def fly() -> Sequence[Action]:
+        flying.append(True)
+        return []
+
+    def require_ready(context: LaunchContext) -> None:
+        if waiting and not context.is_shutdown:
+            end(f"{', '.join(spec.executable for spec in waiting)} not ready after {READY_TIMEOUT:g} s")
+
+    def require_flight(context: LaunchContext) -> None:
+        if not flying and not context.is_shutdown:
+            end(
+                "y did not reach the controller, or u did not reach the aircraft; the lines of the nodes say what they wait for"
+            )
+
+    def end(reason: str) -> None:
+        leave_outcome(run, f"{NEVER_FLEW}: {reason}")
+        raise RuntimeError(f"{NEVER_FLEW}: {reason}")
+
+    def give_up(context: LaunchContext) -> list[Action]:
+        return [] if context.is_shutdown else complete(run, "flight completed, and the log does not hold the end")
+
+    def receive(message: Any) -> None:
+        stamp = message.header.stamp if by_rosbag2 else message
+        if stamp.sec * NANOSECONDS + stamp.nanosec >= end_ns and not context.is_shutdown:
+            context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent())
+
+    topic, qos = (U, NEWEST_SAMPLES) if by_rosbag2 else (RECORDED, LOCKSTEP)
+    get_ros_node(context).create_subscription(topic.type, f"{_namespace(context)}/{topic.name}", receive, qos)
+    flown = EventHandler(
+        matcher=lambda event: isinstance(event, FlownEvent),
+        entities=[OpaqueFunction(function=lambda context: complete(run))],
+        handle_once=True,
+    )
+    return [
+        RegisterEventHandler(flown),
+        *(on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in nodes),
+        on_state(context, AIRCRAFT, NodeState.FLYING, fly),
+        TimerAction(period=remaining(READY_TIMEOUT), actions=[OpaqueFunction(function=require_ready)]),
+        TimerAction(period=remaining(duration + 2.0 * LOG_TIMEOUT), actions=[OpaqueFunction(function=give_up)]),
+    ]
+
+
 def complete(run: Path, reason: str = "flight completed") -> list[Action]:
-    """The actions at the end of a flight of full duration."""
-    return [LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"), Shutdown(reason=reason)]
+    """The actions at the end of a flight of full duration. The recorder closes the log with the outcome."""
+    leave = OpaqueFunction(function=lambda context: leave_outcome(run, COMPLETED))
+    return [
+        leave,
+        LogInfo(msg=f"{reason}; now: ros2 run flight_cli rise-di report {shlex.quote(str(run))}"),
+        Shutdown(reason=reason),
+    ]
 
 
 def _subscribe_states(context: LaunchContext) -> None:
