@@ -42,7 +42,7 @@ from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.modes import TARGETS as MODE_TARGETS
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.route_file import READERS, Origin, read_route
+from flight_guidance.route_file import ENDINGS, Origin, read_route_file
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback
@@ -161,10 +161,10 @@ def message(data: bytes, folder: Path) -> None:
 
 def route(data: bytes, folder: Path) -> None:
     """A route file, by each reader."""
-    for ending in READERS:
+    for ending in ENDINGS:
         path = folder / f"route{ending}"
         path.write_bytes(data)
-        rejected(lambda path=path: read_route(path, Origin(47.4, 8.5)))  # type: ignore[misc]  # bound in the loop
+        rejected(lambda path=path: read_route_file(path, Origin(47.4, 8.5), 30.0, 5.0))  # type: ignore[misc]  # bound in the loop
 
 
 def targets(data: bytes, folder: Path) -> None:

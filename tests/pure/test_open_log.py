@@ -124,7 +124,7 @@ def test_file_that_is_no_log_is_named(command: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_path_without_log_is_told_with_what_is_there(command: str, recorded: Path, tmp_path: Path) -> None:
+def test_path_without_log_names_its_content(command: str, recorded: Path, tmp_path: Path) -> None:
     assert refusal(command, str(tmp_path / "nowhere")).startswith(f"{tmp_path}/nowhere: found no such file or folder")
     assert refusal(command, str(tmp_path)).startswith(f"{tmp_path}: found no .mcap file, expected")
     (tmp_path / "a.ulg").write_bytes(FOREIGN_FILES["ULog"][0])
@@ -133,7 +133,7 @@ def test_path_without_log_is_told_with_what_is_there(command: str, recorded: Pat
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"play", "repair"}))
-def test_log_without_flight_is_told_with_its_topics(command: str, messages: list[Recorded], tmp_path: Path) -> None:
+def test_log_without_flight_names_its_topics(command: str, messages: list[Recorded], tmp_path: Path) -> None:
     text = STORE.types["std_msgs/msg/String"]("a")
     chatter = [Recorded("/chatter", EPOCH, EPOCH, bytes(STORE.serialize_cdr(text, "std_msgs/msg/String")))]
     schema = ("std_msgs/msg/String", "ros2msg", b"string data")
@@ -181,7 +181,7 @@ def test_report_of_foreign_bag_by_command(messages: list[Recorded], figures: dic
     assert f"{TICKS} ticks, every bit equal" in result.output
 
 
-def test_topics_that_cannot_be_played_are_skipped_and_named(messages: list[Recorded], tmp_path: Path) -> None:
+def test_topics_without_cdr_are_skipped(messages: list[Recorded], tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag", messages, beside=foreign_topics)
     playback = read_playback(tmp_path / "bag")
     assert playback.skipped == {"/log": "foxglove.Log in json", "/bare": "no type"}
@@ -202,7 +202,7 @@ MISSING = "bag_1.mcap: named in metadata.yaml and missing"
         (["bag_0.mcap", "", "bag_2.mcap"], False, "bag_1.mcap: a number between those there and missing"),
     ],
 )
-def test_missing_part_of_bag_is_named_also_after_repair(
+def test_missing_part_stays_named_after_repair(
     names: list[str], metadata: bool, note: str, messages: list[Recorded], tmp_path: Path
 ) -> None:
     bag = tmp_path / "bag"
@@ -236,21 +236,21 @@ def test_single_file_is_repaired_alone(messages: list[Recorded], tmp_path: Path)
         repair(tmp_path)
 
 
-def test_truncated_packed_file_is_read_up_to_its_end(messages: list[Recorded], tmp_path: Path) -> None:
+def test_truncated_packed_file_read_to_end(messages: list[Recorded], tmp_path: Path) -> None:
     packed(tmp_path / "bag", messages, ".zstd", zstandard.compress, part=0.95)
     tape = read_run(tmp_path / "bag").tape
     assert 0.0 < float(tape.time("y")[-1]) < 1.95
     assert any("truncated" in note for note in tape.notes)
 
 
-def test_part_of_bag_in_empty_file_is_noted(messages: list[Recorded], tmp_path: Path) -> None:
+def test_empty_part_of_bag_is_noted(messages: list[Recorded], tmp_path: Path) -> None:
     """As a recorder leaves it that was killed right after a split."""
     split(tmp_path / "bag", messages, ["bag_0.mcap", "bag_1.mcap", "bag_2.mcap"])
     (tmp_path / "bag" / "bag_2.mcap").write_bytes(b"")
     assert any(note.startswith("bag_2.mcap is truncated") for note in read_run(tmp_path / "bag").tape.notes)
 
 
-def test_damaged_database_is_refused_or_read_in_part(messages: list[Recorded], tmp_path: Path) -> None:
+def test_damaged_database_refused_or_partly_read(messages: list[Recorded], tmp_path: Path) -> None:
     WHOLE["rosbags_sqlite3_plain"](tmp_path / "bag", messages)
     (file,) = (tmp_path / "bag").glob("*.db3")
     content = file.read_bytes()
@@ -274,7 +274,7 @@ def test_database_in_folder_of_any_name(name: str, messages: list[Recorded], tmp
     assert len(read_run(tmp_path / name).tape["internals"].stamp_ns) == TICKS
 
 
-def test_bag_packed_beside_plain_file_is_read_once(messages: list[Recorded], tmp_path: Path) -> None:
+def test_plain_file_replaces_packed_file_beside(messages: list[Recorded], tmp_path: Path) -> None:
     file = write_mcap(tmp_path / "bag", messages)
     file.with_name("bag_0.mcap.zstd").write_bytes(zstandard.compress(file.read_bytes()))
     assert len(read_run(tmp_path / "bag").tape["internals"].stamp_ns) == TICKS
@@ -290,7 +290,7 @@ def test_rosbags_reads_what_the_generator_writes(messages: list[Recorded], tmp_p
             assert reader.message_count == len(messages)
 
 
-def test_log_in_recording_is_watched_before_its_first_topic(tmp_path: Path) -> None:
+def test_log_in_recording_watched_before_topics(tmp_path: Path) -> None:
     file = tmp_path / "run_0.mcap"
     file.write_bytes(b"\x89MCAP0\r\n")
     with file.open("rb") as stream:

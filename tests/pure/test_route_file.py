@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Route files: WGS84 against pymap3d, and what each format holds or may not hold."""
 
+import io
 import json
 import math
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,16 @@ import pytest
 from pymap3d.vincenty import vdist
 
 from flight_core.parameters import ParameterError
-from flight_guidance.route_file import FLATTENING, MAX_DISTANCE, SEMI_MAJOR, Origin, Waypoint, local, read_route
+from flight_guidance.route_file import (
+    FLATTENING,
+    MAX_DISTANCE,
+    SEMI_MAJOR,
+    Origin,
+    Waypoint,
+    local,
+    read_route,
+    read_route_file,
+)
 
 pytestmark = pytest.mark.package("flight_guidance")
 
@@ -110,13 +121,158 @@ def test_points_beside_line_ignored(tmp_path: Path) -> None:
     assert len(read_route(marked, ZURICH)) == len(SQUARE)
 
 
+def gpx(body: str, head: str = "") -> str:
+    return f'<?xml version="1.0"?>{head}<gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1">{body}</gpx>'
+
+
+def gpx_points(kind: str) -> str:
+    return "".join(f'<{kind} lat="{lat}" lon="{lon}"><ele>{h}</ele></{kind}>' for lon, lat, h in SQUARE)
+
+
+RTE, TRK, WPT = (gpx_points(kind) for kind in ("rtept", "trkpt", "wpt"))
+
+
+def mission_item(latitude: float, longitude: float, altitude: float, frame: int = 3, command: int = 16) -> dict[str, Any]:
+    params = [0, 0, 0, None, latitude, longitude, altitude]
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": params}
+
+
+def plan(items: list[dict[str, Any]], home: Any = (47.4, 8.5, 400.0), **more: Any) -> dict[str, Any]:
+    return {"fileType": "Plan", "mission": {"items": items, "plannedHomePosition": list(home)}} | more
+
+
+def wpl(*rows: tuple[float, ...]) -> str:
+    """Rows of frame, command, latitude, longitude, altitude, after the home at 400 m."""
+    lines = [(0, 16, 47.4, 8.5, 400.0), *rows]
+    texts = [f"{k}\t0\t{frame}\t{command}\t0\t0\t0\t0\t{a}\t{b}\t{c}\t1" for k, (frame, command, a, b, c) in enumerate(lines)]
+    return "\r\n".join(["QGC WPL 110", *texts, ""])
+
+
+def zipped(**files: str) -> bytes:
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, content in files.items():
+            opened.writestr(name.replace("_", "."), content)
+    return archive.getvalue()
+
+
+TRACK = "<gx:Track xmlns:gx='http://www.google.com/kml/ext/2.2'><altitudeMode>absolute</altitudeMode>" + "".join(
+    f"<when>2026-01-01T00:00:0{k}Z</when><gx:coord>{lon} {lat} {h}</gx:coord>" for k, (lon, lat, h) in enumerate(SQUARE)
+)
+RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("r.geojson", {"type": "MultiLineString", "coordinates": [SQUARE]}),
+        ("r.geojson", {"type": "MultiPoint", "coordinates": SQUARE}),
+        ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE]}),
+        ("r.geojson", {"type": "GeometryCollection", "geometries": [line()]}),
+        ("r.geojson", {"features": [{"type": "Feature", "geometry": None}, point([8.5, 47.4]), {"geometry": line()}]}),
+        ("r.geojson", line([SQUARE[0], *SQUARE])),  # a double click
+        ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}}),
+        ("r.kml", kml(f"<Placemark><MultiGeometry>{RING}</MultiGeometry></Placemark>{KML_POINTS}")),
+        ("r.kml", kml(f"<Polygon><outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>")),
+        ("r.kml", kml(f"<Placemark>{TRACK}</gx:Track></Placemark>{KML_POINTS}")),
+        ("r.kml", kml(KML_LINE.replace(",", ", "))),
+        ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),
+        ("r.kmz", zipped(route_kml=kml(KML_LINE))),
+        ("r.gpx", gpx(f"{WPT}<rte>{RTE}</rte><trk><trkseg>{TRK}</trkseg></trk>")),
+        ("r.gpx", gpx(f"<trk><trkseg>{TRK}</trkseg><trkseg/></trk>")),
+        ("r.gpx", gpx(WPT)),
+        ("r.plan", plan([mission_item(lat, lon, h) for lon, lat, h in SQUARE])),
+        ("r.json", plan([mission_item(lat, lon, h + 400.0, frame=0) for lon, lat, h in SQUARE])),
+        ("r.waypoints", wpl(*((3, 16, lat, lon, h) for lon, lat, h in SQUARE))),
+        ("r.txt", wpl(*((0, 16, lat, lon, h + 400.0) for lon, lat, h in SQUARE))),
+    ],
+)
+def test_files_of_other_programs_hold_same_route(name: str, content: Any, tmp_path: Path) -> None:
+    if isinstance(content, bytes):
+        (tmp_path / name).write_bytes(content)
+        assert [waypoint[:3] for waypoint in read_route(tmp_path / name, ZURICH)] == ROUTE
+    else:
+        assert flown(tmp_path / name, content) == ROUTE
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "heights"),
+    [
+        ("r.geojson", line([place[:2] for place in SQUARE]), [30.0, 30.0, 30.0]),
+        ("r.kml", kml(KML_LINE, mode=""), [30.0, 30.0, 30.0]),  # a path of Google Earth: clampToGround
+        ("r.kml", kml(KML_LINE, mode="<altitudeMode>relativeToGround</altitudeMode>"), [530.0, 580.0, 630.5]),
+        ("r.plan", plan([mission_item(lat, lon, h) for lon, lat, h in SQUARE]), [530.0, 580.0, 630.5]),
+    ],
+)
+def test_altitude_option_fills_what_file_lacks(name: str, content: Any, heights: list[float], tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    assert [waypoint.altitude for waypoint in read_route_file(path, ZURICH, 30.0).waypoints] == heights
+
+
+def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
+    """The home is 400 m above the sea; its place is the origin where no origin is given."""
+    path = tmp_path / "r.waypoints"
+    path.write_text(wpl((3, 16, 47.4, 8.52, 50.0), (0, 16, 47.42, 8.52, 500.0)), encoding="utf-8")
+    assert [waypoint.altitude for waypoint in read_route_file(path, above_sea=True).waypoints] == [450.0, 500.0]
+    assert [waypoint.altitude for waypoint in read_route_file(path).waypoints] == [50.0, 100.0]
+    assert read_route(path)[0].point == pytest.approx(PLACES[1], abs=1e-6)
+    # The altitude of the home as the aircraft counts, where nothing else of the flight is known.
+    assert [waypoint.altitude for waypoint in read_route_file(path, ZURICH, 7.0, above_sea=None).waypoints] == [57.0, 107.0]
+    with pytest.raises(ParameterError, match=r"found an altitude above the home, expected --altitude"):
+        read_route_file(path, ZURICH, above_sea=None)
+    with pytest.raises(ParameterError, match="expected an origin"):
+        read_route_file(path, None, 7.0, above_sea=None)
+
+
+def test_unflown_items_of_mission_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "r.waypoints"
+    rows = [(3, 22, 0.0, 0.0, 50.0), (3, 16, 47.4, 8.52, 50.0), (3, 18, 47.42, 8.52, 60.0), (2, 177, 0.0, 0.0, 0.0)]
+    path.write_text(wpl(*rows), encoding="utf-8")
+    route = read_route_file(path)
+    assert [waypoint.altitude for waypoint in route.waypoints] == [50.0, 60.0]
+    assert route.notes == (
+        "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 4)",
+        "flown as waypoints, without the wait: NAV_LOITER_TURNS (item 3)",
+    )
+
+
+def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
+    """RFC 7946, section 3.1.9: a line over the antimeridian is cut there."""
+    parts = [[[179.99, 0.0, 1.0], [180.0, 0.0, 1.0]], [[-180.0, 0.0, 1.0], [-179.99, 0.0, 1.0]]]
+    (tmp_path / "r.geojson").write_text(json.dumps({"type": "MultiLineString", "coordinates": parts}), encoding="utf-8")
+    waypoints = read_route(tmp_path / "r.geojson", Origin(0.0, 180.0))
+    assert [round(waypoint.east) for waypoint in waypoints] == [-1113, 1113]  # 0.01 deg of the equator
+
+
+def test_track_is_thinned_within_tolerance(tmp_path: Path) -> None:
+    """A track of positions 20 m apart, beside two lines by up to 4 m, is two lines within 5 m."""
+    north = [(20.0 * k, 4.0 * math.sin(k), 100.0) for k in range(51)]
+    east = [(1000.0, 20.0 * k, 100.0) for k in range(1, 51)]
+    path = tmp_path / "r.yaml"
+    path.write_text(json.dumps({"route": [*north, *east]}), encoding="utf-8")
+    route = read_route_file(path, simplify=5.0)
+    assert [waypoint.point for waypoint in route.waypoints] == [
+        (0.0, 0.0),
+        pytest.approx((1000.0, 0.0), abs=5.0),
+        (1000.0, 1000.0),
+    ]
+    assert route.notes == ("3 of 101 positions: the others are within 5 m of the line",)
+
+
+def test_archive_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "r.kmz").write_bytes(zipped(doc_kml=" " * 10_000_000))
+    with pytest.raises(ParameterError, match=r"doc\.kml: found more than \d+ bytes"):
+        read_route(tmp_path / "r.kmz", ZURICH)
+
+
 ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
 
 
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
-        ("r.gpx", "", r"route: found the file .*r\.gpx, expected one that ends in \.geojson, \.json, \.kml, \.yaml, \.yml"),
+        ("r.abc", "", r"route: found the file .*r\.abc, expected one that ends in \.geojson, \.json, \.kml, .*\.yaml, \.yml"),
         ("r.yaml", "route: [[0, 0]]", r"route\[0\]: found \[0, 0\], expected \[north, east, altitude\], "),
         ("r.yaml", "route: [[0, 0, .nan]]", r"route\[0\]\.altitude: found nan, expected a finite number"),
         ("r.yaml", "route: [[0, true, 1]]", r"route\[0\]\.east: found True, expected a finite number"),
@@ -133,10 +289,48 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
             line([[-171.5, -47.4, 500.0]]),
             r"route\[0\]: found a position on the other half of the Earth, expected one near",
         ),
-        ("r.geojson", line([[47.4, 8.5, 500.0]]), r"route\[0\]: found 49\d\d km from the origin"),
+        ("r.geojson", line([[47.4, 8.5, 500.0]]), "found latitude and longitude exchanged, by the origin"),
         ("r.geojson", line([[8.5, 147.4, 1.0]]), r"route\[0\]\.latitude: found 147\.4, expected .* from -90 to 90"),
         ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or Points alone"),
-        ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE]}, "found no LineString and no Point, expected a route"),
+        ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE, SQUARE]}, "found 2 Polygons, expected one, or Points alone"),
+        (
+            "r.geojson",
+            {"type": "Curve", "coordinates": SQUARE},
+            "no Point, but 1 geometry of the type 'Curve'",
+        ),
+        ("r.geojson", {"features": [line(), {"type": "Curve"}]}, "found 1 LineString and 1 geometry of the type 'Curve'"),
+        ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::2056"}}}, "the coordinate system 'urn:"),
+        ("r.kml", kml("<NetworkLink/>"), "found no LineString and no Point, but 1 NetworkLink"),
+        ("r.kml", kml(KML_LINE + KML_LINE), "found 2 LineStrings, expected one, or Points alone"),
+        ("r.gpx", gpx("<rte>" + RTE + "</rte><rte>" + RTE + "</rte>"), "found 2 rte, expected one"),
+        ("r.gpx", gpx("<trk><trkseg>" + TRK + "</trkseg><trkseg>" + TRK + "</trkseg></trk>"), "found 2 trkseg, expected one"),
+        ("r.gpx", gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'), r"route\[0\]: found a rtept without ele, .* --altitude"),
+        ("r.gpx", gpx(""), "found no rte, no trk and no wpt"),
+        ("r.gpx", gpx("<rte>&a;</rte>", head=ENTITY), "found a document type, expected the XML of a GPX"),
+        ("r.plan", {"fileType": "Plan"}, "found no mission with items"),
+        (
+            "r.plan",
+            plan([mission_item(47.4, 8.5, 9.0, frame=10)]),
+            "the frame 10, above the ground, expected 0 or 3",
+        ),
+        (
+            "r.plan",
+            plan([{"type": "ComplexItem", "complexItemType": "survey"}]),
+            "found a 'survey', expected waypoints",
+        ),
+        (
+            "r.plan",
+            plan([{"type": "SimpleItem", "frame": 3, "command": 16, "params": ["x"]}]),
+            "expected frame, command and seven",
+        ),
+        (
+            "r.plan",
+            plan([mission_item(47.4, 8.5, 500.0, frame=0)], home=[47.4, 8.5]),
+            "an altitude above the sea, expected that of",
+        ),
+        ("r.waypoints", "hello", "found 'hello', expected QGC WPL 110 in the first line"),
+        ("r.txt", "QGC WPL 110\n0 1 2\n", "line 2: found '0 1 2', expected 12 numbers"),
+        ("r.kmz", "hello", "cannot be unpacked .*, expected a KMZ archive"),
         ("r.kml", "<kml>", r"r\.kml: found no element found.*, expected the XML of a KML file"),
         ("r.kml", kml(KML_LINE, mode=""), "found a LineString with the altitudeMode 'clampToGround', expected absolute"),
         ("r.kml", kml("<Point><coordinates>a,b,c</coordinates></Point>"), r"route\[0\]\.latitude: found 'b'"),

@@ -16,16 +16,16 @@ from flight_bringup.graph import Autopilot, find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     flight_progress,
-    parse_numbers,
     print_json,
     show_flight,
 )
+from flight_cli.route_options import Altitude, Simplify, read_waypoints
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.outcome import exit_status
 from flight_core.parameters import ParameterError, require
-from flight_guidance.route_file import Origin, read_route
+from flight_guidance.route_file import ENDINGS
 
 
 def fly(
@@ -46,11 +46,14 @@ def fly(
         ),
     ] = None,
     route: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Fly a route: .geojson, .kml or .yaml. Guidance starts with it.")
+        Path | None, typer.Option(metavar="FILE", help=f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.")
     ] = None,
     origin: Annotated[
-        str | None, typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees.")
+        str | None,
+        typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees; else the file's home."),
     ] = None,
+    altitude: Altitude = None,
+    simplify: Simplify = 0.0,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
@@ -69,9 +72,11 @@ def fly(
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
+    for option, value in (("--origin", origin), ("--altitude", altitude), ("--simplify", simplify or None)):
+        require(value is None or route is not None, option, "no --route", "the file of a route: --route FILE")
     if route is not None:
-        chosen = with_route(chosen, read_route(route, parse_origin(origin)))
-    require(origin is None or route is not None, "--origin", "no --route", "the file of a route: --route FILE")
+        waypoints = read_waypoints(route, origin, altitude, simplify, above_sea=chosen.aircraft.is_jsbsim)
+        chosen = with_route(chosen, waypoints)
     _require_flyable(chosen, autopilot, in_process=in_process)
     run = new_run(chosen, runs)
     if route is not None:
@@ -125,13 +130,3 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
         require_signs(autopilot.channel_map, scenario)
         require_limits(autopilot, scenario)
-
-
-def parse_origin(text: str | None) -> Origin | None:
-    """The origin of a route, from "47.38,8.54"."""
-    if text is None:
-        return None
-    numbers = parse_numbers(text)
-    fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
-    require(fits, "--origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
-    return Origin(*numbers)

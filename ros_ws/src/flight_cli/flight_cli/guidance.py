@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flight_cli.fly import parse_origin
+from flight_cli.route_options import Altitude, Simplify, read_waypoints
 from flight_core.parameters import ParameterError
-from flight_guidance.route_file import read_route
 
 if TYPE_CHECKING:
     from flight_guidance.client import GuidanceClient
@@ -62,10 +61,12 @@ def home(namespace: Namespace = "") -> None:
 def route(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Route file, as of `rise-di fly --route`.")],
     origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for FILE.")] = None,
+    altitude: Altitude = None,
+    simplify: Simplify = 0.0,
     namespace: Namespace = "",
 ) -> None:
     """Fly a route from its first leg on. An airspeed of a waypoint is refused: the topic has none."""
-    waypoints = read_route(file, parse_origin(origin))
+    waypoints = read_waypoints(file, origin, altitude, simplify, above_sea=None)
     for k, waypoint in enumerate(waypoints):
         if waypoint.speed is not None:
             raise ParameterError(f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di target V=VALUE")

@@ -1,23 +1,24 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Route files: GeoJSON, KML and YAML as waypoints in the local tangent plane.
+"""Route files as waypoints in the local tangent plane; `route_formats` reads the formats with latitudes and longitudes.
 
-GeoJSON (RFC 7946) and KML (OGC 12-007r2) hold longitude and latitude in degrees of WGS84, and altitude in m. A single
-LineString is the route; without a LineString the Points are, in the order of the file. A YAML file holds the list `route` of
-[north, east, altitude], [north, east, altitude, V] or {latitude: ..., longitude: ..., altitude: ..., V: ...}.
+A YAML file holds the list `route` of [north, east, altitude], [north, east, altitude, V] or
+{latitude: ..., longitude: ..., altitude: ..., V: ...}.
 """
 
-import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree.ElementTree import ParseError, TreeBuilder, XMLParser
+
+import numpy as np
 
 from flight_core.fields import short_repr
 from flight_core.files import parse_yaml, read_file
 from flight_core.parameters import ParameterError, require
+from flight_guidance import route_formats
 from flight_guidance.path import Point
+from flight_guidance.route_formats import FORMATS, Above, Home, Place
 
 SEMI_MAJOR, FLATTENING = 6378137.0, 1.0 / 298.257223563
 """a in m and f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""
@@ -40,6 +41,13 @@ class Waypoint(NamedTuple):
         return self.north, self.east
 
 
+class RouteFile(NamedTuple):
+    """The content of a route file."""
+
+    waypoints: tuple[Waypoint, ...]
+    notes: tuple[str, ...]  # sentences on what of the file is not flown
+
+
 class Origin(NamedTuple):
     """Where north = east = 0."""
 
@@ -48,8 +56,6 @@ class Origin(NamedTuple):
 
 
 GEODETIC = ("latitude", "longitude", "altitude", "V")  # keys of a waypoint of a YAML file
-
-Place = tuple[str, Any, Any, Any, Any]  # key in the file, latitude and longitude in deg, altitude, V: not validated yet
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
@@ -80,16 +86,119 @@ def _meridian(latitude: float) -> tuple[float, float]:
     return normal * math.cos(latitude), normal * (1.0 - e_squared) * math.sin(latitude)
 
 
-def read_route(path: Path, origin: Origin | None = None) -> tuple[Waypoint, ...]:
-    """The waypoints of a route file, by the ending: .geojson or .json, .kml, .yaml or .yml.
+YAML = (".yaml", ".yml")
+ENDINGS = (*FORMATS, *YAML)
 
-    Latitudes and longitudes are turned to north and east of the origin. Raises ParameterError for an unreadable file, a
-    value missing or out of range, and latitudes without an origin.
+
+def read_route(path: Path, origin: Origin | None = None) -> tuple[Waypoint, ...]:
+    """The waypoints of a route file. Raises as `read_route_file`."""
+    return read_route_file(path, origin).waypoints
+
+
+def read_route_file(
+    path: Path,
+    origin: Origin | None = None,
+    altitude: float | None = None,
+    simplify: float = 0.0,
+    *,
+    above_sea: bool | None = False,
+) -> RouteFile:
+    """The waypoints of a route file, by the ending: one of ENDINGS.
+
+    Latitudes and longitudes are turned to north and east of the origin, by default the home in the file. `altitude` is the
+    height in m to fly at where the file has none, and the height of the ground or of the home where the file counts from
+    there. `above_sea`: the altitudes of `pose` count from the sea, else from the start, which is the home in the file; None
+    where that is not known, nor the start. Equal successive positions are one waypoint. Waypoints within `simplify` in m of the
+    line without them are left out. Raises ParameterError for an unreadable file, a geometry that is no route, a value missing
+    or out of range, and latitudes without an origin.
     """
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ParameterError(f"route: found the file {path}, expected one that ends in {', '.join(READERS)}")
-    return tuple(reader(read_file(path, str(path), "a route file"), str(path), origin))
+    suffix = path.suffix.lower()
+    require(suffix in ENDINGS, "route", f"the file {path}", f"one that ends in {', '.join(ENDINGS)}")
+    content = read_file(path, str(path), "a route file")
+    if suffix in YAML:
+        waypoints, notes = list(_read_yaml(content, str(path), origin)), list[str]()
+    else:
+        route = route_formats.read(content, str(path), suffix)
+        home, notes = route.home, list(route.notes)
+        if origin is None and home is not None and above_sea is not None:
+            origin = Origin(home.latitude, home.longitude)
+        _require_order(route.places, origin)
+        heights = _Heights(altitude, home, above_sea=above_sea)
+        waypoints = [_placed(place, origin, heights) for place in route.places]
+        waypoints = [waypoint for k, waypoint in enumerate(waypoints) if k == 0 or waypoint[:3] != waypoints[k - 1][:3]]
+    if simplify > 0.0:
+        kept = thinned(waypoints, simplify)
+        notes.append(f"{len(kept)} of {len(waypoints)} positions: the others are within {simplify:g} m of the line")
+        waypoints = kept
+    return RouteFile(tuple(waypoints), tuple(notes))
+
+
+def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
+    """The waypoints without those within a distance in m of the line between the rest.
+
+    Source: Douglas and Peucker (1973), Algorithms for the reduction of the number of points required to represent a line.
+    """
+    points = np.array([waypoint[:3] for waypoint in waypoints])
+    kept, spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    while spans:
+        first, last = spans.pop()
+        if last - first < 2:
+            continue
+        start, along = points[first], points[last] - points[first]
+        inside = points[first + 1 : last] - start
+        share = np.clip(inside @ along / max(float(along @ along), np.finfo(float).tiny), 0.0, 1.0)
+        distance = np.linalg.norm(inside - share[:, None] * along, axis=1)
+        farthest = first + 1 + int(np.argmax(distance))
+        if distance.max() > tolerance:
+            kept.add(farthest)
+            spans += [(first, farthest), (farthest, last)]
+    return [waypoints[k] for k in sorted(kept)]
+
+
+class _Heights:
+    """Turns the altitude of a place to the altitude of `pose`."""
+
+    def __init__(self, given: float | None = None, home: Home | None = None, *, above_sea: bool | None = None) -> None:
+        self._given, self._sea = given, None if home is None else home.altitude
+        self._zero = given  # altitude of the home, as `pose` counts
+        if given is None and above_sea is not None:
+            self._zero = self._sea if above_sea else 0.0
+        self._above_sea = above_sea
+
+    def of(self, place: Place) -> Any:
+        """The altitude in m, not validated yet. Raises ParameterError where the file does not tell."""
+        altitude, above = place.altitude, place.above
+        if above is Above.AS_POSE or altitude is None:
+            return self._given if altitude is None else altitude
+        altitude = _number(place.key, altitude, "altitude")
+        if above is Above.GROUND:
+            way_out = "absolute, or --altitude with the height of the ground: that is not known"
+            require(self._given is not None, place.key, place.found, way_out)
+            return altitude + (self._given or 0.0)
+        if above is Above.SEA and self._above_sea:
+            return altitude
+        found = f"an altitude above the {above.name.lower()}"
+        require(above is Above.HOME or self._sea is not None, place.key, found, "that of the home in the file")
+        require(self._zero is not None, place.key, found, "--altitude with that of the home, as the aircraft counts")
+        return altitude + (self._zero or 0.0) - (self._sea or 0.0) * (above is Above.SEA)
+
+
+def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
+    """Raise ParameterError where places are near the origin with latitude and longitude exchanged alone."""
+    if origin is None:
+        return
+    numbers = [(place.latitude, place.longitude) for place in places]
+    if not all(isinstance(value, int | float) and math.isfinite(value) for pair in numbers for value in pair):
+        return
+    exchanged = [(longitude, latitude) for latitude, longitude in numbers]
+    near, near_exchanged = (all(_is_near(*pair, origin) for pair in pairs) for pairs in (numbers, exchanged))
+    found = "latitude and longitude exchanged, by the origin"
+    require(near or not near_exchanged, places[0].key, found, "longitude first in GeoJSON and KML, latitude first in --origin")
+
+
+def _is_near(latitude: float, longitude: float, origin: Origin) -> bool:
+    inside = abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and _is_above(latitude, longitude, origin)
+    return inside and math.hypot(*local(latitude, longitude, origin)) <= MAX_DISTANCE
 
 
 def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypoint]:
@@ -102,7 +211,7 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
             unknown = sorted(map(str, set(point) - set(GEODETIC)))
             require(not unknown, name, f"the keys {short_repr(unknown)}", "latitude, longitude, altitude and perhaps V")
             latitude, longitude, altitude, speed = (point.get(each) for each in GEODETIC)
-            yield _placed((name, latitude, longitude, altitude, speed), origin)
+            yield _placed(Place(name, latitude, longitude, altitude, speed), origin, _Heights())
         else:
             fits = isinstance(point, list) and 3 <= len(point) <= 4
             require(fits, name, short_repr(point), "[north, east, altitude], [north, east, altitude, V] or a mapping")
@@ -110,95 +219,15 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
             yield _waypoint(name, _number(name, north, "north"), _number(name, east, "east"), altitude, *speed)
 
 
-def _read_geojson(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypoint]:
-    try:
-        tree = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise ParameterError(f"{key}: not valid JSON ({error}), expected a route file") from None
-    features = _member(tree, "features")
-    lines: list[list[Any]] = []  # positions with V
-    points: list[Any] = []
-    for feature in features if isinstance(features, list) else [tree]:
-        geometry, speed = _member(feature, "geometry") or feature, _member(_member(feature, "properties"), "V")
-        kind, coordinates = _member(geometry, "type"), _member(geometry, "coordinates")
-        if kind == "LineString" and isinstance(coordinates, list):
-            lines.append([(position, speed) for position in coordinates])
-        elif kind == "Point":
-            points.append((coordinates, speed))
-    for k, (position, speed) in enumerate(_only_line(key, lines, points)):
-        yield _placed(_lon_lat(f"route[{k}]", position, speed), origin)
-
-
-def _member(tree: Any, name: str) -> Any:
-    """A member of a JSON object; None of anything else."""
-    return tree.get(name) if isinstance(tree, Mapping) else None
-
-
-class _NoDoctype(TreeBuilder):
-    """Refuses a document type, the only place of entity declarations: no entity is ever expanded or fetched."""
-
-    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise ParseError("a document type")
-
-
-def _read_kml(content: bytes, key: str, origin: Origin | None) -> Iterator[Waypoint]:
-    parser = XMLParser(target=_NoDoctype())  # noqa: S314 - without a document type there is nothing to expand
-    try:
-        parser.feed(content)
-        root = parser.close()
-    except (ParseError, ValueError, LookupError) as error:  # the last two: of an encoding
-        raise ParameterError(f"{key}: found {error}, expected the XML of a KML file") from None
-    lines: list[list[Any]] = []  # positions
-    points: list[Any] = []
-    kinds = [(str(element.tag).rpartition("}")[2], element) for element in root.iter()]
-    used = "LineString" if any(kind == "LineString" for kind, _ in kinds) else "Point"
-    for kind, geometry in kinds:
-        if kind != used:
-            continue
-        texts = {str(child.tag).rpartition("}")[2]: child.text or "" for child in geometry}
-        mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
-        found = f"a {kind} with the altitudeMode {short_repr(mode)}"
-        require(mode == "absolute", key, found, "absolute, for the height of the ground is not known")
-        tuples = [text.split(",") for text in texts.get("coordinates", "").split()]
-        if kind == "LineString":
-            lines.append(tuples)
-        else:
-            require(len(tuples) == 1, key, f"a Point with {len(tuples)} positions", "one")
-            points += tuples
-    for k, position in enumerate(_only_line(key, lines, points)):
-        yield _placed(_lon_lat(f"route[{k}]", list(map(_parsed, position))), origin)
-
-
-def _parsed(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _lon_lat(key: str, position: Any, speed: Any = None) -> Place:
-    """A position of GeoJSON or KML."""
-    fits = isinstance(position, list) and len(position) == 3
-    require(fits, key, short_repr(position), "longitude, latitude, altitude")
-    longitude, latitude, altitude = position
-    return key, latitude, longitude, altitude, speed
-
-
-def _only_line(key: str, lines: list[list[Any]], points: list[Any]) -> list[Any]:
-    """The positions of the line; of the points where there is none."""
-    require(len(lines) <= 1, key, f"{len(lines)} LineStrings", "one, or Points alone")
-    places = lines[0] if lines else points
-    require(bool(places), key, "no LineString and no Point", "a route")
-    return places
-
-
-def _placed(place: Place, origin: Origin | None) -> Waypoint:
-    key, latitude, longitude, altitude, speed = place
+def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
+    key, altitude = place.key, heights.of(place)
+    if altitude is None and place.found:
+        raise ParameterError(f"{key}: found {place.found}, expected longitude, latitude, altitude, or --altitude to fly at")
     if origin is None:
         raise ParameterError(f"{key}: found a latitude and a longitude, expected an origin, where north and east are 0")
-    degrees = (_number(key, latitude, "latitude", 90.0), _number(key, longitude, "longitude", 180.0))
+    degrees = (_number(key, place.latitude, "latitude", 90.0), _number(key, place.longitude, "longitude", 180.0))
     require(_is_above(*degrees, origin), key, "a position on the other half of the Earth", "one near the origin")
-    return _waypoint(key, *local(*degrees, origin), altitude, speed)
+    return _waypoint(key, *local(*degrees, origin), altitude, place.speed)
 
 
 def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = None) -> Waypoint:
@@ -217,12 +246,3 @@ def _number(key: str, value: Any, name: str, largest: float = 1e9) -> float:
     expected = "a finite number" + (f" from {-largest:g} to {largest:g}" if largest < 1e9 else "")
     require(fits, f"{key}.{name}", "nothing" if value is None else short_repr(value), expected)
     return float(value)
-
-
-READERS: Mapping[str, Callable[[bytes, str, Origin | None], Iterator[Waypoint]]] = {
-    ".geojson": _read_geojson,
-    ".json": _read_geojson,
-    ".kml": _read_kml,
-    ".yaml": _read_yaml,
-    ".yml": _read_yaml,
-}

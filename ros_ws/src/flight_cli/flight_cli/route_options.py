@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The options of the commands that read a route file."""
+
+import math
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flight_cli.output import parse_numbers
+from flight_core.parameters import require
+from flight_guidance.route_file import Origin, Waypoint, read_route_file
+
+Altitude = Annotated[
+    float | None, typer.Option(help="Altitude of a route without, or of the ground or home that it counts from, m.")
+]
+Simplify = Annotated[
+    float, typer.Option(min=0.0, help="Leave out positions of a route within this distance of the line without them, m.")
+]
+
+
+def read_waypoints(
+    file: Path, origin: str | None, altitude: float | None, simplify: float, *, above_sea: bool | None
+) -> tuple[Waypoint, ...]:
+    """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as `read_route_file`."""
+    require(altitude is None or math.isfinite(altitude), "--altitude", altitude, "a number")
+    require(math.isfinite(simplify), "--simplify", simplify, "a number")
+    route = read_route_file(file, parse_origin(origin), altitude, simplify, above_sea=above_sea)
+    for note in route.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return route.waypoints
+
+
+def parse_origin(text: str | None) -> Origin | None:
+    """The origin of a route, from "47.38,8.54"."""
+    if text is None:
+        return None
+    numbers = parse_numbers(text)
+    fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
+    require(fits, "--origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
+    return Origin(*numbers)

@@ -1,0 +1,429 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Formats of routes with latitudes and longitudes of WGS84: GeoJSON, KML, KMZ, GPX, plans of QGroundControl, QGC WPL 110.
+
+A file holds one route: a line, or points in the order of the file. What else a file holds is refused, or named in a note.
+Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl guide, Plan File Format; MAVLink guide, File
+Formats and MAV_FRAME.
+"""
+
+import io
+import json
+import re
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import Enum
+from types import MappingProxyType
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
+
+from flight_core.fields import short_repr
+from flight_core.files import MAX_FILE_BYTES, limited
+from flight_core.parameters import ParameterError, require
+
+A_ROUTE = "a route file"
+
+
+class Above(Enum):
+    """The zero of an altitude."""
+
+    AS_POSE = 0  # as `pose` counts: the number stands
+    SEA = 1
+    HOME = 2
+    GROUND = 3
+
+
+class Place(NamedTuple):
+    """A position of a file, not validated yet."""
+
+    key: str  # "route[0]"
+    latitude: Any  # deg
+    longitude: Any  # deg
+    altitude: Any  # m; None without an altitude
+    speed: Any = None  # m/s
+    above: Above = Above.AS_POSE
+    found: str = ""  # what the file has in place of an altitude, for a sentence
+
+
+class Home(NamedTuple):
+    """The home of a mission."""
+
+    latitude: float  # deg
+    longitude: float  # deg
+    altitude: float | None  # m above the sea
+
+
+class Places(NamedTuple):
+    """The route of a file."""
+
+    places: list[Place]
+    notes: tuple[str, ...] = ()  # what is not flown
+    home: Home | None = None
+
+
+class _Geometry(NamedTuple):
+    kind: str  # by the name in the format
+    places: list[Place]
+
+
+def read(content: bytes, key: str, suffix: str) -> Places:
+    """The route in the content of a file; `key` names the file in errors. Raises ParameterError."""
+    route = FORMATS[suffix](content, key)
+    require(bool(route.places), key, "no position", "a route")
+    named = [place._replace(key=f"route[{k}]") for k, place in enumerate(route.places)]
+    return route._replace(places=named)
+
+
+def _one_route(key: str, geometries: Sequence[_Geometry], others: Sequence[str] = ()) -> Places:
+    """The only line; the points where there is no line. Raises ParameterError that names what is there."""
+    lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS and geometry.places])
+    points = [geometry for geometry in geometries if geometry.kind in POINTS]
+    kinds = _counted([*(line.kind for line in lines), *others])
+    if len(lines) > 1 or (lines and others):
+        raise ParameterError(f"{key}: found {kinds}, expected one, or Points alone")
+    if lines:
+        beside = _counted([point.kind for point in points])
+        return Places(lines[0].places, (f"{beside} beside the {lines[0].kind}: no part of the route",) if points else ())
+    has = f", but {kinds}" if others else ""
+    require(bool(points) and not others, key, f"no LineString and no Point{has}", "a route")
+    return Places([place for point in points for place in point.places])
+
+
+POINTS = ("Point", "MultiPoint", "wpt")
+
+
+def _counted(kinds: Sequence[str]) -> str:
+    """Kinds with their numbers: "2 LineStrings and 1 Polygon"."""
+    counts = [f"{count} {kind}{'s' * (count > 1)}" for kind, count in Counter(kinds).items()]
+    return " and ".join(counts)
+
+
+def _joined(lines: Sequence[_Geometry]) -> list[_Geometry]:
+    """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section 3.1.9)."""
+    joined: list[_Geometry] = []
+    for line in lines:
+        end, begin = (joined[-1].places[-1], line.places[0]) if joined else (None, None)
+        if end is not None and begin is not None and _meets(end, begin):
+            joined[-1] = joined[-1]._replace(places=[*joined[-1].places[:-1], *line.places[1:]])
+        else:
+            joined.append(line)
+    return joined
+
+
+def _meets(end: Place, begin: Place) -> bool:
+    """Whether both are one position on the antimeridian."""
+    try:
+        return bool(abs(end.longitude) == 180.0 and (end.longitude, end.latitude) == (-begin.longitude, begin.latitude))
+    except TypeError:
+        return False
+
+
+# GeoJSON
+
+
+def _parsed_json(content: bytes, key: str) -> Any:
+    try:
+        return json.loads(content.removeprefix(b"\xef\xbb\xbf"))
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"{key}: not valid JSON ({error}), expected {A_ROUTE}") from None
+
+
+def _read_json(content: bytes, key: str) -> Places:
+    tree = _parsed_json(content, key)
+    if _member(tree, "fileType") == "Plan":
+        return _read_plan_tree(tree, key)
+    _require_wgs84(tree, key)
+    geometries: list[_Geometry] = []
+    others: list[str] = []
+    for node, speed in _nodes(tree):
+        kind, coordinates = _member(node, "type"), _member(node, "coordinates")
+        if isinstance(kind, str) and kind in GEOJSON:
+            parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
+            geometries += [_Geometry(kind, [_lon_lat(position, speed) for position in part]) for part in parts]
+        elif node is not None:
+            others.append(f"geometry of the type {short_repr(kind)}")
+    return _one_route(key, geometries, others)
+
+
+def _ring(rings: list[Any]) -> list[list[Any]]:
+    """The outer ring of a Polygon, whose only line is a route; every ring of a Polygon with holes."""
+    return [ring for ring in rings if isinstance(ring, list)]
+
+
+GEOJSON: Mapping[str, Callable[[list[Any]], list[list[Any]]]] = MappingProxyType(
+    {
+        "Point": lambda coordinates: [[coordinates]],
+        "MultiPoint": lambda coordinates: [coordinates],
+        "LineString": lambda coordinates: [coordinates],
+        "MultiLineString": _ring,
+        "Polygon": _ring,
+        "MultiPolygon": lambda polygons: [ring for rings in _ring(polygons) for ring in _ring(rings)],
+    }
+)
+"""By the type of a geometry: its lines, or its points."""
+
+
+def _nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
+    """The geometries with the property V of their Feature, in the order of the file; None for a Feature without geometry."""
+    pending: list[tuple[Any, Any]] = [(tree, None)]
+    while pending:
+        node, speed = pending.pop()
+        members = [_member(node, name) for name in ("features", "geometries")]
+        inside = next((member for member in members if isinstance(member, list)), None)
+        if inside is not None:
+            pending += [(child, speed) for child in reversed(inside)]
+        elif isinstance(node, Mapping) and "geometry" in node:
+            pending.append((node["geometry"], _member(_member(node, "properties"), "V")))
+        else:
+            yield node, speed
+
+
+def _require_wgs84(tree: Any, key: str) -> None:
+    """Refuse a member `crs` of another system: RFC 7946 has WGS84 alone, and GDAL wrote others before."""
+    crs = _member(tree, "crs")
+    name = str(_member(_member(crs, "properties"), "name") or "")
+    known = crs is None or re.search(r"CRS84h?$|EPSG:+4326$|EPSG:+4979$|WGS ?84$", name, re.IGNORECASE)
+    require(bool(known), key, f"the coordinate system {short_repr(name)}", "WGS84: ogr2ogr -t_srs EPSG:4326 converts it")
+
+
+def _member(tree: Any, name: str) -> Any:
+    """A member of a JSON object; None of anything else."""
+    return tree.get(name) if isinstance(tree, Mapping) else None
+
+
+def _lon_lat(position: Any, speed: Any = None, above: Above = Above.AS_POSE, found: str = "") -> Place:
+    """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
+    fits = isinstance(position, list) and 2 <= len(position) <= 3
+    require(fits, "route", short_repr(position), "longitude, latitude, altitude")
+    longitude, latitude, *altitude = position
+    return Place("route", latitude, longitude, altitude[0] if altitude else None, speed, above, found or short_repr(position))
+
+
+# KML and GPX
+
+
+class _NoDoctype(TreeBuilder):
+    """Refuses a document type, the only place of entity declarations: no entity is ever expanded or fetched."""
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise ParseError("a document type")
+
+
+def _parsed_xml(content: bytes, key: str, of: str) -> Element:
+    parser = XMLParser(target=_NoDoctype())  # noqa: S314 - without a document type there is nothing to expand
+    try:
+        parser.feed(content)
+        root: Element = parser.close()
+    except (ParseError, ValueError, LookupError) as error:  # the last two: of an encoding
+        raise ParameterError(f"{key}: found {error}, expected the XML of {of}") from None
+    return root
+
+
+def _kind(element: Element) -> str:
+    """The name of an element without the namespace."""
+    return str(element.tag).rpartition("}")[2]
+
+
+KML_LINES = ("LineString", "LinearRing", "Track")
+KML_OTHERS = ("Model", "NetworkLink")  # geometry elsewhere
+KML_MODES = {"absolute": Above.AS_POSE, "relativeToGround": Above.GROUND, "clampToGround": Above.GROUND}
+
+
+def _read_kml(content: bytes, key: str) -> Places:
+    root = _parsed_xml(content, key, "a KML file")
+    geometries: list[_Geometry] = []
+    kinds = [(_kind(element), element) for element in root.iter()]
+    others = [kind for kind, _ in kinds if kind in KML_OTHERS]
+    has_line = any(kind in KML_LINES for kind, _ in kinds)
+    for kind, element in kinds:
+        if kind == "Point" and has_line:
+            geometries.append(_Geometry(kind, []))  # a mark, at any altitude
+        elif kind in (*KML_LINES, "Point"):
+            geometries.append(_Geometry(kind, _kml_places(key, kind, element)))
+    return _one_route(key, geometries, others)
+
+
+def _kml_places(key: str, kind: str, element: Element) -> list[Place]:
+    texts = {_kind(child): child.text or "" for child in element}
+    mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
+    found = f"a {kind} with the altitudeMode {short_repr(mode)}"
+    require(mode in KML_MODES, key, found, "absolute, for the height of the ground is not known")
+    if kind == "Track":
+        tuples = [(child.text or "").split() for child in element if _kind(child) == "coord"]
+    else:
+        tuples = [text.split(",") for text in re.sub(r"\s*,\s*", ",", texts.get("coordinates", "")).split()]
+    require(kind != "Point" or len(tuples) == 1, key, f"a Point with {len(tuples)} positions", "one")
+    if mode == "clampToGround":  # which ignores the altitude
+        tuples = [[*position[:2], "0"] for position in tuples]
+    return [_lon_lat(list(map(_number_of, position)), None, KML_MODES[mode], found) for position in tuples]
+
+
+def _number_of(text: str | None) -> float | str | None:
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
+
+
+def _read_kmz(content: bytes, key: str) -> Places:
+    """The KML file of a KMZ archive: doc.kml, or the only one (OGC 12-007r2, Annex C)."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
+            chosen = "doc.kml" if "doc.kml" in names else names[0] if len(names) == 1 else ""
+            method = archive.getinfo(chosen).compress_type if chosen else zipfile.ZIP_STORED
+            require(
+                method in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}, key, f"the compression {method}", "deflate, as in a KMZ"
+            )
+            inside = archive.open(chosen).read(MAX_FILE_BYTES + 1) if chosen else b""
+    except ParameterError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
+        raise ParameterError(f"{key}: cannot be unpacked ({error}), expected a KMZ archive") from None
+    require(bool(chosen), key, f"{len(names)} .kml files and no doc.kml", "one")
+    return _read_kml(limited(inside, f"{key}: {chosen}", A_ROUTE), key)
+
+
+def _read_gpx(content: bytes, key: str) -> Places:
+    """A route (rte), without one a track (trk) of one segment, without both the waypoints (wpt)."""
+    root = _parsed_xml(content, key, "a GPX file")
+    routes = [_gpx_places(element, "rtept") for element in root.iter() if _kind(element) == "rte"]
+    segments = [_gpx_places(element, "trkpt") for element in root.iter() if _kind(element) == "trkseg"]
+    marks = _gpx_places(root, "wpt")
+    lines = [places for places in (routes or segments) if places]
+    kind = "rte" if routes else "trkseg"
+    require(len(lines) <= 1, key, f"{len(lines)} {kind}", "one: GPX of a single route or of a track without a gap")
+    if not lines:
+        require(bool(marks), key, "no rte, no trk and no wpt", "a route")
+        return Places(marks)
+    beside = {"trkseg": len(segments) if routes else 0, "wpt": len(marks)}
+    notes = (f"{count} {what} beside the {kind}: no part of the route" for what, count in beside.items() if count)
+    return Places(lines[0], tuple(notes))
+
+
+def _gpx_places(parent: Element, kind: str) -> list[Place]:
+    places = []
+    for element in (child for child in parent if _kind(child) == kind):
+        latitude, longitude = (_number_of(element.get(name)) for name in ("lat", "lon"))
+        height = next((child.text for child in element if _kind(child) == "ele"), None)
+        places.append(Place("route", latitude, longitude, _number_of(height), found=f"a {kind} without ele"))
+    return places
+
+
+# Missions of MAVLink
+
+FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
+TERRAIN = (10, 11)
+WAYPOINT, SPLINE, CHANGE_SPEED, AIRSPEED = 16, 82, 178, 0  # MAV_CMD, and SPEED_TYPE
+LOITERS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
+COMMANDS = {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
+COMMANDS |= {177: "DO_JUMP", 189: "DO_LAND_START", 206: "DO_SET_CAM_TRIGG_DIST", 201: "DO_SET_ROI", 183: "DO_SET_SERVO"}
+
+
+class _Item(NamedTuple):
+    """An item of a mission."""
+
+    number: int
+    frame: int
+    command: int
+    params: Sequence[Any]  # seven
+
+
+def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequence[str] = ()) -> Places:
+    """The waypoints of a mission, each loiter as a waypoint; the items that are not flown in notes."""
+    places: list[Place] = []
+    skipped: list[str] = []
+    held: list[str] = []
+    speed: Any = None
+    for item in items:
+        latitude, longitude, altitude = item.params[4:7]
+        name = LOITERS.get(item.command) or COMMANDS.get(item.command, f"MAV_CMD {item.command}")
+        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (latitude or longitude):
+            expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
+            found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
+            require(item.frame in FRAMES, f"{key}: item {item.number}", found, expected)
+            places.append(Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame]))
+            if item.command in LOITERS:
+                held.append(f"{name} (item {item.number})")
+        elif item.command == CHANGE_SPEED and item.params[0] == AIRSPEED and (item.params[1] or 0) > 0:
+            speed = item.params[1]
+        else:
+            skipped.append(f"{name} (item {item.number})")
+    told = [f"not flown: {', '.join(skipped)}"] * bool(skipped)
+    told += [f"flown as waypoints, without the wait: {', '.join(held)}"] * bool(held)
+    return Places(places, (*notes, *told), home)
+
+
+def _read_plan(content: bytes, key: str) -> Places:
+    return _read_plan_tree(_parsed_json(content, key), key)
+
+
+def _read_plan_tree(tree: Any, key: str) -> Places:
+    mission = _member(tree, "mission")
+    listed = _member(mission, "items")
+    require(isinstance(listed, list), key, "no mission with items", "a plan of QGroundControl")
+    items = []
+    for k, entry in enumerate(listed or ()):
+        kind = _member(entry, "complexItemType") or _member(entry, "type")
+        simple = _member(entry, "type") == "SimpleItem"
+        require(simple, f"{key}: item {k + 1}", f"a {short_repr(kind)}", "waypoints alone")
+        params = _member(entry, "params")
+        frame, command = _member(entry, "frame"), _member(entry, "command")
+        numbers = isinstance(params, list) and all(value is None or isinstance(value, int | float) for value in params)
+        fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
+        require(fits, f"{key}: item {k + 1}", short_repr(entry), "frame, command and seven params")
+        items.append(_Item(k + 1, frame, command, params))
+    fence, rally = _member(tree, "geoFence"), _member(_member(tree, "rallyPoints"), "points")
+    fenced = any(_member(fence, name) for name in ("polygons", "circles"))
+    notes = ["the fence of the plan is no part of the route"] * fenced + ["rally points are no part of the route"] * bool(rally)
+    return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
+
+
+def _home(position: Any) -> Home | None:
+    """The home in latitude, longitude and perhaps altitude; None for anything else."""
+    fits = isinstance(position, list) and 2 <= len(position) <= 3
+    if not fits or not all(isinstance(value, int | float) for value in position):
+        return None
+    return Home(position[0], position[1], position[2] if len(position) == 3 else None)
+
+
+WPL = "QGC WPL"
+WPL_COLUMNS = 12
+
+
+def _read_wpl(content: bytes, key: str) -> Places:
+    lines = content.decode("utf-8-sig", errors="replace").splitlines()
+    head = lines[0].strip() if lines else ""
+    require(head.startswith(WPL), key, short_repr(head), "QGC WPL 110 in the first line")
+    items, home = list[_Item](), None
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        numbers = [_number_of(word) for word in words]
+        fits = len(words) == WPL_COLUMNS and all(isinstance(value, float) for value in numbers)
+        require(fits, f"{key}: line {number}", short_repr(line.strip()), f"{WPL_COLUMNS} numbers")
+        index, _, frame, command, *params = (value for value in numbers[:-1] if isinstance(value, float))
+        if index == 0 and frame == 0 and command == WAYPOINT and not items:  # ArduPilot's item 0 is the home
+            home = Home(*params[4:7]) if params[4] or params[5] else None
+            continue
+        items.append(_Item(int(index), int(frame), int(command), params))
+    return _mission(key, items, home)
+
+
+FORMATS: Mapping[str, Callable[[bytes, str], Places]] = MappingProxyType(
+    {
+        ".geojson": _read_json,
+        ".json": _read_json,
+        ".kml": _read_kml,
+        ".kmz": _read_kmz,
+        ".gpx": _read_gpx,
+        ".plan": _read_plan,
+        ".waypoints": _read_wpl,
+        ".mission": _read_wpl,
+        ".txt": _read_wpl,
+    }
+)
+"""Readers by the ending of a file."""
