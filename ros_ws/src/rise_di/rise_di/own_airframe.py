@@ -97,17 +97,18 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
 
     `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text names them.
     """
+    inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)]
     reached, controller = "", first_flight.placeholder(airframe, lag)
     for size in SIZES:
 
         def text(path: Path, section: str, size: float = size) -> str:
             return first_flight.scenario_text(airframe, str(path), str(files[1]), section, lag, size)
 
-        selection = select_gains(trial, _parsed(text(trial, controller), files[1]), samples=SAMPLES)
+        selection = select_gains(trial, _parsed(text(trial, controller), files[1]), inputs=inputs, samples=SAMPLES)
         section = gain_selection.as_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)
-        stops = zip(flown.aircraft.channels().inputs, flown.aircraft.actuators.upper, strict=True)
+        stops = zip(airframe.inputs, flown.aircraft.actuators.upper, strict=True)
         used = {key: float(abs(tape["u"][key]).max()) / stop for key, stop in stops}
         if tape.outcome == COMPLETED and max(used.values()) <= CLEAR:
             return text(files[0], section)

@@ -87,8 +87,12 @@ def import_airframe(
     """
     label = str(source) if isinstance(source, str | Path) else type(source).__name__
     given_speed = None if speed is None else in_si(speed, "speed", "m/s")
-    if isinstance(source, str | Path) and Path(source).suffix in {".yaml", ""} and not thrust and not states:
-        return load_airframe(source), f"airframe file {label}"
+    if isinstance(source, str | Path) and Path(source).suffix in {".yaml", ""}:
+        given = {"speed": speed, "states": states, "inputs": inputs, "outputs": outputs, "thrust": thrust, "text": text, **body}
+        for key, value in given.items():
+            require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
+        loaded = load_airframe(source)
+        return (loaded.model_copy(update={"name": name}) if name else loaded), f"airframe file {label}"
     named_states, named_inputs = _named(states, "states"), _named(inputs, "inputs")
     model = _model(source, named_states, named_inputs, given_speed, body)
     speed_used = given_speed if given_speed is not None else model.speed
@@ -151,22 +155,24 @@ def _inputs(given: Mapping[str, Any], found: Sequence[str], m: int) -> dict[str,
 def _model(
     source: Any, states: Mapping[str, Any], inputs: Mapping[str, Any], speed: float | None, body: Mapping[str, str | float]
 ) -> Model:
+    of_avl = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
+        require(not body, next(iter(body), ""), "it beside a state space", of_avl)
         return _state_space(source, states, inputs)
     path = as_path(source, "source", "a state space, or the path of a file")
     content = read_file(path, f"model {path}", "a model: .mat, .yaml, or a text of AVL or XFLR5")
     if path.suffix == ".mat":
+        require(not body, next(iter(body), ""), "it beside a MAT-file", of_avl)
         return _matlab(path, states, inputs)
-    if path.suffix == ".yaml":
-        frame = load_airframe(path)
-        given = {name: dict(value) for name, value in frame.model_dump()["inputs"].items()}
-        C = np.array(frame.C) if frame.C else None
-        return Model(dict(frame.states), given, np.array(frame.A), np.array(frame.B), C, None, frame.outputs, frame.speed)
     text = content.decode("utf-8", errors="replace")
+    if re.search(r"\bCLa\s*=", text) and re.search(r"\bSref\s*=", text):
+        require(
+            not states, "states", "names beside AVL's derivatives", "none: the states are V, alpha, q, theta, beta, p, r, phi"
+        )
+        return _avl_derivatives(text, inputs, speed, body)
+    require(not body, next(iter(body), ""), f"it beside {path.name}", of_avl)
     if "Longitudinal state matrix" in text or "Lateral state matrix" in text:
         return _xflr5(text, states, inputs)
-    if re.search(r"\bCLa\s*=", text) and re.search(r"\bSref\s*=", text):
-        return _avl_derivatives(text, inputs, speed, body)
     if (header := _avl_header(text)) is not None:
         return _avl_matrix(text, header, states, inputs, speed)
     expected = "a .mat or .yaml file, AVL's system matrix or stability derivatives, or XFLR5's state matrices"
@@ -174,6 +180,7 @@ def _model(
 
 
 def _finite(matrix: Any, key: str) -> FloatArray:
+    require(not np.iscomplexobj(matrix), key, "complex numbers", "a real matrix")
     try:
         values = np.atleast_2d(np.asarray(matrix, dtype=np.float64))
     except (TypeError, ValueError):

@@ -10,12 +10,13 @@ import numpy as np
 from aircraft_sim.airframe import Airframe
 from flight_analysis.design import gain_selection
 from flight_core.parameters import require
-from flight_core.units import ANGLE, quantity
+from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from rise_di_controller.decomposition import search
 
 SURFACE_LAG, ENGINE_LAG = 0.05, 0.3  # s, servos and engine of a light aircraft, assumed
 STOP, SURFACE_RATE = 0.35, 1.0  # rad, rad/s: 20 deg, 57 deg/s, assumed
-ENGINE_STOP, ENGINE_RATE = 0.3, 0.3  # parts of the weight, 1/s, assumed
+AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
+USED = 0.4  # part of the authority that the edge of a command takes at most
 NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
 SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
 RATE = 200.0  # Hz, of y and y_m
@@ -75,20 +76,26 @@ def scenario_text(
 ) -> str:
     """A scenario file for the airframe in `path`, with the text of the section controller; `size` multiplies the commands.
 
-    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, and an output of a different name by 1 % of
-    the size that full inputs reach in a second. Gusts have 3 % of the trim speed.
+    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge of a command would take
+    more than USED of the input's authority. Gusts have 3 % of the trim speed.
     """
     inputs, outputs, V0 = list(airframe.inputs), list(airframe.outputs), airframe.speed
     surfaces = [quantity(given.unit).dimension == ANGLE for given in airframe.inputs.values()]
-    stops = [STOP if surface else ENGINE_STOP for surface in surfaces]
-    lag_of = {output: max(lag) for output in outputs}
-    lag_of |= {outputs[i]: lag[j] for i, j in enumerate(_pairing(airframe))}
+    paired = pairing(airframe)
+    response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
+    dimensions = [quantity(unit).dimension for unit in airframe.units_of_outputs().values()]
+    stops = [STOP] * len(inputs)
+    for i, j in enumerate(paired):
+        if not surfaces[j]:
+            stops[j] = float(f"{AUTHORITY.get(dimensions[i], 1.0) / max(response[i], 1e-9):.3g}")
+    lag_of = {outputs[i]: lag[j] for i, j in enumerate(paired)}
+    fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if {"p", "r"} <= set(outputs) else None
     amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
-    Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b()) @ np.array(stops)
     start, pulses = 2.0, {}
     for k, output in enumerate(outputs):
-        value = size * amplitude.get(output, 0.01 * float(Omega[k]))
+        reachable = USED * float(response[k]) * stops[paired[k]] / fastest[output]
+        value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
         if output == "r" and turn:
             continue  # the turns command it
         length = 8.0 if output in {"V", "u"} else 2.0
@@ -114,10 +121,10 @@ def scenario_text(
             "lag": list(lag),
             "lower": [-stop for stop in stops],
             "upper": stops,
-            "rate": [SURFACE_RATE if surface else ENGINE_RATE for surface in surfaces],
+            "rate": [SURFACE_RATE if surface else stop for surface, stop in zip(surfaces, stops, strict=True)],
         },
         noise=[NOISE.get(output, 0.001) for output in outputs],
-        frequency=[min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs],
+        frequency=list(fastest.values()),
         damping=[1.0 if output in {"V", "u"} else 0.9 for output in outputs],
         pulses=pulses,
         turn=turn,
@@ -132,8 +139,8 @@ def default_lags(airframe: Airframe) -> tuple[float, ...]:
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
     """A section controller with gains of 1, for the selection of gains."""
-    pairing = _pairing(airframe)
-    inputs = [list(airframe.inputs)[j] for j in pairing]
+    paired = pairing(airframe)
+    inputs = [list(airframe.inputs)[j] for j in paired]
     m = len(inputs)
     require(m > 1, "inputs", inputs[0], "two inputs or more: add a thrust with --thrust, or a second control")
     values: Mapping[str, Any] = {
@@ -145,7 +152,7 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         "k_d": [1.0] * (m - 1),
         **dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), [1.0] * m),
         "sign": "auto",
-        "lag": [lag[j] for j in pairing],
+        "lag": [lag[j] for j in paired],
         "delay": 0.003,
         "softening": SOFTENING,
         "max_age": 0.1,
@@ -156,7 +163,7 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
     return "\n".join(["/**/controller:", "  ros__parameters:", *lines, ""])
 
 
-def _pairing(airframe: Airframe) -> tuple[int, ...]:
+def pairing(airframe: Airframe) -> tuple[int, ...]:
     """The input of each output, as the smallest change that gives D = I, else in their order."""
     best = search(airframe.matrix_c() @ airframe.matrix_b())
     if best is None:

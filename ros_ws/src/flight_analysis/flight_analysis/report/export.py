@@ -71,7 +71,7 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write y over y_m, the best error, and u of a flight or several flights: a column a quantity, a row a channel."""
     from matplotlib.figure import Figure  # noqa: PLC0415
 
-    require(path.suffix.lower() == ".png", "png", path.name, "a name that ends in .png; figure writes .pdf and .svg")
+    require(path.suffix.lower() in {"", ".png"}, "png", path.name, "a name that ends in .png; figure writes .pdf and .svg")
     columns = [(column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topic))]
     rows = max(len(names) for _, names in columns)
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * rows + 0.6), layout="constrained")
