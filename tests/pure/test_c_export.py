@@ -19,12 +19,13 @@ from tests.conftest import REPOSITORY
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
 from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
-from flight_analysis.c_export.library import FMU
 from flight_analysis.c_export.proof import (
     CODE,
     FLAGS,
     FLOAT32_BOUND,
+    FMU,
     PARAMETERS,
+    REPORT,
     SOURCE,
     Program,
     build,
@@ -36,7 +37,7 @@ from flight_analysis.c_export.proof import (
 from flight_analysis.closed_loop.replay import vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
-from flight_cli.export import REPORT, export
+from flight_cli.export import export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_log.tape_reader import read_run
@@ -314,5 +315,10 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         export("osprey_servo", tmp_path)
     with pytest.raises(ParameterError, match="--compiler: found no program 'tcc', expected the command of a C compiler"):
         export("osprey_servo", tmp_path, compiler=["tcc"])
+    (tmp_path / "file").touch()
+    with pytest.raises(ParameterError, match=r"--c: .*file"):
+        export("osprey_servo", tmp_path / "file", without_proof=True)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / REPORT).write_text("PROVED: every bit is equal\n", encoding="utf-8")  # of an earlier export
     export("osprey_servo", tmp_path / "c", without_proof=True)
-    assert not (tmp_path / "c" / "proof.txt").exists()
+    assert not (tmp_path / "c" / REPORT).exists()

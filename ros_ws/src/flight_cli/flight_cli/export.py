@@ -12,8 +12,8 @@ from rich.console import Console
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
 from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
-from flight_analysis.c_export.library import FMU, build_fmu
-from flight_analysis.c_export.proof import compilers, prove, report, write_code
+from flight_analysis.c_export.library import build_fmu
+from flight_analysis.c_export.proof import FMU, REPORT, compilers, prove, report, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
 from flight_cli.output import options, print_json
@@ -23,7 +23,6 @@ from flight_log.tape_reader import read_run
 from rise_di_controller.rise_di import RiseDiConfig
 
 DIFFERS = 1
-REPORT = "proof.txt"
 PART = 50_000  # drawn steps of a recording
 LONGEST = 20.0  # s, of a flight without --duration
 
@@ -42,7 +41,7 @@ def export(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the drawn inputs.")] = 1,
     compiler: Annotated[
         list[str] | None,
-        typer.Option(help="Command of a C compiler, as 'gcc -m32'; may be repeated. Else gcc and clang, if there."),
+        typer.Option(help="Command of a C compiler, as 'python -m ziglang cc'; may be repeated. Else gcc and clang, if there."),
     ] = None,
     fmu: Annotated[
         bool, typer.Option("--fmu", help="Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.")

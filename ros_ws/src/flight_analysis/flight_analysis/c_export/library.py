@@ -18,7 +18,6 @@ from flight_analysis.c_export.proof import CODE, FLAGS, PARAMETERS, SOURCE, buil
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
 
-FMU = "rise_di.fmu"
 _POINTER = ctypes.c_void_p
 
 

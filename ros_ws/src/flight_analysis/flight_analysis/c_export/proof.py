@@ -24,6 +24,7 @@ from rise_di_controller.rise_di import RiseDiConfig
 SOURCE = Path(str(files("flight_analysis"))) / "c_export" / "source"
 CODE = ("rise_di.h", "rise_di.c")
 PARAMETERS = "rise_di_parameters.h"
+REPORT, FMU = "proof.txt", "rise_di.fmu"  # beside the code
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
@@ -59,9 +60,11 @@ class Comparison(NamedTuple):
 
 
 def write_code(controller: RiseDiConfig, scenario: str, folder: Path, *, float32: bool) -> list[Path]:
-    """Write the C code of a controller to a folder. Raises ParameterError where that cannot be."""
+    """Write the C code of a controller to a folder, and remove report and unit of the code before. Raises ParameterError."""
     with writing("c", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
+        for name in (REPORT, FMU):
+            (folder / name).unlink(missing_ok=True)
         for name in CODE:
             shutil.copyfile(SOURCE / name, folder / name)
         write_file(folder / PARAMETERS, header(controller, scenario, float32=float32))
@@ -225,7 +228,8 @@ def build(command: Sequence[str], folder: Path) -> None:
     """Run a compiler in a folder. Raises ParameterError with what it says."""
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
     if done.returncode:
-        raise ParameterError(f"{shlex.join(command)}: {(done.stderr or done.stdout).strip()[-2000:]}")
+        said = (done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}"
+        raise ParameterError(f"{shlex.join(command)}: {said}")
 
 
 def version(compiler: Sequence[str]) -> str:
