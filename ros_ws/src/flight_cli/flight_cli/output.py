@@ -50,16 +50,16 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         columns = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
         console.print(grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
-        console.print(_guidance_table(summary["guidance"]["segments"]))
+        console.print(_guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")))
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
-    for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"])):
+    for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"] if note != busy)):
         console.print(line, highlight=False)
 
 
-def _guidance_table(segments: Sequence[Mapping[str, Any]]) -> Table:
+def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
     """What guidance held in each segment: rms and largest error."""
     headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
-    table = new_table("Guidance by segment, in m, m/s and deg", headings, left=("segment",))
+    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings, left=("segment",))
     for segment in segments:
         held = segment["lateral"], segment["vertical"]
         units = [QUANTITY_UNITS[each["quantity"]] for each in held]

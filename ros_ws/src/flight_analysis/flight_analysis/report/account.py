@@ -22,6 +22,7 @@ REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all 
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
+RESTART = 10  # a number of a tick that is less by more
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 
 
@@ -84,17 +85,18 @@ def final_outcome(outcome: str, account: Account) -> str:
 
 
 def flown(tape: Tape) -> Tape:
-    """The tape up to the controller's last u: later samples belong to the shutdown of the processes.
+    """The tape up to the controller's last tick: later samples belong to the shutdown of the processes.
 
     A u that ends much earlier than y and y_m, or before the end of a whole flight, is a gap of the log: nothing is cut there.
     """
-    lasts = [int(tape[name].stamp_ns[-1]) for name in ("y", "y_m", "u") if name in tape and len(tape[name].stamp_ns)]
-    if "u" not in tape or not len(tape["u"].stamp_ns):
+    ticks = [int(tape[name].stamp_ns[-1]) for name in TICKS if name in tape and len(tape[name].stamp_ns)]
+    others = [int(tape[name].stamp_ns[-1]) for name in ("y", "y_m") if name in tape and len(tape[name].stamp_ns)]
+    if not ticks:
         return tape
-    end_ns, planned_ns = lasts[-1], _planned_ns(tape)
-    if planned_ns is not None and end_ns < planned_ns - LATE_TICK_NS and min(lasts) == end_ns < max(lasts) - LATE_TICK_NS:
+    end_ns, planned_ns = max(ticks), _planned_ns(tape)  # one tick publishes u and internals
+    if planned_ns is not None and end_ns < planned_ns - LATE_TICK_NS and end_ns < max(others, default=0) - LATE_TICK_NS:
         end_ns = planned_ns
-    elif min(lasts[:-1], default=end_ns) - end_ns > nanoseconds(SILENCE):
+    elif min(others, default=end_ns) - end_ns > nanoseconds(SILENCE):
         return tape
     return Tape(
         {name: signal.until(end_ns) for name, signal in tape.signals.items()},
@@ -206,14 +208,18 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     count = max((end_ns - begin_ns) // step_ns + 1, 1)
     if "internals" not in tape or not {"number", "age", "mode"} <= set(tape["internals"].names):
         return count, float(count)
-    log = tape["internals"]
-    steps = np.diff(log["number"])
-    numbered = float(log["number"][0]) + float(np.where(steps > 0, steps, 1.0).sum())
-    begin_ns = min(begin_ns, int(log.stamp_ns[0]) - (int(log["number"][0]) - 1) * step_ns)
-    last_ns = int(log.stamp_ns[-1] + round(float(log["age"][-1]) * NANOSECONDS))
-    slow = max((last_ns - int(log.stamp_ns[0])) // step_ns + log["number"][0] - numbered, 0.0)
-    ticks = max((end_ns - begin_ns) // step_ns + 1 - math.ceil(slow), 1)
-    return int(ticks), float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
+    log = tape["internals"].until(end_ns)
+    if not len(log.stamp_ns):
+        return count, float(count)
+    # Stamps order two ticks of one instant either way. A much smaller number is that of another controller.
+    of_controllers = np.split(log["number"], np.flatnonzero(np.diff(log["number"]) < -RESTART) + 1)
+    missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in of_controllers)
+    before = float(of_controllers[0].min()) - 1.0
+    last_ns = int(log.stamp_ns[-1]) + round(float(log["age"][-1]) * NANOSECONDS)
+    goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
+    after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0)
+    ticks = int(len(log.stamp_ns) + max(missing, 0.0) + before + after)
+    return ticks, float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
 
 
 def _topic(tape: Tape, name: str, expected: int | None, end_ns: int) -> TopicAccount:

@@ -180,6 +180,7 @@ FIGURES = {
     "errors": ("y", "y_m", "internals", "u_m", "guidance"),
     "inputs": ("u", "internals", "u_m", "guidance"),
     "ticks": ("internals",),
+    "guidance": ("guidance",),
 }
 """Topics of the tables of figures beside the error: the values, and the parts of the flight."""
 

@@ -136,7 +136,7 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
             factors = (factor, factor, factor, 1.0)
             row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in metrics), factors)]
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
-    return Table("Guidance by segment", columns, rows, GUIDANCE_LEGEND if rows else "")
+    return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, GUIDANCE_LEGEND if rows else "")
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
