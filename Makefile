@@ -13,7 +13,7 @@
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
 
 PYTHON ?= python3
-SCENARIO ?= osprey_gust
+SCENARIO ?= osprey_servo
 UV_VERSION := 0.13.8
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.scenario import Scenario, require_euler
+from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, require_euler
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, find_autopilot, require_limits
@@ -30,7 +30,7 @@ from flight_guidance.route_file import ENDINGS
 
 def fly(
     context: typer.Context,
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
     duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
@@ -78,6 +78,8 @@ def fly(
         waypoints = read_waypoints(route, origin, altitude, simplify, above_sea=chosen.aircraft.is_jsbsim)
         chosen = with_route(chosen, waypoints)
     _require_flyable(chosen, autopilot, in_process=in_process)
+    for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
+        print(f"warning: {sentence}", file=sys.stderr)
     run = new_run(chosen, runs)
     if route is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")

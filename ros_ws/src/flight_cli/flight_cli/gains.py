@@ -70,6 +70,9 @@ def gains(
     phase_margin: Annotated[
         float, typer.Option(help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.")
     ] = PHASE_MARGIN,
+    theorem: Annotated[
+        bool, typer.Option("--theorem", help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.")
+    ] = False,
     accept: Annotated[
         bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
     ] = False,
@@ -85,6 +88,9 @@ def gains(
     Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
     console = Console(quiet=as_json)
+    require(
+        not theorem or (write is not None and not observer), "--theorem", "it alone", "--write beside it, without --observer"
+    )
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     answers: dict[str, Assessment]
     with console.status("simulating the ideal control on uncertain airframes"), options(*loop, *PARTS):
@@ -118,14 +124,14 @@ def gains(
             both = {"theorem": selection.theorem, "engineering": selection.engineering}
             answers, origin = {"observer": selection.engineering} if observer else both, selection.origin
             if write is not None:
-                _require_margins(selection.engineering, accept)
-                write_text("--write", write, HEADER + gain_selection.as_yaml(selection))
+                _require_margins(selection.theorem if theorem else selection.engineering, accept)
+                write_text("--write", write, HEADER + gain_selection.as_yaml(selection, theorem=theorem))
     found = next(iter(answers.values())).study
     if as_json:
         print_json(_as_json(found, answers, seed))
     else:
         _show(console, found, answers)
-        if not check and not observer and selection.engineering.margins is not None:
+        if not check and not observer and selection.engineering.has_requirement:
             _show_trade(console, selection)
         if origin:
             console.print(origin, highlight=False, soft_wrap=True)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A scenario: a file with the parameters of every node, validated by section and together."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,8 @@ from reference_model.params import ReferenceModelConfig
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
+
+STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
 """Parameters of one node by name that replace those of its section in the scenario."""
@@ -217,6 +220,20 @@ def check_together(scenario: Scenario) -> None:
         require(divides, key, f"{rate:g} Hz", f"a whole multiple of controller.rate ({controller.rate:g} Hz)")
     if scenario.guidance is not None:
         _check_guidance(scenario, scenario.guidance)
+
+
+def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
+    """A sentence for each limit of the controller outside the end stops of the actuators: the anti-windup starts too late."""
+    controller, actuators = scenario.controller, scenario.aircraft.actuators
+    sentences = []
+    for key, sign in (("lower", -1.0), ("upper", 1.0)):
+        stops = dict(zip(scenario.aircraft.channels().inputs, getattr(actuators, key), strict=bool(getattr(actuators, key))))
+        own = dict(zip(controller.inputs, getattr(controller, key) or (), strict=bool(getattr(controller, key))))
+        for name, stop in stops.items():
+            limit = own.get(name, sign * math.inf)
+            if sign * limit > sign * stop + STOP_TOLERANCE * abs(stop):
+                sentences.append(f"controller.{key} of {name}: found {limit:g}, expected the end stop {stop:g} or less far out")
+    return tuple(sentences)
 
 
 def require_euler(scenario: Scenario) -> None:

@@ -157,6 +157,11 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return () if self.margins is None else self.margins.channel_delay
 
     @property
+    def has_requirement(self) -> bool:
+        """Whether margins are asked of the loop: not of an ideal loop with the implicit or the literal sign."""
+        return any(condition.name in REQUIRED for condition in self.loop)
+
+    @property
     def unmet(self) -> tuple[Condition, ...]:
         """The margins of the requirement that the loop does not have."""
         return tuple(condition for condition in gain_conditions.failing(self.loop) if condition.name in REQUIRED)
@@ -606,7 +611,7 @@ def yaml_template(text: str) -> Template:
 
 
 CONTROLLER_YAML = yaml_template("""\
-# Gains for the airframe {{ airframe }} {{ "beside an observer" if observed else "by the engineering procedure" }}.
+# Gains for the airframe {{ airframe }} {{ origin }}.
 {%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
 {%- if margins %}
 
@@ -627,10 +632,14 @@ CONTROLLER_YAML = yaml_template("""\
 """)
 
 
-def as_yaml(selection: Selection) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments."""
+def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
+    """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments.
+
+    With `theorem` the gain set of Theorem 1 in place of the engineering gains.
+    """
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
-    controller, study = selection.engineering.controller, selection.study
+    assessed = selection.theorem if theorem else selection.engineering
+    controller, study = assessed.controller, selection.study
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
     responses = response(study, controller)
@@ -654,6 +663,8 @@ def as_yaml(selection: Selection) -> str:
         "delay": "s, beyond sampling",
         "softening": "1, width of the softened sign in total lags: wider for the phase margin",
     }
+    if theorem:
+        comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
     if controller.observer is not None:
         unscaled = "units of u s / units of y; for a K of (22) that is above 1"
         comments |= {
@@ -668,9 +679,9 @@ def as_yaml(selection: Selection) -> str:
     ]
     return CONTROLLER_YAML.render(
         airframe=study.airframe.name,
-        observed=controller.observer is not None,
-        delay_margin=selection.engineering.delay_margin,
-        margins=margins_sentence(controller, selection.engineering.margins),
+        origin="by Theorem 1" if theorem else "beside an observer" if controller.observer else "by the engineering procedure",
+        delay_margin=assessed.delay_margin,
+        margins=margins_sentence(controller, assessed.margins),
         parameters=parameters,
         sections=_sections(controller, study.airframe),
     )
