@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.signal
+import typer
 import yaml
 from tests.conftest import REPOSITORY
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.airframe_import import import_airframe
 from flight_bringup.scenarios import find_scenario
 from flight_cli.airframe import airframe as command
+from flight_cli.gains import gains
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di.own_airframe import new_airframe
@@ -369,3 +372,17 @@ def test_f4c_of_tutorial_follows_from_the_derivatives_of_the_book() -> None:
     np.testing.assert_allclose(A[:3, :4], np.linalg.solve(mass, forces), rtol=0.01, atol=1e-4)
     np.testing.assert_allclose(A[4:7, 4:], np.linalg.solve(lateral_mass, lateral), rtol=0.005, atol=1e-4)
     assert Airframe.validate_mapping(page, "f4c").matrix_c()[1, :2] == pytest.approx([np.cos(theta), np.sin(theta)], abs=1e-4)
+
+
+def test_gains_of_an_airframe_with_outputs_of_c_show_the_trade(tmp_path: Path) -> None:
+    """V in ft/s is a row of C: score, table and margins take its unit."""
+    made, _ = import_airframe(SYSTEM, thrust=True, **NAMES)
+    path = tool_file(tmp_path, "navion.yaml", as_yaml(made))
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command()(gains)
+    result = CliRunner(env={"COLUMNS": "100"}).invoke(
+        app, [str(path), "--lag", "0.05,0.3", "--samples", "2"], catch_exceptions=False
+    )
+    assert result.exit_code == 0
+    assert "Trade: rms of the error" in result.stdout
+    assert "ft/s" in result.stdout

@@ -11,6 +11,7 @@ import numpy as np
 
 from flight_core.fields import Field
 from flight_core.parameters import Config, require
+from flight_core.units import ANGULAR_RATE, SPEED, quantity
 from flight_core.vectors import FloatArray
 
 PER_DECADE, DECADES = 100, (-8, 6)
@@ -18,8 +19,8 @@ PER_DECADE, DECADES = 100, (-8, 6)
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
 
-SCORE_UNIT = {"rad/s": 0.010, "m/s": 0.1}
-"""Unit of an rms error in the score, by unit of the channel. p counts half, since its commands are larger."""
+SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
+"""Unit of an rms error in the score, by dimension of the channel. p counts half, since its commands are larger."""
 
 SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel; it replaces that of its unit
 
@@ -142,9 +143,9 @@ class Tally(Config):
 def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
     """Units of the rms errors of the channels in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
     for name in outputs:
-        expected = f"units a score counts: {', '.join(SCORE_UNIT)}"
-        require(units[name] in SCORE_UNIT, "outputs", f"{name} in {units[name]}", expected)
-    return np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[units[name]]) for name in outputs])
+        counted = quantity(units[name]).dimension in SCORE_UNIT
+        require(counted, "outputs", f"{name} in {units[name]}", "units a score counts: rad/s, m/s, and multiples of these")
+    return np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[quantity(units[name]).dimension]) for name in outputs])
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:

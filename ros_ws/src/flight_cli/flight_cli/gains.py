@@ -18,9 +18,10 @@ from flight_analysis.design.requirement import PHASE_MARGIN
 from flight_analysis.design.trade import trade
 from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_analysis.report.summary import display_unit
-from flight_campaign.statistics import score_units
+from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import new_table, options, parse_numbers, print_json, write_text
 from flight_core.parameters import ParameterError, require
+from flight_core.units import quantity
 from rise_di.gain_design import check_gains, select_gains
 from rise_di_controller.params import ControllerConfig
 
@@ -151,10 +152,12 @@ def _require_margins(found: Assessment, accept: bool) -> None:
 def _show_trade(console: Console, selection: Selection) -> None:
     """The error of the linear loop along the manoeuvre against the phase margin."""
     controller, frame = selection.engineering.controller, selection.study.airframe
-    units, outputs = score_units(controller.outputs, frame.states), controller.outputs
-    shown = [display_unit(frame.states[name]) for name in outputs]
-    of_outputs = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
-    heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *of_outputs, "score"]
+    outputs, of_outputs = controller.outputs, frame.units_of_outputs()
+    shown = [display_unit(of_outputs[name]) for name in outputs]
+    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in of_outputs.values())  # no score of a height
+    units = score_units(outputs, of_outputs) if counted else np.full(len(outputs), np.nan)
+    headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
+    heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]
     table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left=())
     for row in trade(selection):
         errors = (f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True))
