@@ -577,6 +577,12 @@ async def whole_log(server: Server) -> None:
         await asyncio.sleep(0.01)
 
 
+async def read_in_full(server: Server) -> None:
+    """Wait until the server has read the log: before, each answer has news."""
+    while server.flights[0].state() != "ended":
+        await asyncio.sleep(0.01)
+
+
 async def left(server: Server) -> None:
     """Wait until all WebSockets are closed."""
     while server.streams:
@@ -592,6 +598,7 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
 
     async def client(server: Server) -> None:
         await whole_log(server)  # else the second answer may have more rows than the first
+        await read_in_full(server)
         socket = await stream(server)
         await socket.write_message("")
         first = (await get(server, "/data/0")).body
@@ -645,6 +652,7 @@ def test_foreign_websocket_refused(path: str, token: str, headers: dict[str, str
 def test_websocket_whose_message_is_no_request_closed(message: str, code: int, reason: str, recorded: Path) -> None:
     async def client(server: Server) -> None:
         await whole_log(server)  # until then the epoch may change
+        await read_in_full(server)
         socket = await stream(server)
         await socket.write_message(f"epoch={decoded((await get(server, '/data/0')).body)[0]['epoch']}&{message}")
         assert await socket.read_message() is None
@@ -794,7 +802,7 @@ def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
     for words, expected in (
         (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
         ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
-        ((recorded, "--namespace", "n"), "error: --namespace: found no --control, expected --control beside it\n"),
+        ((recorded, "--namespace", "n"), f"error: {recorded}: found aircraft in the namespaces /, expected one in 'n'\n"),
     ):
         ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)
         assert (ended.returncode, ended.stderr) == (2, expected)
