@@ -30,6 +30,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_cli.cli import COMMANDS, application
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.parameters import Config, ParameterError
+from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import LogAttachments
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
@@ -244,7 +245,8 @@ def test_node_that_is_not_ready_in_time_named(tmp_path: Path) -> None:
 
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
     """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
-    context.ros_node.subscriptions["/recorded"](Time(sec=int(instant), nanosec=round(instant % 1.0 * 1e9)))
+    sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)
+    context.ros_node.subscriptions["/recorded"](Time(sec=sec, nanosec=nanosec))
     return context.handle(actions)
 
 

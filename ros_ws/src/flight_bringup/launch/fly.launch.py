@@ -81,7 +81,7 @@ def _fly(context: LaunchContext) -> list[Action]:
             end: list[Action] = [on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))]
         elif scenario.controller.autostart and scenario.controller.start_active:
             end = complete_when_flown(context, run, nodes, start_time, duration, by_rosbag2=by_rosbag2)
-        else:  # somebody activates the controller, or nobody
+        else:  # a user activates the controller, or no user does
             end = [TimerAction(period=lead + duration, actions=complete(run))]
         return [*end, *(node(spec, start_time) for spec in nodes)]
 

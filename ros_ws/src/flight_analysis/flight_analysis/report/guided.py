@@ -97,7 +97,7 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
     if "missed" not in log.names:
         return []
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    given = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins anew
+    given = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins again
     edges = np.flatnonzero((np.diff(legs) != 0.0) | (given[1:] != 0)) + 1
     flown = []
     for first, after in zip([0, *edges], [*edges, len(t)], strict=True):
