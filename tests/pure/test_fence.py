@@ -133,9 +133,8 @@ def test_flight_towards_fence_stays_inside(
     scenario = calm(duration, wind, program=commanded(0.0), fence=BOX | zones, home={"north": 100.0})
     tape = simulate(scenario)
     least = distances(tape, scenario).min()
-    assert (
-        margin - 3.0 < least < margin + 8.0
-    )  # the margin of half a second over ground; the flown turn is not exactly the predicted
+    # Half a second over ground. The predicted turn is the wider one, at 0.9 of the bank: the flown turn is narrower.
+    assert margin - 3.0 < least < margin + 20.0, least
     log = tape["guidance"]
     assert log["fence.action"][-1] == HOME
     assert (log["mode.lateral"][-1], log["target.north"][-1]) == (Lateral.ORBIT, 100.0)

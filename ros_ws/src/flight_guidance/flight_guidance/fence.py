@@ -56,7 +56,7 @@ class Motion(NamedTuple):
     wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s
     bank: Scalar  # largest bank, rad
     roll_rate: float  # rad/s
-    lag: float  # s, before the roll begins
+    lag: float  # s, of the turn behind the commanded bank: half of 1 / k_phi, and 2 / w_r of the reference model of r
 
 
 def inside(zone: Zone, north: Array, east: Array) -> Array:

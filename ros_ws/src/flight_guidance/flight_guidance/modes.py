@@ -126,6 +126,7 @@ class GuidanceParams(NamedTuple):
     slew: tuple[float, ...]  # largest derivatives of u_m
     max_age_ns: int
     hold_ns: int
+    turn_lag: float = 0.0  # s, of the turn behind the bank
     fence: Fence | None = None
     home: Home = Home()
 
@@ -435,7 +436,7 @@ def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, p
         state.wind,
         protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed),
         params.attitude.roll_rate,
-        0.5 / params.attitude.k_phi,
+        0.5 / params.attitude.k_phi + params.turn_lag,
     )
 
 

@@ -300,6 +300,7 @@ class GuidanceConfig(NodeConfig):
             slew=tuple(slew[name] for name in self.outputs),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
+            turn_lag=2.0 / frequency["r"],
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
         )
