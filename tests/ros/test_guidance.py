@@ -256,7 +256,9 @@ def test_route_flown_when_it_arrives_and_refused_when_it_cannot_be_flown(flight:
         flight.until(partial(logged, sentence), partial(publisher.publish, message))
     good.header.frame_id = "map"
     flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, lambda: publisher.publish(good))
-    assert flight.last("to_go") == pytest.approx(900.0)
+    # the last line is a tangent to the last orbit, of the least radius at 25 m/s, 3 m/s of wind and 0.8 of a bank of 30 deg
+    radius = math.ceil((25.0 + 3.0) ** 2 / (9.80665 * math.tan(0.8 * math.radians(30.0))))
+    assert flight.last("to_go") == pytest.approx(math.sqrt(900.0**2 - radius**2))
     assert flight.last("target.altitude") == 55.0
 
 
