@@ -251,7 +251,7 @@ def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
     flight.update()
     head, _ = decoded(answer(flight, {}))
     assert head["topics"][0]["channels"][0].startswith("<img src=x onerror=alert(1)>\\x1b[2J")
-    assert head["faults"] == ["another aircraft in the namespace /other is not shown"]
+    assert head["faults"] == ["another aircraft in the namespace /other is not shown: --namespace /other"]
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 

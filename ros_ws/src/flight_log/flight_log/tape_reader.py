@@ -50,6 +50,7 @@ ROUTE = "route"
 BATCH = 512  # messages that are decoded together: of 1024, the tables are so large that the memory for each is new
 LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by the age of its sample
 RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
+UNSTAMPED = ("route",)  # plans, which are often published without a stamp
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
 
 T = TypeVar("T", bound=np.generic)
@@ -121,7 +122,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     filled = {
         topic: signal
         for topic, samples in log.topics.items()
-        if (signal := samples.signal(rests=topic.rpartition("/")[2] in RESTING)) is not None
+        if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
     without = [f"no stamp of {topic}" for topic, samples in log.topics.items() if samples.recording().unset]
@@ -267,10 +268,10 @@ class _TopicSamples:
                 return known, values[:, [names.index(name) for name in known]]
         return names, values
 
-    def signal(self, *, rests: bool) -> Signal | None:
-        """The samples in the order of the stamps; None without samples that have a stamp.
+    def signal(self, name: str) -> Signal | None:
+        """The samples of a topic in the order of the stamps; None without samples that have a stamp.
 
-        `rests`: equal stamps may follow on another, so that a stamp of 0 may be flight time.
+        Equal stamps may follow on another in RESTING topics, so that a stamp of 0 may be flight time. A plan needs no stamp.
         """
         self._decode_batch(end=True)
         if not self._samples:
@@ -278,8 +279,8 @@ class _TopicSamples:
         names = self._names()
         stamps, values = self._samples[names].stamp_ns.all(), self._samples[names].values.all()
         zero = stamps == 0
-        zeros, least = int(np.count_nonzero(zero)), len(stamps) - 1 if rests else 1
-        if zeros and (zeros > max(least, 1) or stamps.max() > SINCE_EPOCH_NS):
+        zeros, least = int(np.count_nonzero(zero)), len(stamps) - 1 if name in RESTING else 1
+        if name not in UNSTAMPED and zeros and (zeros > max(least, 1) or stamps.max() > SINCE_EPOCH_NS):
             self._unset = zeros
             stamps, values = stamps[~zero], values[~zero]
             if not len(stamps):

@@ -255,9 +255,9 @@ def identify(
     1. Trim, first in another process. 2. Step tests: `step_responses`. 3. The pairing, with outputs in units of the manoeuvre,
     and D from the minors. 4. Gains by the engineering procedure for y_dot = Omega u behind the lags; all other terms count as
     f. 5. A simulation in moderate turbulence with K and Lambda alone: the slew of its u replaces that of the ideal control
-    and gives beta; that of V is K Lambda times the rms of light turbulence. With `observer_margin`, the delay margin in s of
-    the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. The margins of that loop meet
-    `needed`, with 35 degrees of phase beside an observer. 6. Simulations of the result:
+    and gives beta; that of V is K bandwidth / 4 times the rms of light turbulence. With `observer_margin`, the delay margin in
+    s of the loop on y_dot = Omega u, an extended-state observer and the gains beside it replace them. The margins of that loop
+    meet `needed`, with 35 degrees of phase beside an observer. 6. Simulations of the result:
     in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by
     90 degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft
     whose `sideslip_zero` is positive, too.
@@ -297,7 +297,8 @@ def identify(
     turbulent = _load(scenario_text(first)).vary(aircraft={"turbulence": moderate_turbulence(altitude)})
     tape = simulate(without_beta(turbulent))
     slew = _slew(tape, measured.lag)
-    # V holds the wind itself: beta = K Lambda sigma, so that the sign moves the throttle no faster than Lambda does
+    # V holds the wind itself: beta = K bandwidth / 4 sigma, so that the sign moves the throttle no faster than the Lambda of
+    # the rule would, bandwidth / 4; the phase margin may ask for less Lambda
     sign = V_bandwidth**2 / 4.0 * LIGHT_SIGMA  # m/s^3
     slew[throttle] = sign / (gain_selection.BETA_TO_SLEW * abs(measured.Omega[throttle, throttle]))
     chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)

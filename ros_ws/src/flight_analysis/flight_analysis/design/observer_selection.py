@@ -8,7 +8,6 @@ then `effort` is raised, and K and the integral are lowered, in the channel in w
 the extended-state observer are taken as slower.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -246,7 +245,7 @@ def _within_margin(
 ) -> SelectedObserver:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
-    The plant is the nominal aircraft, then uncertain aircraft: the channel with the least phase margin of these is next.
+    The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
     """
     loop = Loop(model.lag, 0.0, model.period)  # the delay margin counts the declared delay too
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
@@ -262,7 +261,7 @@ def _within_margin(
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         law, uncertain = linear_law(controller.tuned_law(), m, model.period), plant._replace(A=plant.A[1:], B=plant.B[1:])
-        return np.asarray(loop_margins(uncertain, law, loop_of(controller)).phase.min(axis=0, initial=math.inf))
+        return np.asarray(loop_margins(uncertain, law, loop_of(controller)).phase.min(axis=0))
 
     def stepped(channel: int) -> SelectedObserver:
         return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])
@@ -277,7 +276,7 @@ def _within_margin(
         if selected.fraction < 1.0:
             best = max((stepped(channel) for channel in range(m)), key=lambda candidate: candidate.fraction)
             selected = best if best.fraction > selected.fraction else relaxed(selected.relaxation * RELAXATION)
-        elif (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
+        elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
             selected = stepped(int(np.argmin(worst)))
         else:
             break
