@@ -120,7 +120,7 @@ def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark)
 def test_score_of_campaign_is_that_of_single_process_simulation(wind: str, short: Benchmark) -> None:
     controller = short.scenario.controller
     gains = {key: np.array([getattr(controller, key)]).T for key in ("Lambda", "beta")}
-    gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.array([[short.scenario.rise_di().softening]])}
+    gains |= {"K": np.array([controller.law_params().K]).T, "softening": np.atleast_2d(short.scenario.rise_di().softening).T}
     (found,) = law_comparison.compare(short, {"rise": {"gust": as_tuned(gains)}}, 1, [0.3], 1)
     turbulence = MODERATE | {"seed": tuning.TUNING_TURBULENCE_SEED}
     flown = short.scenario if wind == GUST else short.scenario.vary(aircraft={"gusts": {}, "turbulence": turbulence})
