@@ -265,8 +265,9 @@ def test_any_registered_law_has_margins(law: str) -> None:
 
 def test_pi_is_rise_di_with_wide_sign() -> None:
     # A sign 1e6 lags wide has no slope: what is left is K (e + Lambda integral of e)
-    wide = margins(find_scenario("osprey_servo").vary(controller={"softening": 1e6, "k_g": 1.0}))
-    alone = margins(with_law("pi", {"K": [18.0, 18.0, 9.0, 2.0], "Lambda": [5.0, 5.0, 3.0, 0.5]}))
+    flown = find_scenario("osprey_servo").vary(controller={"softening": 1e6})
+    wide, params = margins(flown), flown.rise_di().law_params()
+    alone = margins(with_law("pi", {"K": params.K.tolist(), "Lambda": params.Lambda.tolist()}))
     np.testing.assert_allclose(wide.nominal.phase, alone.nominal.phase, rtol=1e-4)
     assert wide.delay == pytest.approx(alone.delay, abs=2e-4)
 
