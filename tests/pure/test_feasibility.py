@@ -23,6 +23,8 @@ CAN = Performance(
 )  # fmt: skip
 CORNER = (Waypoint(0, 0, 1000), Waypoint(3000, 0, 1050), Waypoint(3000, 3000, 1000))
 RADIUS, PERIOD = 580.0, 14.0  # m: (40 + 10)^2 / (g tan(24 deg)) = 572.6; s
+# The last line touches the last orbit, so that the corner turns by less than 90 deg.
+STRAIGHT = 3000.0 - RADIUS * math.tan((math.pi / 2.0 - math.asin(RADIUS / 3000.0)) / 2.0)
 
 
 def refusal(waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any) -> str:
@@ -41,7 +43,7 @@ def number(sentence: str) -> float:
 def test_route_within_all_limits_gives_legs() -> None:
     first, fillet, second, orbit = flyable_legs(CORNER, RADIUS, PERIOD, CAN)
     assert (type(first), type(fillet), type(second), type(orbit)) == (Line, Arc, Line, Arc)
-    assert first.end == pytest.approx((3000.0 - RADIUS, 0.0))
+    assert first.end == pytest.approx((STRAIGHT, 0.0))
 
 
 def test_a_speed_lasts_until_the_next_one() -> None:
@@ -79,9 +81,10 @@ def test_a_speed_below_the_floor_is_refused() -> None:
 def test_altitude_beyond_climb_to_next_point_refused(altitude: float, side: str, rate: float) -> None:
     route = (CORNER[0], CORNER[1]._replace(altitude=altitude), CORNER[2]._replace(altitude=altitude))
     sentence = refusal(route)
-    reach = math.floor(rate * (3000.0 - RADIUS) / 50.0)  # the straight part, with the wind from behind
+    reach = math.floor(rate * STRAIGHT / 50.0)  # the straight part, with the wind from behind
     assert sentence == (
-        f"route[1].altitude: found 300 m {side} the waypoint before, expected at most {reach} m at {rate:g} m/s over 2420 m"
+        f"route[1].altitude: found 300 m {side} the waypoint before, "
+        f"expected at most {reach} m at {rate:g} m/s over {STRAIGHT:.0f} m"
     )
     change = math.copysign(number(sentence), altitude - 1000.0)
     assert flyable_legs(

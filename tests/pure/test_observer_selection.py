@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Selection of an observer: shipped scenarios, delay margin, models that are refused, the one without A, the command."""
 
+import math
 from functools import cache
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from flight_analysis.design.observer_selection import (
     with_aircraft_observer,
     with_extended_state_observer,
 )
+from flight_analysis.design.requirement import Requirement
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
@@ -120,7 +122,8 @@ def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
 
 def test_extended_state_observer_needs_no_model_and_lowers_every_error() -> None:
     # The model y_dot = Omega u has none of the aircraft's damping: 12 ms there are 26 ms on the osprey. Only K of p is lowered.
-    selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.012)
+    without_margins = Requirement(phase=0.01, gain=1.01, sensitivity=math.inf, damping=1e-9, worst_phase=0.0)
+    selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.012, without_margins)
     assert selected.delay_margin >= 0.012
     np.testing.assert_array_equal(np.delete(selected.relaxation, 1), 1.0)
     controller = selected.controller
@@ -136,7 +139,7 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
         with_aircraft_observer(SERVO.rise_di(), flipped, gains, NOISE, 0.03)
     monkeypatch.setattr(observer_selection, "MAX_RELAXATION", 1.2)  # the search up to 18 takes half a minute
-    with pytest.raises(ParameterError, match=r"^--margin: found at most .* expected less than 500 ms$"):
+    with pytest.raises(ParameterError, match=r"^--margin: found at most .* expected less than 500 ms and 35 deg$"):
         with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.5)
     with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
         with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)
