@@ -45,7 +45,7 @@ def scenarios(servo: Scenario) -> dict[str, Scenario]:
     """osprey_servo by law and margin."""
     airframe, chosen = load_airframe("osprey"), {}
     for phase_margin in PHASE_MARGINS:
-        gains = select_gains(airframe, servo, samples=20, phase_margin=phase_margin, accept=True).engineering.controller
+        gains = select_gains(airframe, servo, samples=20, phase_margin=phase_margin, accept=True).chosen
         chosen[f"RISE-DI, {phase_margin:g} deg"] = replace(servo, controller=gains)
         chosen[f"PI, {phase_margin:g} deg"] = replace(servo, controller=as_pi(gains))
     return chosen

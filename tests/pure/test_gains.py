@@ -216,7 +216,7 @@ def test_airframe_with_unstable_zero_refused(osprey_gust: Scenario) -> None:
 
 
 def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:
-    controller = selected.engineering.controller
+    controller = selected.chosen
     params = controller.law_params()
     assert controller.outputs == ("q", "p", "r", "V")  # the slowest last, as (22) wants it
     # Products of 0.63, 0.63, 0.46, 0.46 rad over total lags of 0.035 and 0.115 s. By hand in flight, K of q and p were 18.
@@ -260,7 +260,7 @@ def test_a_written_gain_set_is_read_back(selected: selection.Selection) -> None:
     text = selection.as_yaml(selected)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
     read = RiseDiConfig.validate_mapping(section, "controller")
-    written = selected.engineering.controller
+    written = selected.chosen
     for key, value in written.model_dump(exclude_none=True).items():
         if isinstance(value, (str, bool)) or key in {"outputs", "inputs", "D"}:
             assert getattr(read, key) == value, key
@@ -436,7 +436,7 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
 ) -> None:
     margin = selected.engineering.delay_margin
     assert margin is not None
-    controller = selected.engineering.controller.model_copy(update={"delay": margin / 2.0})
+    controller = selected.chosen.model_copy(update={"delay": margin / 2.0})
     ratio = selection.stable_speed_ratio(osprey, controller)
     assert 1.0 < ratio < selection.MAX_SPEED_RATIO
     surfaces = np.array([name != "V" for name in controller.outputs])
@@ -444,7 +444,7 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
         scale = np.where(surfaces, factor**2, 1.0) * controller.input_scale
         scaled = controller.model_copy(update={"input_scale": tuple(scale.tolist())})
         assert (selection.assess_gains(osprey, scaled, SERVOS).delay_margin != 0.0) == stable
-    assert selection.stable_speed_ratio(osprey, selected.theorem.controller) == 0.0
+    assert selection.stable_speed_ratio(osprey, selected.literal) == 0.0
 
 
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
@@ -565,7 +565,7 @@ def test_limits_are_end_stops_of_own_aircraft() -> None:
     servo = find_scenario("osprey_servo")
     actuators = servo.aircraft.actuators.model_dump() | stops
     scenario = servo.vary(aircraft={"actuators": actuators})
-    chosen = select_gains("osprey", scenario, samples=2).engineering.controller
+    chosen = select_gains("osprey", scenario, samples=2).chosen
     assert chosen.inputs == ("elevator", "aileron", "rudder", "thrust")
     assert chosen.lower == (-0.35, -0.4, -0.35, -0.3)
     assert chosen.upper == (0.35, 0.4, 0.523599, 0.3)  # the limit of the rudder in the scenario is the tighter
@@ -573,5 +573,5 @@ def test_limits_are_end_stops_of_own_aircraft() -> None:
 
 def test_no_limits_of_another_aircraft() -> None:
     foreign = AIRFRAME.model_copy(update={"name": "unlike the osprey"})
-    chosen = select_gains(foreign, "osprey_servo", samples=2).engineering.controller
+    chosen = select_gains(foreign, "osprey_servo", samples=2).chosen
     assert (chosen.lower, chosen.upper, chosen.slew) == (None, None, None)

@@ -222,7 +222,7 @@ def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> 
 
 
 def test_airspeed_holds_wind_without_moving_throttle_from_stop_to_stop(cessna: IdentifiedAircraft) -> None:
-    controller, light, moderate = cessna.selection.engineering.controller, 1.52, 3.05  # m/s, rms of turbulence
+    controller, light, moderate = cessna.selection.chosen, 1.52, 3.05  # m/s, rms of turbulence
     K, V = 1.0 + controller.k_g, controller.outputs.index("V")
     # The c172p has 1.15 m/s^2 up, 0.38 rad/s times 3.05 m/s, and its engine's lag of 1.1 s would allow 0.42 rad/s.
     up = abs(cessna.responses.Omega[THROTTLE, THROTTLE]) * cessna.trim.upper[THROTTLE]

@@ -236,8 +236,8 @@ def test_another_law_leaves_the_gains_of_the_law_before() -> None:
 
 def test_selected_gains_fly() -> None:
     selection = rise_di.select_gains("osprey", SCENARIO, samples=2, lag=np.zeros(4), delay=np.float64(0.0))
-    chosen = SCENARIO.vary(controller=selection.engineering.controller)
-    assert chosen.controller == selection.engineering.controller
+    chosen = SCENARIO.vary(controller=selection.chosen)
+    assert chosen.controller == selection.chosen
     assert rise_di.simulate(chosen).outcome == "completed"
     assert "/**/controller" in rise_di.gains_yaml(selection)
     checked = rise_di.check_gains(rise_di.load_airframe("osprey"), chosen, samples=2)

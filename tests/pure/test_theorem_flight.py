@@ -59,7 +59,7 @@ def test_written_gains_are_those_of_the_theorem(selection: tuple[Path, gain_sele
     text = gain_selection.as_yaml(selected, theorem=True)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
     assert "by Theorem 1" in text
-    np.testing.assert_allclose(section["beta"], selected.theorem.controller.beta, rtol=1e-5)
+    np.testing.assert_allclose(section["beta"], selected.literal.beta, rtol=1e-5)
     assert section["Lambda"] == [1.0] * 4
 
 

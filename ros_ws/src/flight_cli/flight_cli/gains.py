@@ -122,8 +122,8 @@ def gains(
                 phase_margin=phase_margin,
                 accept=accept,
             )
-            both = {"theorem": selection.theorem, "engineering": selection.engineering}
-            answers, origin = {"observer": selection.engineering} if observer else both, selection.origin
+            engineering, origin = selection.engineering, selection.origin
+            answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
                 write_text("--write", write, HEADER + gain_selection.as_yaml(selection, theorem=theorem))
@@ -151,7 +151,7 @@ def _require_margins(found: Assessment, accept: bool) -> None:
 
 def _show_trade(console: Console, selection: Selection) -> None:
     """The error of the linear loop along the manoeuvre against the phase margin."""
-    controller, frame = selection.engineering.controller, selection.study.airframe
+    controller, frame = selection.chosen, selection.study.airframe
     outputs, of_outputs = controller.outputs, frame.units_of_outputs()
     shown = [display_unit(of_outputs[name]) for name in outputs]
     counted = all(quantity(unit).dimension in SCORE_UNIT for unit in of_outputs.values())  # no score of a height

@@ -425,7 +425,7 @@ def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
         "sideslip_zero": found.sideslip_zero,
         "lost": found.failure,
         "delay_margin": found.selection.engineering.delay_margin,
-        "controller": found.selection.engineering.controller.model_dump(exclude_defaults=True),
+        "controller": found.selection.chosen.model_dump(exclude_defaults=True),
         "flights": {title: flight._asdict() for title, flight in found.flights.items()},
         "scenario": str(path),
     }

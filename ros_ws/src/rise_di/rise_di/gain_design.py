@@ -3,6 +3,7 @@
 """Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,7 +52,7 @@ def select_gains(
 ) -> Selection:
     """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
 
-    The commands, the gusts and the loop are those of the scenario. `scenario.vary(controller=selection.engineering.controller)`
+    The commands, the gusts and the loop are those of the scenario. `scenario.vary(controller=selection.chosen)`
     flies the engineering gains; `gains_yaml` writes them as a section of a scenario file.
 
     Args:
@@ -91,8 +92,8 @@ def select_gains(
     if not observer:
         return selection
     needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
-    controller, origin = observed(selection.engineering.controller, chosen, known_model, margin, needed)
-    return selection._replace(engineering=gain_selection.assess_gains(selection.study, controller, setting), origin=origin)
+    controller, origin = observed(selection.chosen, chosen, known_model, margin, needed)
+    return replace(selection, chosen=controller, origin=origin)
 
 
 def check_gains(

@@ -87,11 +87,11 @@ def loop_assessment(of: LinearLoop) -> LoopMargins:
 def _least_delay(of: LinearLoop, nominal: float) -> float:
     """The smallest delay margin of the uncertain aircraft, at most the nominal delay margin, s.
 
-    The aircraft are tried together with a delay in steps of half a period, or of 1/32 of a longer nominal margin.
+    The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer nominal margin.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
     uncertain = LinearPlant(of.plant.A[1:], of.plant.B[1:], of.plant.C)
-    for delay in np.append(np.arange(0.0, longest, max(of.loop.period / 2.0, longest / 32.0)), longest):
+    for delay in np.append(np.arange(0.0, longest, max(of.loop.period / 2.0, longest / 12.0)), longest):
         matrices = closed_loop(uncertain, of.law, of.loop, np.full(len(of.inputs), delay))
         radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
         unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)

@@ -252,7 +252,7 @@ def flying_scenario(
     studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
     selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}, requirement=needed))
-    flown, margins = _within_margins(_with_integrals(selection.engineering.controller, pairing, found, loop), frame, needed)
+    flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, found, loop), frame, needed)
     turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
     model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))

@@ -9,6 +9,8 @@ scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -172,14 +174,25 @@ class GainAssessment(NamedTuple, Generic[Controller]):
         return gain_conditions.failing((*self.theorem, *self.loop))
 
 
-class Selection(NamedTuple):
-    """Both gain sets for an airframe."""
+@dataclass(frozen=True)
+class Selection:
+    """Both gain sets for an airframe. A set is assessed on first use, for the margins of all samples cost most."""
 
     study: Study
     setting: LoopSetting
-    theorem: GainAssessment[RiseDiConfig]
-    engineering: GainAssessment[RiseDiConfig]
+    literal: RiseDiConfig  # the gain set of Theorem 1
+    chosen: RiseDiConfig  # the engineering gains
     origin: str = ""  # of the gains beside an observer, a sentence
+
+    @cached_property
+    def theorem(self) -> GainAssessment[RiseDiConfig]:
+        """The gain set of Theorem 1, assessed."""
+        return assess_gains(self.study, self.literal, self.setting)
+
+    @cached_property
+    def engineering(self) -> GainAssessment[RiseDiConfig]:
+        """The engineering gains, assessed."""
+        return assess_gains(self.study, self.chosen, self.setting)
 
 
 # The manoeuvre and the ideal control along it
@@ -417,7 +430,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
     chosen = (within_requirement(engineering, setting.requirement) if behind_servos else first).controller
     chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
-    return Selection(study, setting, assess_gains(study, literal, setting), assess_gains(study, chosen, setting))
+    return Selection(study, setting, literal, chosen)
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:

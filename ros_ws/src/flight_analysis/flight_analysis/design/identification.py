@@ -9,6 +9,7 @@ inputs measured in flight. No number in this module is specific to an aircraft.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -223,7 +224,7 @@ class IdentifiedAircraft(NamedTuple):
     @property
     def D(self) -> tuple[int, ...]:  # noqa: N802 - the paper's name
         """D in the canonical order of the inputs."""
-        controller = self.selection.engineering.controller
+        controller = self.selection.chosen
         return tuple(controller.D[controller.inputs.index(name)] for name in INPUTS)
 
     def scenario(self) -> Scenario:
@@ -327,14 +328,14 @@ def slowest_trim(condition: FlightCondition) -> float:
 
 def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
     """The selection with an extended-state observer in its engineering gains; Omega in the aircraft's order."""
-    controller = selection.engineering.controller
+    controller = selection.chosen
     rows = [list(OUTPUTS).index(name) for name in controller.outputs]
     columns = [list(INPUTS).index(name) for name in controller.inputs]
     size = sizes(OUTPUTS[name] for name in controller.outputs)
     needed = selection.setting.requirement
     needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
     observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed)
-    return selection._replace(engineering=gain_selection.assess_gains(selection.study, observed.controller, selection.setting))
+    return replace(selection, chosen=observed.controller)
 
 
 def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:

@@ -266,4 +266,4 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
         return None
     keys = TopicAccount._fields
     topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
-    return Account(content["end"], topics, tuple(content["lacks"]))
+    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"])
