@@ -110,6 +110,21 @@ class BridgeSetup:
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5, each=command)
 
+    def kill_engaged_bridge(self, autopilot: Process) -> tuple[float, int]:
+        """Kill an engaged bridge; the instant of the system clock and the timeouts of the autopilot before.
+
+        A delay of the host can release the channels just before: then the bridge has said NaN, and a new bridge engages.
+        """
+        while True:
+            bridge = self.bridge("-p", "dry_run:=false")
+            self.engage_from_trim()
+            before = autopilot.lines.count("timeout")
+            bridge.popen.kill()
+            killed = time.time()
+            self.peer.spin(LATE)
+            if all(map(math.isfinite, self.joys[-1].axes)):
+                return killed, before
+
     def until_released(self, bridge: Process, command: Callable[[], None], *reason: str) -> None:
         """Wait until the bridge releases the channels for this reason, while u is published."""
         words = ("ENGAGED -> RELEASE: ", *reason)
@@ -263,13 +278,8 @@ def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channel
     assert len(setup.joys) > 5
     assert all(map(math.isnan, setup.joys[-1].axes))
 
-    other = setup.bridge("-p", "dry_run:=false")
-    before = autopilot.lines.count("timeout")  # it may have timed out while it was stopped
-    setup.engage_from_trim()
-    other.popen.kill()
-    killed = time.time()
+    killed, before = setup.kill_engaged_bridge(autopilot)
     setup.peer.until(lambda: autopilot.lines.count("timeout") > before)  # the autopilot's own timeout
-    setup.peer.spin(LATE)
     finite, released = setup.after(killed)
     assert max(finite, default=0.0) < LATE
     assert not released
