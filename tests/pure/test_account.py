@@ -15,12 +15,14 @@ from tests.damaged import DAMAGES, damage
 from tests.recordings import EPOCH
 
 from flight_analysis.metrics import error_metrics, sample_times
+from flight_analysis.report.account import Account, account_of_json
 from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
 from flight_analysis.report.summary import taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.scenarios import find_scenario
 from flight_cli.replay import replay
 from flight_cli.report import report
+from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_log.clock import StampClock
@@ -138,6 +140,25 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
     summary = read_flight(run).summary
     assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
     assert summary["outcome"] == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+
+
+def test_flight_without_step_of_guidance_is_outcome(tmp_path: Path) -> None:
+    """A y that is 20 ms late is too old for guidance with a limit of 1 ms."""
+    late: dict[str, Any] = {
+        "aircraft": {"sensors": {"delay": 0.02}},
+        "guidance": {"max_age": 1e-3},
+        "flight": {"duration": 0.5},
+    }
+    summary = fly_and_report(find_scenario("osprey_route").vary(**late), tmp_path).flight.summary
+    assert summary["outcome"].startswith("never flew guided: guidance took no step")
+    assert exit_status(summary["outcome"]) == STATUS_ENDED_EARLY
+
+
+def test_account_survives_summary(figures: dict[str, Any]) -> None:
+    busy = "this host is too busy: 147 of 2001 y were never sent; see docs/faults.md"
+    of = Account(2.0, {}, ("y 1 of 2 samples",), busy, unguided=True)
+    assert account_of_json(figures | {"account": json.loads(json.dumps(of.as_json()))}) == of
+    assert account_of_json({"account": None}) is None
 
 
 def stamps(*parts: range) -> Iterator[Any]:

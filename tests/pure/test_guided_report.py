@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from rich.console import Console
 from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
@@ -23,6 +24,7 @@ from flight_analysis.report.plotting import Figure
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.tables import flight_tables
 from flight_bringup.scenarios import find_scenario
+from flight_cli.output import show_flight
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import path
@@ -200,6 +202,11 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     bounds = guided_figures.bounds_of(flight.scenario)
     assert bounds["V"] == (0.8 * 25.0, 1.4 * 25.0)  # by rule, without a stall speed and a limit
     assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
+
+
+def test_fly_names_each_leg(flight: RecordedFlight, capsys: pytest.CaptureFixture[str]) -> None:
+    show_flight(Console(), flight)
+    assert "legs: 0 not ended\n" in capsys.readouterr().out
 
 
 def test_comparison_draws_all_ground_tracks_over_route(flight: RecordedFlight, tmp_path: Path) -> None:

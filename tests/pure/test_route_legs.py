@@ -10,7 +10,9 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices
+from flight_analysis.report.account import account, final_outcome
+from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
+from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
@@ -260,6 +262,10 @@ def test_summary_says_which_legs_were_flown() -> None:
         FlownLeg(2, 5.0, 5.0, 9.0, "not ended", 0.0),
     ]
     assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
+    assert leg_results([leg._asdict() for leg in flown_legs(tape)]) == "legs: 0 flown, 1 missed by 321 m, 2 not ended"
+    outcome = final_outcome(COMPLETED, account(tape, None))
+    assert (outcome, exit_status(outcome)) == ("completed, missed leg 1 by 321 m", STATUS_INCOMPLETE)
+    assert final_outcome(outcome, account(tape, None)) == outcome
 
 
 def test_flight_carried_back_is_noticed_once() -> None:

@@ -61,7 +61,8 @@ def fly(
 ) -> None:
     """Fly a scenario: aircraft, reference model, controller, recorder, guidance as processes over ROS 2 topics, in real time.
 
-    Exit status: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log, 130 interrupted.
+    Exit status: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a missed leg,
+    130 interrupted.
     """
     chosen = find_scenario(scenario, duration)
     require(

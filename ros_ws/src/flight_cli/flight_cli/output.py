@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from flight_analysis.report.guided import leg_results
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -51,6 +52,8 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         console.print(grouped_table(title, "input", columns, rows))
     if summary["guidance"]:
         console.print(_guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")))
+        if legs := leg_results(summary["guidance"]["legs"]):
+            console.print(legs, highlight=False, soft_wrap=True)
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"] if note != busy)):
         console.print(line, highlight=False)

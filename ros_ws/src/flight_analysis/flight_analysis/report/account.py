@@ -10,8 +10,9 @@ import numpy as np
 
 from aircraft_sim.pose import every
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.report.guided import FlownLeg, flown_legs
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, NEVER_FLEW, UNKNOWN
+from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, UNKNOWN
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
@@ -55,6 +56,7 @@ class Account(NamedTuple):
     lacks: tuple[str, ...]
     busy: str = ""  # the sentence on a host that left out samples and ticks
     unguided: bool = False  # the controller was engaged, and guidance took no step
+    legs: tuple[FlownLeg, ...] = ()  # of the route, in order
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -69,19 +71,25 @@ class Account(NamedTuple):
         return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in self.lacks))
 
     def as_json(self) -> dict[str, Any]:
-        """The account for `summary.json`."""
+        """The account for `summary.json`, which has the legs in `guidance`."""
         topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
-        return {"end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy}
+        return {
+            "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
+        }  # fmt: skip
 
 
 def final_outcome(outcome: str, account: Account) -> str:
-    """The outcome with what the log lacks: "completed, log incomplete: ...". An early end stays as it is."""
-    base = outcome.partition(f", {INCOMPLETE}")[0]
+    """The outcome with the missed legs and with what the log lacks: "completed, missed leg 2 by 35 m, log incomplete: ...".
+
+    An early end stays as it is.
+    """
+    base = outcome.partition(f", {INCOMPLETE}")[0].partition(f", {MISSED} leg ")[0]
     if base == COMPLETED and account.unguided:
         return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
-    if not account.lacks or not base.startswith((COMPLETED, UNKNOWN)):
+    if not base.startswith((COMPLETED, UNKNOWN)):
         return base
-    return f"{base}, {INCOMPLETE}: {'; '.join(account.lacks)}"
+    missed = [f", {MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed]
+    return "".join([base, *missed, *([f", {INCOMPLETE}: {'; '.join(account.lacks)}"] if account.lacks else [])])
 
 
 def flown(tape: Tape) -> Tape:
@@ -144,7 +152,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         for name, topic in topics.items()
         if topic.expected is not None and topic.unsent > (1.0 - WHOLE) * topic.expected
     ]
-    return Account(end, topics, (*_lost_parts(tape.notes), *lacks), _too_busy(busy), unguided)
+    legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
+    return Account(end, topics, (*_lost_parts(tape.notes), *lacks), _too_busy(busy), unguided, tuple(legs))
 
 
 RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
@@ -266,4 +275,5 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
         return None
     keys = TopicAccount._fields
     topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
-    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"])
+    legs = tuple(FlownLeg(**leg) for leg in (summary["guidance"] or {}).get("legs", ()))
+    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"], content.get("unguided", False), legs)

@@ -3,7 +3,7 @@
 """Figures of merit of a guided flight: the segments, by mode and leg, with the errors of the held quantities."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,6 +110,12 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
         joined = float(t[first + on_leg[0]]) if len(on_leg) else None
         flown.append(FlownLeg(int(legs[first]), float(t[first]), joined, float(t[min(after, len(t) - 1)]), result, missed))
     return flown
+
+
+def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:
+    """The legs of a summary with their results: "legs: 0 flown, 1 missed by 321 m, 2 not ended"; empty without legs."""
+    results = [f"{leg['leg']} {leg['result']}" + (f" by {leg['missed']:.0f} m" if leg["missed"] else "") for leg in legs]
+    return f"legs: {', '.join(results)}" if results else ""
 
 
 def control_errors(tape: Tape) -> dict[str, FloatArray]:

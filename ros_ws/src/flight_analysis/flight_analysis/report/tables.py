@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
-from flight_analysis.report.guided import BANDS
+from flight_analysis.report.guided import BANDS, leg_results
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
     INPUT_COLUMNS,
@@ -121,7 +121,7 @@ def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
 
 
 def _guidance_table(summary: Mapping[str, Any]) -> Table:
-    guidance = summary["guidance"] or {"segments": ()}
+    guidance = summary["guidance"] or {"segments": (), "legs": ()}
     metrics = ("rms", "max", "overshoot", "settling")
     columns = [Column("", head) for head in ("from (s)", "to (s)")]
     for group in ("lateral", "vertical"):
@@ -136,7 +136,8 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
             factors = (factor, factor, factor, 1.0)
             row += [f"{quantity['quantity']} ({unit})", *map(format_value, (quantity[name] for name in metrics), factors)]
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
-    return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, GUIDANCE_LEGEND if rows else "")
+    legend = "; ".join(filter(None, [leg_results(guidance["legs"]), GUIDANCE_LEGEND])) if rows else ""
+    return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
