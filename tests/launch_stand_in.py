@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from operator import attrgetter
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from flight_core.environment import PROFILE_VARIABLE
@@ -60,10 +60,15 @@ class RosNode:
 
     def __init__(self) -> None:
         self.subscriptions: dict[str, Callable[[Any], None]] = {}
+        self.published: list[tuple[str, bytes]] = []
 
     def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any) -> None:
         """Keep the callback by the topic."""
         self.subscriptions[topic] = callback
+
+    def create_publisher(self, kind: type, topic: str, qos: Any) -> Any:
+        """A publisher that keeps the messages with the topic."""
+        return SimpleNamespace(publish=lambda message: self.published.append((topic, message)))
 
     def create_timer(self, period: float, callback: Callable[[], None]) -> None:
         """Accept a timer, which never fires here."""

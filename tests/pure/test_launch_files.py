@@ -34,6 +34,7 @@ from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import LogAttachments
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
+from flight_ros.messages import stamp_of
 from flight_ros.topics import NodeState
 from flight_ros.transport import DISCOVERY_VARIABLE
 
@@ -250,12 +251,30 @@ def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> 
     return context.handle(actions)
 
 
-def test_flight_ends_once_log_holds_it(tmp_path: Path) -> None:
+FLYING = ("recorder", "controller", "aircraft", "reference_model")
+
+
+def all_matched(follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING) -> list[Any]:
+    """The actions once these nodes are matched; a node may be flying before this launch has discovered it."""
+    states = {"aircraft": NodeState.FLYING}
+    return [
+        action for name in names for action in publish(follow, context, f"/{name}#{PID}", states.get(name, NodeState.MATCHED))
+    ]
+
+
+def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path: Path) -> None:
     actions, context = started("fly", duration=5, runs=tmp_path)
     follow = all_ready(actions, context)
-    start = overrides(nodes(follow)["reference_model"])["start_time"]
-    assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # the half second in which nodes discover each other
+    assert overrides(nodes(follow)["reference_model"])["start_time"] == -1.0
     assert not any(ends(timer.actions) for timer in every(TimerAction, follow))
+    assert not all_matched(follow, context, FLYING[:-1])
+    assert not flown_to(context, follow, time.time() + 5.0)
+    assert context.ros_node.published == []
+    all_matched(follow, context, FLYING[-1:])
+    ((topic, message),) = context.ros_node.published
+    start = stamp_of(message) / NANOSECONDS
+    assert topic == "/start"
+    assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # half a second in which `start` reaches the nodes
     assert not flown_to(context, follow, start + 4.9)
     flown = flown_to(context, follow, start + 5.0)
     assert ends(flown)
@@ -267,18 +286,19 @@ def test_flight_ends_once_log_holds_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("states", "reason"),
     [
-        ({}, "never flew: aircraft, reference_model not ready after 20 s"),
-        ({"aircraft": "ready"}, "never flew: reference_model not ready after 20 s"),
-        ({"aircraft": "ready", "reference_model": "ready"}, "never flew: y did not reach the controller"),
-        ({"aircraft": "ready", "reference_model": "ready", "flying": "flying"}, ""),
+        (FLYING[:2], "never flew: aircraft, reference_model not ready, or with an input without a publisher, after 20 s"),
+        (FLYING[:3], "never flew: reference_model not ready, or with an input without a publisher, after 20 s"),
+        (FLYING, "never flew: y did not reach the controller"),
+        ((*FLYING, "flying"), ""),
     ],
 )
-def test_flight_without_u_at_aircraft_never_flew(states: dict[str, str], reason: str, tmp_path: Path) -> None:
+def test_flight_without_u_at_aircraft_never_flew(states: Sequence[str], reason: str, tmp_path: Path) -> None:
     actions, context = started("fly", duration=5, runs=tmp_path)
     follow = all_ready(actions, context)
     timers = every(TimerAction, follow)[:1]
-    for name, state in states.items():
-        timers += every(TimerAction, publish(follow, context, f"/{'aircraft' if state == 'flying' else name}#{PID}", state))
+    for name in states:
+        key, state = ("aircraft", NodeState.FLYING) if name == "flying" else (name, NodeState.MATCHED)
+        timers += every(TimerAction, publish(follow, context, f"/{key}#{PID}", state))[:1]
     checks = [check for timer in timers for check in every(OpaqueFunction, timer.actions)]
     if not reason:
         assert [check.function(context) for check in checks] == [None, None]

@@ -14,7 +14,7 @@ from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.graph import GUIDANCE, parameter_overrides
+from flight_bringup.graph import GUIDANCE, ON_START, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 from flight_bringup.scenarios import find_scenario
 
@@ -90,7 +90,8 @@ ROLES = ("aircraft", "reference_model", "controller", "recorder")
 
 def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
-    processes = [start_node(package) for package in packages]
+    processes = [start_node(package, "-p", "start_time:=-1.0") for package in packages[1:3]]
+    processes += [start_node(package) for package in (packages[0], packages[3])]
     for process in processes:
         process.wait_for("ready")
     real_time = discovered(peer_node, ROLES)
@@ -108,7 +109,7 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, t
 def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Path, peer_node: Peer) -> None:
     scenario, found = find_scenario("osprey_route"), Access(*[frozenset()] * 4)
     for lockstep in (False, True):
-        overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, 0.0, lockstep=lockstep)
+        overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, ON_START, lockstep=lockstep)
         words = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
         node = start("flight_guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
         found = found.merged(discovered(peer_node, ("guidance",))["guidance"])

@@ -5,6 +5,8 @@
 A watchdog measures the age of u. A u that times out gets the failsafe: hold the last value, then ramp it to trim.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
@@ -18,6 +20,7 @@ from flight_core.text import bounded
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import NO_CHANNELS, Decoder, instant, stamp_of
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import CLOCK, POSE, RECORDED, TRUTH, NodeState, U, Y
 
@@ -59,8 +62,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
     def period_ns(self) -> int:
         return self._simulator.period_ns
 
-    def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time) or super().start_ns()
+    def inputs(self) -> Sequence[PolledSubscription]:
+        return (self._u_receiver.subscription,)
 
     def on_parameters(self, parameters: AircraftConfig) -> None:
         """Begin and end faults between two samples."""

@@ -147,7 +147,7 @@ class AircraftConfig(NodeConfig):
         description="the integration step, s; a whole fraction of 1 / rate"
     )
     start_time: float = Field(
-        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
     gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
     turbulence: TurbulenceConfig | None = Field(default=None, description="turbulence along all axes of the airframe's gusts")

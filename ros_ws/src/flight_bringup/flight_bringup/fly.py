@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
-from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
+from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
@@ -84,7 +84,9 @@ def fly_over_topics(
                 scenario, run, monitor, lockstep=lockstep, one_process=one_process, autopilot=autopilot
             ) as processes,
         ):
-            if lockstep:
+            if reason := processes.begin():
+                processes.outcome = reason
+            elif lockstep:
                 processes.outcome = _follow_lockstep(scenario, processes, monitor, progress)
             else:
                 begins = autopilot is None and scenario.controller.autostart and scenario.controller.start_active
@@ -104,7 +106,6 @@ class _Span:
         self._duration, self._processes, self._monitor = scenario.flight.duration, processes, monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
         self._moved = 0.0  # s, flight time of the last change
-        self._ready = math.inf  # s, flight time at which each node was ready
         self._flies = False
         self.engaged = False  # the controller has published
 
@@ -119,13 +120,7 @@ class _Span:
     def failed(self, t: float) -> str:
         """Why the flight has not begun; empty while it may begin, and from the first u on."""
         self._flies = self._flies or self._processes.is_flying()
-        if self._flies:
-            return ""
-        if self._ready == math.inf and not (waiting := self._processes.waiting()):
-            self._ready = max(t, 0.0)
-        if self._ready == math.inf:
-            return f"{NEVER_FLEW}: {', '.join(waiting)} not ready at t = {t:.0f} s" if t > READY_TIMEOUT else ""
-        if t < self._ready + FIRST_U:
+        if self._flies or t < FIRST_U:
             return ""
         if self.engaged:
             return f"{NEVER_FLEW}: u did not reach the aircraft"

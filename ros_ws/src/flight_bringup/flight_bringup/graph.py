@@ -111,6 +111,10 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
     return stage if scenario.guidance is None else (*stage, GUIDANCE)
 
 
+ON_START = -1.0  # `start_time` of nodes that wait for t = 0 on the topic `start`
+LEAD = 0.5  # s, from the sending of t = 0 on `start` to t = 0: a busy host delivers within it
+
+
 def start_lead(startup: float) -> float:
     """Time from the start of the second stage to t = 0, s, given the time until the first stage was ready.
 
@@ -129,8 +133,8 @@ def parameter_overrides(
 ) -> ParameterOverrides:
     """The parameters of a process beside the section of the scenario file; "node:name" for several nodes.
 
-    Real time: the nodes with a t = 0 get the instant. Lockstep: the aircraft gets the rate of u and the duration, controller
-    and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule. The
+    Real time: the nodes with a t = 0 get the instant, or ON_START. Lockstep: the aircraft gets the rate of u and the duration,
+    controller and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule. The
     recorder gets the files to attach to the log; this function writes the files into the folder of the run. With an autopilot
     the bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts inactive.
     """

@@ -6,11 +6,11 @@ import os
 
 from flight_core.modes import Mode
 from flight_core.parameters import require
-from flight_core.rates import seconds
+from flight_core.rates import nanoseconds, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError, FloatArray
 from flight_ros.client import Client
-from flight_ros.messages import Decoder, stamp_of
+from flight_ros.messages import Decoder, instant, stamp_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import (
     ENGAGEMENT,
@@ -20,6 +20,8 @@ from flight_ros.topics import (
     NODE_STATE,
     PUBLISH,
     RECORDED,
+    START,
+    STATE,
     STATES,
     Y_M,
     NodeState,
@@ -39,12 +41,22 @@ class FlightMonitor(Client):
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process
+        self._publish_start = None if lockstep else self._node.create_publisher(START.type, START.name, STATE).publish
         self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def is_ready(self, node: str, pid: int) -> bool:
         """Whether the loop of a node runs. The process id tells it from a node of that name in another flight."""
         return self._state(node, pid) in {*NodeState}
+
+    def is_matched(self, node: str, pid: int) -> bool:
+        """Whether each input of a node has a publisher."""
+        return self._state(node, pid) in {*NodeState} - {NodeState.READY}
+
+    def start(self, start_time: float) -> None:
+        """Give the nodes the system time of t = 0, s."""
+        if self._publish_start is not None:
+            self._publish_start(instant(nanoseconds(start_time)))
 
     def is_flying(self, node: str, pid: int) -> bool:
         """Whether the aircraft has taken a u."""

@@ -22,6 +22,8 @@ from flight_bringup.graph import (
     AIRCRAFT,
     BRIDGE,
     FIRST_STAGE,
+    LEAD,
+    ON_START,
     ONE_PROCESS,
     RECORDER,
     Autopilot,
@@ -32,7 +34,7 @@ from flight_bringup.graph import (
     start_lead,
 )
 from flight_core.files import write_file
-from flight_core.outcome import INTERRUPTED, LOST_CONTACT
+from flight_core.outcome import INTERRUPTED, LOST_CONTACT, NEVER_FLEW
 from flight_core.parameters import ParameterError
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
@@ -46,7 +48,7 @@ CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host o
 READY_TIMEOUT = 20.0  # s
 DISCOVERY_TIME = 0.5  # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
-FIRST_U = 5.0  # s, from the time at which each node is ready to the first u that the aircraft takes
+FIRST_U = 5.0  # s, from t = 0 to the first u that the aircraft takes
 LOG_TIMEOUT = 5.0  # s, after the duration, without a change of the log
 POLL_PERIOD = 0.005  # s, while nodes start
 
@@ -123,7 +125,8 @@ class NodeProcess:
 class FlightProcesses:
     """All processes of one flight. A context manager: its exit stops them.
 
-    `monitor` reports the nodes that are ready. With an autopilot the bridge starts in the aircraft's place.
+    `monitor` reports the nodes that are ready. With an autopilot the bridge starts in the aircraft's place. A flight in real
+    time with an aircraft has its t = 0 from `begin`.
     """
 
     def __init__(
@@ -144,8 +147,9 @@ class FlightProcesses:
             self._first, self._second = (), (ONE_PROCESS,)
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
-        self.start_time = math.inf  # system time of t = 0, s; set once the first stage is ready
+        self.start_time = math.inf  # system time of t = 0, s
         self.started = math.inf  # the same on the monotonic clock, as the nodes count: a step of the system clock is none of t
+        self._on_start = not lockstep and autopilot is None
 
     def __enter__(self) -> Self:
         try:
@@ -156,15 +160,41 @@ class FlightProcesses:
             if not self._first:  # whose start gives the monitor the time to discover another flight
                 time.sleep(DISCOVERY_TIME)
             self._monitor.require_free_domain()
-            lead = start_lead(time.monotonic() - begin)
-            self.start_time, self.started = start_instant(lead), time.monotonic() + lead
+            if not self._on_start:
+                self._set_start(start_lead(time.monotonic() - begin))
             for node in self._second:
                 self._start(node)
             leave_real_time_priority()  # the nodes have it
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, ParameterError):
+                self.outcome = f"{NEVER_FLEW}: {error}"
             self.stop()
             raise
         return self
+
+    def _set_start(self, lead: float) -> None:
+        self.start_time, self.started = start_instant(lead), time.monotonic() + lead
+
+    def begin(self) -> str:
+        """Set t = 0 once each node is ready and each input has a publisher. Returns why the flight cannot begin, else ""."""
+        deadline = time.monotonic() + READY_TIMEOUT
+        while self._on_start and (waiting := self._unmatched()):
+            if (reason := self.ended_early()) is not None:
+                return reason
+            if time.monotonic() > deadline:
+                return f"{NEVER_FLEW}: {'; '.join(waiting)} after {READY_TIMEOUT:g} s"
+            time.sleep(POLL_PERIOD)
+        if self._on_start:
+            self._set_start(LEAD)
+            self._monitor.start(self.start_time)
+        return ""
+
+    def _unmatched(self) -> list[str]:
+        """What the flight waits for before t = 0, by node."""
+        names = [(process.node.executable, process.popen.pid) for process in self.processes]
+        ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
+        without = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
+        return [f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}" for name in without]
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -172,8 +202,9 @@ class FlightProcesses:
     def _start(self, node: NodeSpec) -> None:
         log = self._run / "log" / f"{node.executable}.log"
         log.parent.mkdir(parents=True, exist_ok=True)
+        start = ON_START if self._on_start else self.start_time
         overrides = parameter_overrides(
-            node, self._scenario, self._run, self.start_time, lockstep=self._lockstep, autopilot=self._autopilot
+            node, self._scenario, self._run, start, lockstep=self._lockstep, autopilot=self._autopilot
         )
         if node is BRIDGE:
             overrides = {**overrides, "first_y": FIRST_Y}

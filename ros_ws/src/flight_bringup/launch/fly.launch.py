@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_gust.
 
-The same graph and the same scenario file as `rise-di fly`. The flight begins once recorder and controller are ready. It ends
+The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is ready and matched. It ends
 once the log holds the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a
 node ends, is not ready, or when no u reaches the aircraft.
 """
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,12 +16,21 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
 from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
-from flight_bringup.graph import AIRCRAFT, CONTROLLER, FIRST_STAGE, RECORDER, NodeSpec, parameter_overrides, second_stage
+from flight_bringup.graph import (
+    AIRCRAFT,
+    CONTROLLER,
+    FIRST_STAGE,
+    ON_START,
+    RECORDER,
+    NodeSpec,
+    parameter_overrides,
+    second_stage,
+)
 from flight_bringup.launch.stages import (
     BOOLEAN,
     argument,
+    begin_when_matched,
     complete,
-    complete_when_flown,
     end_with_launch,
     flight_node,
     namespace_argument,
@@ -72,22 +80,23 @@ def _fly(context: LaunchContext) -> list[Action]:
     run = new_run(scenario, Path(argument(context, "runs")))
     end_with_launch(context)
 
-    def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
+    def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
         return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         nodes, duration = second_stage(scenario), scenario.flight.duration
+        begins = not lockstep and scenario.controller.autostart and scenario.controller.start_active
         if lockstep:
             end: list[Action] = [on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))]
-        elif scenario.controller.autostart and scenario.controller.start_active:
-            end = complete_when_flown(context, run, nodes, start_time, duration, by_rosbag2=by_rosbag2)
+        elif begins:
+            end = begin_when_matched(context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2)
         else:  # a user activates the controller, or no user does
             end = [TimerAction(period=lead + duration, actions=complete(run))]
-        return [*end, *(node(spec, start_time) for spec in nodes)]
+        return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
     actions = watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in first}, follow)
     if by_rosbag2:
-        overrides = parameter_overrides(RECORDER, scenario, run, math.inf, lockstep=False)
+        overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
         actions.append(rosbag2(context, scenario, overrides))
     return actions

@@ -3,7 +3,7 @@
 """The guidance node: from pose, y, target and route to u_m, in real time or in lockstep."""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -31,6 +31,7 @@ from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.receiver import Receiver, require_size
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
     GUIDANCE,
@@ -111,8 +112,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def period_ns(self) -> int:
         return self._guidance.period_ns
 
-    def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time) or super().start_ns()
+    def inputs(self) -> Sequence[PolledSubscription]:
+        return self._y.subscription, self._pose.subscription
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         for receiver in (self._internals, self._y, self._pose):

@@ -114,7 +114,7 @@ class GuidanceConfig(NodeConfig):
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(default=50.0, description="the rate at which u_m is published, Hz")
     start_time: float = Field(
-        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
     outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")

@@ -157,6 +157,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def period_ns(self) -> int:
         return period_ns(self.parameters.rate, "rate")
 
+    def inputs(self) -> Sequence[PolledSubscription]:
+        return [topic.subscription for topic in self._topics if topic.subscription.topic in LOOP]
+
     def runs_in_lockstep(self) -> bool:
         return False  # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the progress
 

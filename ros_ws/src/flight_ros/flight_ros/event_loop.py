@@ -22,14 +22,12 @@ from flight_core.scheduling import disable_timer_slack, request_short_slices
 from flight_core.signals import handle_shutdown
 from flight_core.text import bounded
 from flight_ros import transport
-from flight_ros.flight_node import FlightNode
+from flight_ros.flight_node import MAX_START_AGE_NS, FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
 BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
-
-MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
 PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
 
@@ -42,6 +40,8 @@ reader does not match (rmw_fastrtps, `wait_for_subscription`), so that a client 
 LONGEST_PAUSE_NS = NANOSECONDS
 
 REPORT_TIME_NS = NANOSECONDS // 2  # in which the reports of a second are done
+
+START_POLL_PERIOD = 0.005  # s, of a node that waits for t = 0
 
 IDLE_POLL_PERIOD = 0.02  # s, the longest sleep, so that signals and service calls are handled soon
 
@@ -171,7 +171,12 @@ def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: boo
 
 def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
     executor = _start([node])
-    start_ns = node.start_ns()
+    while (start_ns := node.start_ns()) is None:
+        if stop.requested:
+            return
+        node.match()
+        _serve(executor, node)
+        time.sleep(START_POLL_PERIOD)
     if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
         key = f"{node.get_name()}.start_time"
         raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
@@ -194,6 +199,7 @@ def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
             # Requests may take half of the time to the next tick.
             _serve(executor, node, now_ns + nanoseconds(max(ticker.remaining(), 0.0) / 2.0))
             node.require_peers()
+            node.match()
             duration_ns = time.monotonic_ns() - now_ns
             pause_ns = LATE_REQUEST_PAUSE * duration_ns if ticker.remaining() <= 0.0 else 0
             serve_ns = now_ns + max(nanoseconds(IDLE_POLL_PERIOD), min(pause_ns, LONGEST_PAUSE_NS))

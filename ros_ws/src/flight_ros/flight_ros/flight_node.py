@@ -19,16 +19,27 @@ from rclpy.qos import QoSProfile
 from flight_core.outcome import LOST_CONTACT, FlightEnded
 from flight_core.parameters import NodeConfig, ParameterError
 from flight_core.publisher_lock import PublisherLock
-from flight_core.rates import NANOSECONDS, seconds
+from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
 from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import Encoder
+from flight_ros.messages import Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick, TickTimes
-from flight_ros.topics import DIAGNOSTICS, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, PUBLISH, STATE, NodeState, Topic, publisher_qos
+from flight_ros.topics import (
+    DIAGNOSTICS,
+    LOCKSTEP,
+    NEWEST_SAMPLES,
+    NODE_STATE,
+    PUBLISH,
+    START,
+    STATE,
+    NodeState,
+    Topic,
+    publisher_qos,
+)
 
 P = TypeVar("P", bound=NodeConfig)
 S = TypeVar("S", bound=Sample)
@@ -38,6 +49,8 @@ NO_PUBLISHER_WARNING_NS = 3 * NANOSECONDS  # the processes of a flight start one
 ACKNOWLEDGE_TIMEOUT = Duration(seconds=0.5)  # at the end of a lockstep flight, for the last messages to arrive
 
 WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without samples
+
+MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
 CLOCK_STEP_NS = NANOSECONDS // 20  # slewing moves a clock by less than 0.01 s in the second between two checks
 
@@ -61,6 +74,9 @@ class FlightNode(Node, Generic[P]):
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
         self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, STATE)
+        given = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
+        self._start_subscription = PolledSubscription(self, START, STATE, raw=True) if given else None
+        self._matched = False
         self._tick_times = TickTimes()
         self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
         self._clock_step_ns = 0  # of the system clock since the start
@@ -71,10 +87,19 @@ class FlightNode(Node, Generic[P]):
         """The period of the ticks."""
         raise NotImplementedError
 
-    def start_ns(self) -> int:
-        """System time of tick 0, ns: the next whole period of the system clock, so that nodes of equal rates tick together."""
-        now_ns, period_ns = time.time_ns(), self.period_ns()
-        return now_ns - now_ns % period_ns + period_ns
+    def inputs(self) -> Sequence[PolledSubscription]:
+        """Real time: the subscriptions without whose publishers a flight does not begin."""
+        return ()
+
+    def start_ns(self) -> int | None:
+        """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic `start`, None before its message.
+
+        Where that is 0 the next whole period of the system clock, so that nodes of equal rates tick together.
+        """
+        start_time = getattr(self.parameters, "start_time", 0.0)
+        if start_time < 0.0:
+            return self._received_start_ns()
+        return nanoseconds(start_time) or self.next_period_ns()
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         """One tick; `now_ns` is the nominal instant of tick.number on the system clock's scale."""
@@ -99,6 +124,11 @@ class FlightNode(Node, Generic[P]):
         """Called with a valid new set in flight, before it becomes `self.parameters`. A ParameterError refuses it."""
 
     # Used by a subclass
+
+    def next_period_ns(self) -> int:
+        """The next whole period of the system clock, ns."""
+        now_ns, period_ns = time.time_ns(), self.period_ns()
+        return now_ns - now_ns % period_ns + period_ns
 
     def advertise(self, topic: Topic) -> Callable[[bytes], None]:
         """Create a publisher of serialised messages on a topic of the flight. Returns the function that publishes one."""
@@ -172,6 +202,19 @@ class FlightNode(Node, Generic[P]):
         return SetParametersResult(successful=True)
 
     # Called by the event loop
+
+    def _received_start_ns(self) -> int | None:
+        """The instant on the topic `start`, ns. One long ago belongs to another flight."""
+        messages = () if self._start_subscription is None else self._start_subscription.take()
+        instants = (stamp_of(received.message) for received in messages)
+        return next((stamp_ns for stamp_ns in instants if stamp_ns > time.time_ns() - MAX_START_AGE_NS), None)
+
+    def match(self) -> None:
+        """Real time: publish once that each input has a publisher."""
+        awaited = [*self.inputs(), *([self._start_subscription] if self._start_subscription is not None else [])]
+        if not self._matched and all(subscription.entity.get_publisher_count() for subscription in awaited):
+            self._matched = True
+            self.publish_state(NodeState.MATCHED)
 
     def run_tick(self, tick: Tick, now_ns: int) -> None:
         """Run one tick; measure its period, its compute time and its overruns."""

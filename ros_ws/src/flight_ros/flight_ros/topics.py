@@ -60,12 +60,13 @@ def publisher_qos(period_ns: int) -> QoSProfile:
 
 
 class NodeState(StrEnum):
-    """State of a node on `node_state`. READY: its event loop runs.
+    """State of a node on `node_state`, in order. READY: its event loop runs. MATCHED, in real time: each input has a publisher.
 
     FLYING: the aircraft has taken the first u of a flight in real time. COMPLETED: it has completed a lockstep flight.
     """
 
     READY = "ready"
+    MATCHED = "matched"
     FLYING = "flying"
     COMPLETED = "completed"
 
@@ -94,6 +95,7 @@ ROSOUT = Topic("/rosout", Log, foreign=True)  # of ROS 2 itself
 CLOCK = Topic("/clock", Clock)
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
+START = Topic("start", Time)  # t = 0 of a flight in real time, once its nodes are matched
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 
 FLIGHT = (Y, Y_M, U, U_M, POSE, GUIDANCE, TARGET, ROUTE, INTERNALS, TRUTH, DIAGNOSTICS)

@@ -56,9 +56,6 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
     def period_ns(self) -> int:
         return self._reference.period_ns
 
-    def start_ns(self) -> int:
-        return nanoseconds(self.parameters.start_time) or super().start_ns()
-
     def tick(self, tick: Tick, now_ns: int) -> None:
         before = self._reference.source()
         self._publish_y_m(self._encoder.encode(now_ns, self._reference.sample(tick.number)))

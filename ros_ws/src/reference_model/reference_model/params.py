@@ -91,7 +91,7 @@ class ReferenceModelConfig(NodeConfig):
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y_m is published, Hz")
     start_time: float = Field(
-        default=0.0, ge=0, le=1e10, description="system time of t = 0, s since the epoch; 0 starts at once"
+        default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
     outputs: Names = Field(description="the names of the outputs y_m")
     second_order: SecondOrder | None = Field(default=None, description="the model, one filter per channel")

@@ -5,6 +5,8 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
+from collections.abc import Sequence
+
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
@@ -15,6 +17,7 @@ from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.rclpy_private import answer_invalid_transitions
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -90,9 +93,12 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def period_ns(self) -> int:
         return self._controller.period_ns
 
+    def inputs(self) -> Sequence[PolledSubscription]:
+        return self._y.subscription, self._y_m.subscription
+
     def start_ns(self) -> int:
         """BEHIND_NS, or half a period where that is less, after a whole period of the system clock."""
-        return super().start_ns() + min(BEHIND_NS, self.period_ns() // 2)
+        return self.next_period_ns() + min(BEHIND_NS, self.period_ns() // 2)
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         now_ns += tick.late_ns

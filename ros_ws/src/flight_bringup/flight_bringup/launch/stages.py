@@ -30,7 +30,7 @@ from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
-from flight_bringup.graph import AIRCRAFT, NodeSpec, start_instant, start_lead
+from flight_bringup.graph import AIRCRAFT, LEAD, NodeSpec, start_instant, start_lead
 from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
 from flight_bringup.scenarios import scenarios
 from flight_core.outcome import COMPLETED, NEVER_FLEW
@@ -38,7 +38,8 @@ from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
 from flight_ros import transport
-from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, STATES, NodeState, U
+from flight_ros.messages import instant
+from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, START, STATE, STATES, NodeState, U
 from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
@@ -153,11 +154,12 @@ def fail_on_exit(event: ProcessExited, context: LaunchContext) -> None:
 def on_state(
     context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
-    """Run the actions of `then` once, when a node of this launch publishes a state."""
-    node = f"{_namespace(context)}/{spec.executable}"
+    """Run the actions of `then` once, when a node of this launch publishes a state, or a later one."""
+    node, states = f"{_namespace(context)}/{spec.executable}", [*NodeState]
+    reached = {*states[states.index(state) :]}
 
     def matches(event: Event) -> bool:
-        return isinstance(event, NodeStateEvent) and (event.node, event.state) == (node, state)
+        return isinstance(event, NodeStateEvent) and event.node == node and event.state in reached
 
     return RegisterEventHandler(
         EventHandler(matcher=matches, entities=[OpaqueFunction(function=lambda context: [*then()])], handle_once=True)
@@ -188,29 +190,37 @@ def start_in_stages(
     return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=warn)])]
 
 
-def complete_when_flown(
-    context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], start_time: float, duration: float, *, by_rosbag2: bool
+def begin_when_matched(
+    context: LaunchContext, run: Path, nodes: Sequence[NodeSpec], duration: float, *, by_rosbag2: bool
 ) -> list[Action]:
-    """End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end.
+    """Begin the flight once each node is ready and each input has a publisher: t = 0 on the topic `start`.
 
-    A node of the second stage that is not ready, and an aircraft that takes no u, end the launch with exit status 1.
+    End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end. A node that does
+    not get so far, and an aircraft that takes no u, end the launch with exit status 1.
     """
-    waiting, flying, end_ns = dict.fromkeys(nodes), [], nanoseconds(start_time + duration)
+    waiting, flying, end_ns = dict.fromkeys(nodes), [], [0]
+    publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", STATE).publish
 
-    def remaining(after: float) -> float:
-        return max(start_time - time.time(), 0.0) + after
-
-    def ready(spec: NodeSpec) -> Sequence[Action]:
+    def matched(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]
-        return [] if waiting else [TimerAction(period=remaining(FIRST_U), actions=[OpaqueFunction(function=require_flight)])]
+        if waiting:
+            return []
+        start_time = start_instant(LEAD)
+        publish(instant(nanoseconds(start_time)))
+        end_ns[0] = nanoseconds(start_time + duration)
+        return [
+            TimerAction(period=LEAD + FIRST_U, actions=[OpaqueFunction(function=require_flight)]),
+            TimerAction(period=LEAD + duration + 2.0 * LOG_TIMEOUT, actions=[OpaqueFunction(function=give_up)]),
+        ]
 
     def fly() -> Sequence[Action]:
         flying.append(True)
         return []
 
-    def require_ready(context: LaunchContext) -> None:
+    def require_matched(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
-            end(f"{', '.join(spec.executable for spec in waiting)} not ready after {READY_TIMEOUT:g} s")
+            names = ", ".join(spec.executable for spec in waiting)
+            end(f"{names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
 
     def require_flight(context: LaunchContext) -> None:
         if not flying and not context.is_shutdown:
@@ -227,7 +237,7 @@ def complete_when_flown(
 
     def receive(message: Any) -> None:
         stamp = message.header.stamp if by_rosbag2 else message
-        if stamp.sec * NANOSECONDS + stamp.nanosec >= end_ns and not context.is_shutdown:
+        if stamp.sec * NANOSECONDS + stamp.nanosec >= end_ns[0] > 0 and not context.is_shutdown:
             context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent())
 
     topic, qos = (U, NEWEST_SAMPLES) if by_rosbag2 else (RECORDED, LOCKSTEP)
@@ -239,10 +249,9 @@ def complete_when_flown(
     )
     return [
         RegisterEventHandler(flown),
-        *(on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in nodes),
+        *(on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec)) for spec in nodes),
         on_state(context, AIRCRAFT, NodeState.FLYING, fly),
-        TimerAction(period=remaining(READY_TIMEOUT), actions=[OpaqueFunction(function=require_ready)]),
-        TimerAction(period=remaining(duration + 2.0 * LOG_TIMEOUT), actions=[OpaqueFunction(function=give_up)]),
+        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
     ]
 
 
