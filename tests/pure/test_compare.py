@@ -3,6 +3,7 @@
 """Comparison of control laws: cost and score, repeatable tuning, delayed inputs, the shipped gains, the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +15,21 @@ from typer.testing import CliRunner
 
 from aircraft_sim.turbulence import MODERATE
 from control_laws.catalogue import LAWS, Gains, initial_gains
+from flight_analysis.closed_loop.margins import margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.requirement import REQUIREMENT, least_fraction
 from flight_analysis.metrics import error_metrics
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, law_comparison, registered_laws, tuned_gains, tuning
 from flight_campaign.fleet import FleetResult
+from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from rise_di_controller.laws import AnyLaw
+from rise_di_controller.margins import Margins
 
 pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
 
@@ -340,3 +345,39 @@ def test_interrupted_tuning_resumes_with_missing_laws(
     assert result.exit_code == 0, result.output
     assert list(tuned_gains.load(path)) == ["rise", "pi", "l1"]
     assert tuned == ["rise", "pi", "pi", "l1"]
+
+
+def test_margins_of_tuned_gains_are_those_of_the_registered_law(short: Benchmark) -> None:
+    # The catalogue's laws for many sets of gains at once, the registered laws one controller at a time
+    lag, D = short.model.lag.tolist(), [int(sign) for sign in short.model.D]
+    scale, Omega = short.model.input_scale.tolist(), short.model.Omega.ravel().tolist()
+    for name, own in (("pi", {"input_scale": scale}), ("l1", {"Omega": Omega})):
+        gains = initial_gains(LAWS[name], short.model)
+        values = {key: gain[:, 0].tolist() for key, gain in gains.items()}
+        section = SECTIONS[name] | {"lag": lag, "D": D, "delay": 0.0} | values | own
+        expected = margins(replace(short.scenario, controller=AnyLaw.validate_mapping(section, "controller"))).nominal
+        wide = {key: np.concatenate([0.9 * gain, gain], axis=1) for key, gain in gains.items()}
+        found = nominal_margins(LAWS[name], wide, short.model)
+        assert found.phase.shape == (2, 4)
+        for key in ("phase", "sensitivity", "damping"):
+            np.testing.assert_allclose(getattr(found, key)[1], getattr(expected, key), rtol=1e-6)
+
+
+def test_search_within_margins_has_them(short: Benchmark) -> None:
+    law = LAWS["pi"]._replace(
+        initial={"K": np.array([[22.0], [18.0], [13.0], [3.0]]), "Lambda": np.array([[6.0, 11.0, 5.0, 2.0]]).T}
+    )
+
+    def least(gains: Gains) -> float:
+        found = nominal_margins(law, gains, short.model)
+        return least_fraction(Margins(*(values[0] for values in found)), REQUIREMENT)
+
+    assert least(initial_gains(law, short.model)) < 0.98  # 43 degrees for 45
+    result = tuning.tune(law, OBJECTIVES["margins"], short, (3, 4), generations=8)
+    assert least(tuning.as_gains(result)) >= 1.0 - 1e-3  # gains are written with five digits
+
+
+def test_law_that_measures_more_than_y_has_no_margins() -> None:
+    without = {name for name, law in LAWS.items() if law.measurements == "y" and not has_margins(law)}
+    assert without == {"rise_implicit", "twisting"}
+    assert not has_margins(LAWS["indi"])

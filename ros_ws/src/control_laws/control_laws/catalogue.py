@@ -59,6 +59,7 @@ class Law(NamedTuple):
     tuned: tuple[str, ...]  # names of the gains
     feedforward: str = NONE  # model of the feedforward
     initial: Gains | None = None  # of a search; None: by the lag of the loop and the constants above
+    linear: bool = True  # near e = 0
 
 
 def initial_gains(law: Law, model: NominalModel) -> Gains:
@@ -106,7 +107,13 @@ FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, Nom
 LAWS: dict[str, Law] = {
     "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di.params_of, _rise_gains),
     "rise_implicit": Law(
-        "RISE-DI, implicit sign", "y", "Omega_ii", _implicit, rise_di.params_of, ("K", "Lambda", "beta", "omega")
+        "RISE-DI, implicit sign",
+        "y",
+        "Omega_ii",
+        _implicit,
+        rise_di.params_of,
+        ("K", "Lambda", "beta", "omega"),
+        linear=False,
     ),
     "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di.params_of, _rise_gains, AIRCRAFT),
     "rise_observer": Law(
@@ -150,7 +157,13 @@ LAWS: dict[str, Law] = {
     "l1": Law("L1", "y", "Omega", _l1, l1.params_of, ("K", "bandwidth")),
     "l1_ff": Law("L1 + feedforward", "y", _model, _l1_ff, l1.params_of, ("K", "bandwidth"), AIRCRAFT),
     "twisting": Law(
-        "super-twisting", "y", "Omega", super_twisting.control_law, super_twisting.twisting_params, ("root", "beta")
+        "super-twisting",
+        "y",
+        "Omega",
+        super_twisting.control_law,
+        super_twisting.twisting_params,
+        ("root", "beta"),
+        linear=False,
     ),
     "mackunis": Law(
         "MacKunis RISE, filtered difference", "y", "Omega", _filtered, mackunis.mackunis_params, (*_rise_gains, "filter")

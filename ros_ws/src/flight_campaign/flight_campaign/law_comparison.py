@@ -12,10 +12,12 @@ import numpy as np
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS, Law
 from flight_campaign import fleet
+from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
 from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
+from rise_di_controller.margins import Margins
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
 TURBULENCE_SEED = 3  # of a comparison, unlike that of the tuning
@@ -47,6 +49,7 @@ class LawResult(NamedTuple):
     lost_late: dict[float, float]  # by delay of u in s: fraction of the aircraft of the first level that lose track in gusts
     rms: FloatArray  # (m,) of the true error, nominal aircraft in gusts
     slew: FloatArray  # (m,) mean abs(u_dot), nominal aircraft in gusts
+    margins: Margins | None  # of the nominal aircraft; None for a law without a linear loop from y to u
 
 
 def compare(
@@ -100,6 +103,7 @@ def compare(
                     {ticks * benchmark.model.period: _lost(costs) for ticks, costs in zip(delays, delayed, strict=True)},
                     np.asarray(flown[GUST].rms)[:, 0],
                     np.asarray(flown[GUST].slew)[:, 0],
+                    _margins(law, gains, benchmark),
                 )
             )
         return law_results
@@ -116,6 +120,12 @@ def score_cells(result: LawResult) -> list[str]:
         uncertain = (level.scores[wind] for level in result.levels)
         cells += [f"{nominal:.2f}", *(f"{scores.mean:.2f} ({scores.worst:.2f})" for scores in uncertain)]
     return cells
+
+
+def _margins(law: Law, gains: TuningResult, benchmark: Benchmark) -> Margins | None:
+    if not has_margins(law):
+        return None
+    return Margins(*(values[0] for values in nominal_margins(law, as_gains(gains), benchmark.model)))
 
 
 def _scores(scores: FloatArray) -> Scores:

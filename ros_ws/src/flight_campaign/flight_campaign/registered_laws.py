@@ -18,7 +18,9 @@ from flight_campaign.tuning import Benchmark
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller import laws
+from rise_di_controller.law import Sign
 from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
@@ -49,6 +51,7 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
         tuple(start),
         NONE if controller.feedforward is None else name,
         {key: np.array(value)[:, None] for key, value in start.items()},
+        not isinstance(controller, RiseDiConfig) or controller.sampled_sign()[0] is Sign.SOFT,
     )
 
 

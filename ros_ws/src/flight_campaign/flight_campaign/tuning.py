@@ -21,9 +21,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
 from flight_analysis.design.observer_selection import integrator_model
+from flight_analysis.design.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_campaign import fleet, statistics
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.fleet import Fleet, FleetResult, Vehicle
+from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import score_units
 from flight_campaign.tuned_gains import TuningResult
 from flight_core.vectors import Array, FloatArray
@@ -45,6 +47,7 @@ class Objective(NamedTuple):
     weights: dict[str, float]  # by wind
     delay: int  # of the late u, in multiples of `Benchmark.delay`
     all_late: bool  # u is late on all aircraft, not on the nominal one alone
+    requirement: Requirement | None = None  # of the nominal loop of a law that has margins
 
 
 # Turbulence has half the weight, since scores in it are about twice those in the gusts.
@@ -52,6 +55,9 @@ OBJECTIVES = {
     "gust": Objective("gusts", {GUST: 1.0}, 1, all_late=False),
     "gust_turbulence": Objective("gusts and turbulence", {GUST: 1.0, TURBULENCE: 0.5}, 1, all_late=False),
     "delay": Objective("gusts and turbulence with a large delay", {GUST: 1.0, TURBULENCE: 0.5}, 2, all_late=True),
+    "margins": Objective(
+        "gusts and turbulence within margins of 45 deg and 6 dB", {GUST: 1.0, TURBULENCE: 0.5}, 1, False, REQUIREMENT
+    ),
 }
 
 UNCERTAIN_AIRCRAFT, UNCERTAINTY, UNCERTAINTY_SEED = 12, 0.4, 40
@@ -66,7 +72,7 @@ first standard deviation of log(gain)."""
 
 PARTS = 2  # of the candidates of a generation, flown side by side; a flight in a smaller part takes more processor time
 
-MAX_COST = 1000.0  # cost of a flight that diverged, and upper bound of every other cost
+MAX_COST = 1000.0  # cost of a flight that diverged, of a loop without any margin, and upper bound of every other cost
 STEP = 0.005  # s. Step of the integration, or one tick if that is shorter. The scores are within 1 % of those of a finer step.
 
 
@@ -219,8 +225,9 @@ def tune(
 ) -> TuningResult:
     """Gains of the smallest cost that CMA-ES finds from the initial ones, the best of several seeds; all seeds run together.
 
-    The cost of a candidate is the weighted sum over the flights of `evaluations`. Threads fly a part of the candidates in one
-    wind each. `progress` receives the generation and the smallest cost so far.
+    The cost of a candidate is the weighted sum over the flights of `evaluations`. A loop with a part of the margins that the
+    objective requires costs MAX_COST times the rest. Threads fly a part of the candidates in one wind each. `progress` receives
+    the generation and the smallest cost so far.
     Source: N. Hansen, A. Ostermeier, Evolutionary Computation 9(2), 2001; the package `cma`.
     """
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
@@ -246,6 +253,13 @@ def tune(
         result = fleet.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ flown.weight
 
+    def lacking(part: FloatArray) -> FloatArray:
+        """Costs of missing margins, (together,), of logarithms (together, d)."""
+        if objective.requirement is None or not has_margins(law):
+            return np.zeros(together)
+        margins = nominal_margins(law, gains_of(part), benchmark.model)
+        return np.asarray(MAX_COST * (1.0 - np.minimum(least_fractions(margins, objective.requirement), 1.0)))
+
     options = {"popsize": POPULATION, "verbose": -9}
     searches = [cma.CMAEvolutionStrategy(origin, INITIAL_SIGMA, options | {"seed": seed}) for seed in seeds]
     best: list[tuple[float, FloatArray]] = [(np.inf, origin)] * len(seeds)
@@ -256,7 +270,7 @@ def tune(
             parts = np.split(np.concatenate(asked), PARTS)
             params = [spread_over(law.params(gains_of(part), benchmark.model), of_one, each) for part in parts]
             found = np.array(list(pool.map(costs, product(params, flights)))).reshape(PARTS, len(flights), together)
-            of_search = found.sum(axis=1).reshape(len(seeds), POPULATION)
+            of_search = (found.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(len(seeds), POPULATION)
             for k, (search, values) in enumerate(zip(searches, of_search, strict=True)):
                 search.tell(list(asked[k]), list(values))
                 least = int(np.argmin(values))

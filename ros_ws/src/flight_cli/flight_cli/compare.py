@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
@@ -25,6 +26,7 @@ from flight_campaign.law_comparison import LawResult
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
 from flight_core.parameters import require
+from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig
 
 SEEDS = (1, 2, 3)
@@ -38,6 +40,8 @@ score: sum of rms of the true error over {unit}; mean (worst) of the aircraft of
   the level, rows of angles known; a few % are noise of the tuning
 lost: share of the aircraft that lose track in gusts, a score above 10; a diverged aircraft is lost and makes the mean infinite
 slew: mean abs(u_dot) in gusts, nominal aircraft, in the units of the airframe
+margins: least phase margin, deg, and largest sensitivity of the linear loop on the nominal aircraft, u in time, one input open;
+  none without a linear loop from y alone to u
 cost: the least of {seeds} seeds of the tuning, and the difference to the largest. It is the mean of score + slew over
   {slew}, of the nominal and {uncertain} uncertain aircraft at +-{level:g} %, once with u in time and once late:
 {costs}
@@ -162,6 +166,7 @@ def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law]
         *(f"{wind}\n{level}" for wind in found[0].scores for level in levels),
         f"lost, %, at {levels[1]},\nu late by, ms:\n{delays}",
         "slew\n" + of(name[:4] for name in scenario.controller.inputs),
+        "margins:\ndeg, S",
         "cost",
     )
     table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees", "knows"))
@@ -174,9 +179,16 @@ def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law]
             *law_comparison.score_cells(result),
             "/".join(f"{100.0 * share:.3g}" for share in lost),
             of(f"{value * units[name].factor:.0f}" for name, value in slew),
+            "none" if result.margins is None else _format_margins(result.margins),
             f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}" if result.costs else "own gains",
         )
     return table
+
+
+def _format_margins(margins: Margins) -> str:
+    if not margins.stable:
+        return "unstable"
+    return f"{np.degrees(margins.phase.min()):.0f}, {margins.sensitivity.max():.2f}"
 
 
 def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]) -> str:
@@ -219,4 +231,13 @@ def _as_json(one: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
         "late": [{"delay": delay, "lost": lost} for delay, lost in one.lost_late.items()],
         "rms": dict(zip(controller.outputs, one.rms.tolist(), strict=True)),
         "slew": dict(zip(controller.inputs, one.slew.tolist(), strict=True)),
+        "margins": None if one.margins is None else _margins_as_json(one.margins),
     }
+
+
+def _margins_as_json(margins: Margins) -> dict[str, Any]:
+    """The least margins of a stable loop, SI: phase in rad, gain as a factor."""
+    least = {"phase": margins.phase.min(), "gain": margins.gain.min(), "sensitivity": margins.sensitivity.max()}
+    least |= {"damping": margins.damping}
+    values = {name: float(value) for name, value in least.items()}
+    return {"stable": bool(margins.stable)} | dict(finite_or_null(values))

@@ -45,27 +45,30 @@ class Loop(NamedTuple):
 
 
 class LinearLaw(NamedTuple):
-    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0."""
+    """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0; leading axes are batches."""
 
-    A: FloatArray  # (k, k)
-    B: FloatArray  # (k, m)
-    C: FloatArray  # (m, k)
-    D: FloatArray  # (m, m)
+    A: FloatArray  # (..., k, k)
+    B: FloatArray  # (..., k, m)
+    C: FloatArray  # (..., m, k)
+    D: FloatArray  # (..., m, m)
 
 
-def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
+def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
     """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the state or of y.
 
-    An observer has faded in. Raises ParameterError for the literal sign: not linear anywhere.
+    An observer has faded in. With `candidates` N the parameters have N sets of gains as the last axis, and the matrices have
+    them as the first. Raises ParameterError for the literal sign: not linear anywhere.
     """
     control_law, params = law
     of_law = getattr(params, "law", params)  # the law under an observer or a schedule
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
-    zero = np.zeros(m)
-    at_rest = fields(control_law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    sets = () if candidates is None else (candidates,)
+    zero = np.zeros((m, *sets))
+    at_engagement = fields(control_law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    at_rest = {name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()}
     if "sigma" in at_rest:
-        at_rest["sigma"] = np.ones(1)
+        at_rest["sigma"] = np.ones((1, *sets))
     ends = np.cumsum([len(value) for value in at_rest.values()])
     size = int(ends[-1]) if len(ends) else 0
 
@@ -78,9 +81,11 @@ def linear_law(law: TunedLaw, m: int, period: float) -> LinearLaw:
 
     begin = np.concatenate([*at_rest.values(), zero])
     rest = step(begin[:size], zero)
-    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in SMALL * np.eye(size + m)]
+    units = SMALL * np.eye(size + m).reshape(size + m, size + m, *(1 for _ in sets))
+    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in units]
     matrix = np.array(columns).T
-    return LinearLaw(matrix[:size, :size], matrix[:size, size:], matrix[size:, :size], matrix[size:, size:])
+    above, below = matrix[..., :size, :], matrix[..., size:, :]
+    return LinearLaw(above[..., :size], above[..., size:], below[..., :size], below[..., size:])
 
 
 def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
@@ -149,11 +154,11 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
 def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray) -> FloatArray:
     """A period of the sampled loop as a matrix, exact: stable if no eigenvalue lies outside the unit circle.
 
-    The state is the state of `sampled_plant`, then the state of the law. Leading axes of the plant are batches.
+    The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and law are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
-    k, size = A.shape[-1], A.shape[-1] + len(law.A)
-    matrix = np.zeros((*A.shape[:-2], size, size))
+    k, size = A.shape[-1], A.shape[-1] + law.A.shape[-1]
+    matrix = np.zeros((*np.broadcast_shapes(A.shape[:-2], law.A.shape[:-2]), size, size))
     matrix[..., :k, :k], matrix[..., :k, k:] = A + B @ law.D @ C, B @ law.C
     matrix[..., k:, :k], matrix[..., k:, k:] = law.B @ C, law.A
     return matrix

@@ -112,7 +112,7 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
 
 
 def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
-    """Margins of an aircraft, or of N aircraft under the same law: A (N, n, n) and B (N, n, m) of the plant.
+    """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a law for each of them.
 
     Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The phase margin is the
     smallest abs(angle(-L_i)) at abs(L_i) = 1, the gain margins are 1 / abs(L_i) at real L_i < 0, next to 1 on either side.
@@ -122,15 +122,18 @@ def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
 
     exact for m <= 3 and at most the disk margin for more inputs.
     """
-    shape = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
-    n, m = plant.B.shape[-2:]
+    shape = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (plant.A, plant.B, law.A)))
     count = int(np.prod(shape))
-    A = np.broadcast_to(plant.A, (*shape, n, n)).reshape(count, n, n)
-    B = np.broadcast_to(plant.B, (*shape, n, m)).reshape(count, n, m)
-    parts = [
-        _margins(_schur_form(LinearPlant(A[k : k + BATCH], B[k : k + BATCH], plant.C), law, loop), loop.period)
-        for k in range(0, count, BATCH)
-    ]
+
+    def each(matrix: FloatArray) -> FloatArray:
+        return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(count, *matrix.shape[-2:])
+
+    A, B, laws = each(plant.A), each(plant.B), [each(matrix) for matrix in law]
+    parts = []
+    for k in range(0, count, BATCH):
+        of = slice(k, k + BATCH)
+        aircraft, its_law = LinearPlant(A[of], B[of], plant.C), LinearLaw(*(matrix[of] for matrix in laws))
+        parts.append(_margins(_schur_form(aircraft, its_law, loop), loop.period))
     return Margins(*(np.concatenate(values).reshape((*shape, *values[0].shape[1:])) for values in zip(*parts, strict=True)))
 
 
@@ -147,15 +150,15 @@ class _SchurForm(NamedTuple):
 
 
 def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
-    """The closed loops of N aircraft: A (N, n, n), B (N, n, m)."""
+    """The closed loops of N aircraft: A (N, n, n), B (N, n, m) under one law or N laws."""
     from scipy.linalg import schur  # noqa: PLC0415 - a controller without an observer starts without it
 
     no_delay, (N, _, m) = np.zeros(len(loop.lag)), plant.B.shape
     _, B, C = sampled_plant(plant, loop, no_delay)
     pairs = [schur(matrix, output="complex") for matrix in closed_loop(plant, law, loop, no_delay)]
     T, Q = (np.array(matrices, dtype=np.complex128) for matrices in zip(*pairs, strict=True))
-    B = np.concatenate([B, np.zeros((N, len(law.A), m))], axis=1)
-    K = np.concatenate([law.D @ C, np.broadcast_to(law.C, (N, *law.C.shape))], axis=2)
+    B = np.concatenate([B, np.zeros((N, law.A.shape[-1], m))], axis=1)
+    K = np.concatenate([law.D @ C, np.broadcast_to(law.C, (N, *law.C.shape[-2:]))], axis=2)
     return _SchurForm(T, Q.conj().swapaxes(1, 2) @ B, K @ Q)
 
 

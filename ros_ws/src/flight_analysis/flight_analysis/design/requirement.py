@@ -82,10 +82,16 @@ def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatA
         return phase, np.log(margins.gain) / math.log(needed.gain), margins.damping / needed.damping
 
 
-def least_fraction(margins: Margins, needed: Requirement) -> float:
-    """The least of `fractions` of a loop: at least 1 where the requirement holds, 0 for an unstable loop."""
+def least_fractions(margins: Margins, needed: Requirement) -> FloatArray:
+    """The least of `fractions` of each loop, (...): at least 1 where the requirement holds, 0 for an unstable loop."""
     phase, gain, damping = fractions(margins, needed)
-    return float(min(phase.min(), gain.min(), damping)) if margins.stable else 0.0
+    least = np.minimum(np.minimum(phase.min(axis=-1), gain.min(axis=-1)), damping)
+    return np.asarray(np.where(margins.stable, least, 0.0))
+
+
+def least_fraction(margins: Margins, needed: Requirement) -> float:
+    """The `least_fractions` of one loop."""
+    return float(least_fractions(margins, needed))
 
 
 def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ...]:
