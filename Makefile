@@ -8,6 +8,7 @@
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
 # make foxglove   what `rise-di watch --foxglove` needs
+# make autopilot   what `rise-di import` and maps over MAVLink need
 # make messages PACKAGE=... SOURCE=...   build a message package of an autopilot for the stack: docs/autopilots.md
 # make wheel   build dist/rise_di-VERSION-py3-none-any.whl and its sources, which pip installs
 # make setup   what flying and its report need: .venv/, the workspace built, .venv/bin/rise-di; make setup-all: campaigns and tests too
@@ -28,7 +29,7 @@ MADE_IN := $(shell sed -n 's/^command = .* -m venv --clear //p' .venv/pyvenv.cfg
 MOVED := $(if $(filter-out $(subst $() ,?,$(CURDIR)/.venv),$(subst $() ,?,$(MADE_IN))),yes)
 
 FLY := --extra ros --group build
-ALL := $(FLY) --extra campaign --group messages --group docs --group dev
+ALL := $(FLY) --extra campaign --extra autopilot --group messages --group docs --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock --requirement pyproject.toml
 
@@ -38,7 +39,7 @@ ifdef MOVED
 .PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
 endif
 
-.PHONY: fly test test-fast test-sitl check docs evidence foxglove messages wheel setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl check docs evidence foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -59,8 +60,8 @@ test-fast: .venv/.all .venv/.workspace
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
 
-foxglove: setup
-	$(INSTALL) --extra foxglove
+foxglove autopilot: setup
+	$(INSTALL) --extra $@
 
 check: setup-all
 	$(BIN)/ruff check .

@@ -32,7 +32,21 @@ TEST_DEPENDENCIES = {"python3-hypothesis", "python3-pytest", "python3-pytest-tim
 PYTHON3 = ("jinja2", "matplotlib", "numpy", "psutil", "rich", "scipy", "tornado", "typer", "yaml")
 KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-jinja2"}  # which depends on it
 # Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
-WITHOUT_KEY = {"cma", "dask", "distributed", "foxglove", "jax", "jsbsim", "lz4", "mcap", "polars", "rosbags", "zstandard"}
+WITHOUT_KEY = {
+    "cma",
+    "dask",
+    "distributed",
+    "foxglove",
+    "jax",
+    "jsbsim",
+    "lz4",
+    "mcap",
+    "polars",
+    "pymavlink",
+    "pyulog",
+    "rosbags",
+    "zstandard",
+}
 
 
 def check_packages(mistakes: Callable[[Path], Iterable[object]]) -> None:

@@ -26,6 +26,7 @@ from flight_analysis.design.bridge_identification import (
     measured_trims,
     require_envelope,
 )
+from flight_analysis.design.log_import import COMMANDS, median_trims
 from flight_analysis.design.open_loop_fit import ChannelModel
 from flight_analysis.design.requirement import Requirement
 from flight_analysis.design.response_identification import Response, identify_response
@@ -60,7 +61,8 @@ def identify_behind_bridge(
     run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
     tape, spans = _engaged(run)
     pairing, _ = channel_pairs(channel_map)
-    trims = measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
+    is_imported = COMMANDS in tape
+    trims = median_trims(tape[COMMANDS]) if is_imported else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
     _show_response(console, channel_map.name, response, trims)
     models = channel_models(channel_map, tape, spans, speed)
@@ -134,14 +136,17 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
 
 
 def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
-    """The tape of an experiment and its engaged spans, ns.
+    """The tape of an experiment and its engaged spans, ns; all of a flight that `rise-di import` took from another log.
 
     Raises ParameterError for a log without an engagement, and for a flight under feedback: its u follows y.
     """
     recorded = read_run(run)
     tape, flown = recorded.tape, recorded.engagements
+    if COMMANDS in tape:
+        recorded.require("y", "u")
+        return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))]
     law = "not recorded" if recorded.scenario is None else recorded_parameters(recorded.scenario).law
-    require(law == OPEN_LOOP, f"{run}: law", law, f"{OPEN_LOOP}: the log of an experiment, identify --bridge without --log")
+    require(law == OPEN_LOOP, f"{run}: law", law, f"{OPEN_LOOP}: the log of an experiment, or of rise-di import")
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:

@@ -11,6 +11,7 @@ import gc
 import os
 import sys
 from contextlib import suppress
+from keyword import iskeyword
 from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import Annotated
@@ -29,6 +30,7 @@ COMMANDS = MappingProxyType(
         "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
         "play": "Publish the topics of a recorded flight again with their timing.",
         "watch": "See a flight on a page, live while it is recorded, or again later.",
+        "import": "Make a bag from the log of an autopilot: DataFlash, tlog or ULog.",
         "repair": "Rebuild the log of a run whose recorder was killed, or that is damaged.",
         "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
         "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
@@ -44,7 +46,8 @@ COMMANDS = MappingProxyType(
         "compare": "Compare RISE-DI with other control laws on the same aircraft.",
     }
 )
-"""What each command does. The function `NAME` of the module `flight_cli.NAME` is the command, with _ for -."""
+"""What each command does. The function `NAME` of the module `flight_cli.NAME` is the command, with _ for -, and _ after
+a keyword."""
 
 
 def _show_version(wanted: bool) -> None:
@@ -69,7 +72,7 @@ def application(words: list[str]) -> typer.Typer:
     app.callback()(_options)
     for name, sentence in COMMANDS.items():
         if name in words:
-            module = name.replace("-", "_")
+            module = f"{name}_" if iskeyword(name) else name.replace("-", "_")
             command = resolve_name(f"flight_cli.{module}:{module}")
             if isinstance(command, typer.Typer):  # a command with commands of its own
                 app.add_typer(command, name=name, help=sentence)

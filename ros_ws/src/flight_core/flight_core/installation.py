@@ -10,10 +10,18 @@ from flight_core.parameters import ParameterError
 CHECKOUT = Path(__file__).resolve().parents[4]
 """The root of the repository, if this file is ros_ws/src/flight_core/flight_core/installation.py there."""
 
-TARGETS = {"ros": "make setup", "campaign": "make setup-all", "foxglove": "make foxglove"}
+TARGETS = {"ros": "make setup", "campaign": "make setup-all", "foxglove": "make foxglove", "autopilot": "make autopilot"}
 """The targets of the Makefile by the extras of pyproject.toml."""
 
-EXTRAS = {"rclpy": "ros", "cma": "campaign", "distributed": "campaign", "jax": "campaign", "foxglove": "foxglove"}
+EXTRAS = {
+    "rclpy": "ros",
+    "cma": "campaign",
+    "distributed": "campaign",
+    "jax": "campaign",
+    "foxglove": "foxglove",
+    "pymavlink": "autopilot",
+    "pyulog": "autopilot",
+}
 """The extras of pyproject.toml by the packages that a command may lack."""
 
 MESSAGE_SUFFIXES = ("_msgs", "_interfaces", "_srvs")

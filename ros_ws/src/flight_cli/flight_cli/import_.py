@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di import`: a bag of y, u and pose from the log of an autopilot."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from autopilot_bridge.params import load_map
+from flight_analysis.design.log_import import Window, imported
+from flight_cli.output import new_table, options
+from flight_core.files import display_path, dump_yaml, write_file, writing
+from flight_core.parameters import require
+from flight_core.rates import NANOSECONDS
+from flight_log.bag import LogAttachments
+from flight_log.tape_writer import write_run
+from flight_log.vehicle_log import read_vehicle_log
+
+PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
+
+
+def import_(
+    log: Annotated[Path, typer.Argument(help="DataFlash log of ArduPilot (.bin, .log), tlog of MAVLink, or ULog of PX4.")],
+    map_name: Annotated[str, typer.Option("--map", metavar="MAP", help="Channel map: its channels of y and u, trims, scales.")],
+    output: Annotated[Path | None, typer.Option(help="Folder to create; by default runs/ with the name of the log.")] = None,
+    start: Annotated[float | None, typer.Option("--from", help="Begin, s since the begin of the log.")] = None,
+    stop: Annotated[float | None, typer.Option("--until", help="End, s since the begin of the log.")] = None,
+    servos: Annotated[
+        bool, typer.Option("--servos", help="u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.")
+    ] = False,
+) -> None:
+    """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
+
+    By default it takes the longest stretch in the air, for sticks in MANUAL. `check-signs --bag` and `identify --bridge --log`
+    read the bag. u is the deviation from the median of the stretch, `commands` is the whole.
+
+    Exit status: 0, or 2 bad input.
+    """
+    with options("from", "until"):
+        for name, value in (("from", start), ("until", stop)):
+            require(value is None or value >= 0.0, name, value, "0 s or more")
+    channel_map = load_map(map_name)
+    read = read_vehicle_log(log)
+    tape = imported(channel_map, read, Window(start, stop), servos=servos)
+    folder = output or Path("runs") / log.stem
+    require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
+    with writing("--output", folder, "a folder that can"):
+        folder.mkdir(parents=True)
+        write_file(folder / PARAMETERS, dump_yaml(dict(sorted(read.parameters.items())), flow=False))
+    bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS,)))
+    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left=("topic",))
+    for topic, signal in tape.signals.items():
+        gaps = np.diff(signal.stamp_ns) / NANOSECONDS
+        rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
+        longest = float(gaps.max()) if len(gaps) else 0.0
+        table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
+    console = Console()
+    console.print(table)
+    begin = (tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])) / NANOSECONDS
+    length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
+    console.print(
+        f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}", highlight=False, soft_wrap=True
+    )

@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Reads the logs that autopilots write: DataFlash of ArduPilot, tlogs of MAVLink, ULogs of PX4.
+
+Sources: ArduPilot, libraries/AP_Logger/LogStructure.h and ArduPlane/Log.cpp; MAVLink, common.xml; PX4 guide, ULog file format,
+and PX4's msg/*.msg. pymavlink and pyulog decode the files.
+"""
+
+import math
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.installation import require_package
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import FloatArray
+from flight_log.file_kinds import file_kind
+
+DEGREE = math.pi / 180.0
+AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
+STICKS, SERVOS = 16, 16  # channels that are read
+
+
+class Table(NamedTuple):
+    """The samples of a message: stamps, ns, shape (N,), ascending, and the fields by name, each of shape (N,)."""
+
+    stamp_ns: NDArray[np.int64]
+    fields: Mapping[str, FloatArray]
+
+    def at(self, field: str, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """The newest value of a field at each of some instants, shape (n,); NaN before the first."""
+        places = np.searchsorted(self.stamp_ns, stamp_ns, side="right") - 1
+        return np.where(places < 0, np.nan, self.fields[field][places])
+
+
+class Source(NamedTuple):
+    """Where a log has a quantity: value = scale field."""
+
+    message: str
+    field: str
+    scale: float = 1.0
+
+
+Sources = Mapping[str, tuple[Source, ...]]
+"""By quantity the places that may have it, the first one first."""
+
+
+class Format(NamedTuple):
+    """A format of logs: what has y and pose in SI (body FRD; north, east, up), the transmitter's channels, the servos."""
+
+    sources: Sources
+    sticks: Source  # its field has the number of the channel in place of {}
+    servos: Source
+    mode: tuple[Source, ...]
+
+
+def _sources(**places: tuple[Source, ...] | Source) -> Sources:
+    return MappingProxyType({name: (at,) if isinstance(at, Source) else at for name, at in places.items()})
+
+
+def _estimator(field: str, scale: float = 1.0) -> tuple[Source, ...]:
+    return tuple(Source(message, field, scale) for message in ("XKF1", "NKF1", "EKF1"))  # EKF3, EKF2, EKF2 of old releases
+
+
+DATAFLASH = Format(
+    sources=_sources(
+        q=Source("IMU", "GyrY"),
+        p=Source("IMU", "GyrX"),
+        r=Source("IMU", "GyrZ"),
+        V=(Source("ARSP", "Airspeed"), Source("CTUN", "As"), Source("CTUN", "Aspd")),  # equivalent: _true_airspeed
+        phi=Source("ATT", "Roll", DEGREE),
+        theta=Source("ATT", "Pitch", DEGREE),
+        psi=Source("ATT", "Yaw", DEGREE),
+        north=_estimator("PN"),
+        east=_estimator("PE"),
+        altitude=_estimator("PD", -1.0),
+        v_north=_estimator("VN"),
+        v_east=_estimator("VE"),
+        climb=_estimator("VD", -1.0),
+    ),
+    sticks=Source("RCIN", "C{}"),
+    servos=Source("RCOU", "C{}"),
+    mode=(Source("MODE", "ModeNum"), Source("MODE", "Mode")),
+)
+TLOG = Format(
+    sources=_sources(
+        q=Source("ATTITUDE", "pitchspeed"),
+        p=Source("ATTITUDE", "rollspeed"),
+        r=Source("ATTITUDE", "yawspeed"),
+        V=Source("VFR_HUD", "airspeed"),
+        phi=Source("ATTITUDE", "roll"),
+        theta=Source("ATTITUDE", "pitch"),
+        psi=Source("ATTITUDE", "yaw"),
+        north=Source("LOCAL_POSITION_NED", "x"),
+        east=Source("LOCAL_POSITION_NED", "y"),
+        altitude=Source("LOCAL_POSITION_NED", "z", -1.0),
+        v_north=Source("LOCAL_POSITION_NED", "vx"),
+        v_east=Source("LOCAL_POSITION_NED", "vy"),
+        climb=Source("LOCAL_POSITION_NED", "vz", -1.0),
+    ),
+    sticks=Source("RC_CHANNELS", "chan{}_raw"),
+    servos=Source("SERVO_OUTPUT_RAW", "servo{}_raw"),
+    mode=(Source("HEARTBEAT", "custom_mode"),),
+)
+ULOG_SOURCES = _sources(
+    q=Source("vehicle_angular_velocity", "xyz[1]"),
+    p=Source("vehicle_angular_velocity", "xyz[0]"),
+    r=Source("vehicle_angular_velocity", "xyz[2]"),
+    V=Source("airspeed_validated", "true_airspeed_m_s"),
+    phi=Source("vehicle_attitude", "phi"),
+    theta=Source("vehicle_attitude", "theta"),
+    psi=Source("vehicle_attitude", "psi"),
+    north=Source("vehicle_local_position", "x"),
+    east=Source("vehicle_local_position", "y"),
+    altitude=Source("vehicle_local_position", "z", -1.0),
+    v_north=Source("vehicle_local_position", "vx"),
+    v_east=Source("vehicle_local_position", "vy"),
+    climb=Source("vehicle_local_position", "vz", -1.0),
+)
+
+
+class VehicleLog(NamedTuple):
+    """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's topics."""
+
+    kind: str
+    tables: Mapping[str, Table]
+    parameters: Mapping[str, float]
+    format: Format | None
+
+    def source(self, quantity: str) -> Source | None:
+        """The place in this log that has a quantity of y or of the pose; None where it has none."""
+        sources = ULOG_SOURCES if self.format is None else self.format.sources
+        return next((at for at in sources.get(quantity, ()) if self.has(at)), None)
+
+    def start_ns(self, quantity: str) -> int:
+        """The first stamp of a quantity that the log has."""
+        source = self.source(quantity)
+        return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
+
+    def has(self, at: Source) -> bool:
+        """Whether the log has samples of a field."""
+        return at.message in self.tables and at.field in self.tables[at.message].fields
+
+    def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """The newest value of a place at each of some instants, shape (n,); NaN before the first."""
+        return source.scale * self.tables[source.message].at(source.field, stamp_ns)
+
+
+EXPECTED = "a DataFlash log (.bin, .log), a tlog or a ULog"
+
+
+def read_vehicle_log(path: Path) -> VehicleLog:
+    """Read the log of an autopilot. Raises ParameterError for another file, and where no message can be decoded."""
+    require(path.is_file(), str(path), "no such file", EXPECTED)
+    kind = file_kind(path)
+    readers = {"ULog": _read_ulog, "DataFlash": _read_dataflash, "tlog": _read_tlog}
+    read = next((reader for word, reader in readers.items() if f" {word} " in f"{kind} "), None)
+    if read is None:
+        raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
+    try:
+        log = read(path, kind)
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, struct.error) as error:
+        raise ParameterError(f"{path}: found {kind} that cannot be decoded ({error}), expected {EXPECTED}") from None
+    require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
+    return log
+
+
+def _read_dataflash(path: Path, kind: str) -> VehicleLog:
+    require_package("pymavlink")
+    from pymavlink import DFReader  # noqa: PLC0415 - an extra
+
+    wanted = _wanted(DATAFLASH)
+    wanted.setdefault("CTUN", set()).add("E2T")
+    parameters: dict[str, float] = {}
+
+    def samples() -> Iterator[tuple[str, int, Any]]:
+        reader = DFReader.DFReader_text(str(path)) if "text" in kind else DFReader.DFReader_binary(str(path))
+        with closing(reader):
+            while (message := reader.recv_match(type=[*wanted, "PARM"])) is not None:
+                name = message.get_type()
+                if name == "PARM":
+                    parameters[message.Name] = float(message.Value)
+                elif not (getattr(message, "I", 0) or getattr(message, "C", 0)):  # of the first sensor and of the first core
+                    yield name, round(1e3 * message.TimeUS), message
+
+    tables = _tables(samples(), wanted)
+    _true_airspeed(tables)
+    if (attitude := tables.get("ATT")) is not None:
+        attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
+    return VehicleLog(kind, tables, parameters, DATAFLASH)
+
+
+def _true_airspeed(tables: Mapping[str, Table]) -> None:
+    """Turn equivalent into true airspeed by the ratio in CTUN, in place."""
+    control = tables.get("CTUN")
+    if control is None or "E2T" not in control.fields:
+        return
+    for name, field in (("ARSP", "Airspeed"), ("CTUN", "As"), ("CTUN", "Aspd")):
+        if name in tables and field in tables[name].fields:
+            ratio = control.at("E2T", tables[name].stamp_ns)
+            tables[name].fields[field][:] *= np.where(np.isfinite(ratio), ratio, 1.0)
+
+
+def _read_tlog(path: Path, kind: str) -> VehicleLog:
+    require_package("pymavlink")
+    from pymavlink import mavutil  # noqa: PLC0415 - an extra
+
+    wanted = _wanted(TLOG)
+    parameters: dict[str, float] = {}
+
+    def samples() -> Iterator[tuple[str, int, Any]]:
+        vehicle = None  # the first autopilot in the log
+        with closing(mavutil.mavlink_connection(str(path), dialect="ardupilotmega")) as reader:
+            while (message := reader.recv_match(type=[*wanted, "PARAM_VALUE"])) is not None:
+                name = message.get_type()
+                if message.get_srcComponent() != AUTOPILOT:
+                    continue
+                if vehicle is None and name == "HEARTBEAT":
+                    vehicle = message.get_srcSystem()
+                if message.get_srcSystem() != vehicle:
+                    continue
+                if name == "PARAM_VALUE":
+                    parameters[message.param_id] = float(message.param_value)
+                else:
+                    yield name, round(NANOSECONDS * message._timestamp), message
+
+    return VehicleLog(kind, _tables(samples(), wanted), parameters, TLOG)
+
+
+def _read_ulog(path: Path, kind: str) -> VehicleLog:
+    require_package("pyulog")
+    from pyulog import ULog  # noqa: PLC0415 - an extra
+
+    log = ULog(str(path))
+    tables = {}
+    for data in log.data_list:
+        if data.multi_id == 0:
+            columns = {name: np.asarray(values, dtype=np.float64) for name, values in data.data.items()}
+            tables[data.name] = _table(1000 * data.data["timestamp"].astype(np.int64), columns)
+    attitude = tables.get("vehicle_attitude")
+    if attitude is not None:
+        w, x, y, z = (attitude.fields[f"q[{k}]"] for k in range(4))
+        angles = {  # z, y, x, as of autopilot_bridge.channel_map
+            "phi": np.arctan2(2 * (w * x + y * z), w * w - x * x - y * y + z * z),
+            "theta": np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0)),
+            "psi": np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z),
+        }
+        tables["vehicle_attitude"] = Table(attitude.stamp_ns, {**attitude.fields, **angles})
+    return VehicleLog(kind, tables, {name: float(value) for name, value in log.initial_parameters.items()}, None)
+
+
+def _wanted(of: Format) -> dict[str, set[str]]:
+    """The fields that are read, by message."""
+    places = [at for ats in of.sources.values() for at in ats] + list(of.mode)
+    for at, count in ((of.sticks, STICKS), (of.servos, SERVOS)):
+        places += [Source(at.message, at.field.format(number)) for number in range(1, count + 1)]
+    wanted: dict[str, set[str]] = {}
+    for at in places:
+        wanted.setdefault(at.message, set()).add(at.field)
+    return wanted
+
+
+def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
+    """Tables of messages: name, stamp in ns, message. A field that its first message lacks is absent."""
+    stamps: dict[str, list[int]] = {}
+    columns: dict[str, dict[str, list[float]]] = {}
+    for name, stamp_ns, message in samples:
+        if name not in columns:
+            columns[name] = {field: [] for field in sorted(wanted[name]) if _is_number(getattr(message, field, None))}
+        stamps.setdefault(name, []).append(stamp_ns)
+        for field, values in columns[name].items():
+            values.append(float(getattr(message, field)))
+    return {
+        name: _table(np.array(stamps[name], dtype=np.int64), {field: np.array(values) for field, values in fields.items()})
+        for name, fields in columns.items()
+    }
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float)
+
+
+def _table(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:
+    """A table in the order of its stamps, without samples of a repeated stamp."""
+    stamps, places = np.unique(stamp_ns, return_index=True)
+    return Table(stamps, {name: values[places] for name, values in fields.items()})

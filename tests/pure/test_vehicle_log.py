@@ -1,0 +1,193 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the aircraft."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
+from typer.testing import CliRunner
+
+from flight_analysis.design.response_identification import MIN_RATIO
+from flight_analysis.design.sign_check import recorded_response
+from flight_cli.cli import COMMANDS, application
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from flight_log.tape_reader import read_run
+from flight_log.vehicle_log import read_vehicle_log
+
+pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
+
+app = application([*COMMANDS])
+OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+OMEGA = np.array([40.0, 8.0, 80.0, 30.0])  # SI, by channel
+DAMPING = np.array([6.0, 0.3, 8.0, 3.0])  # 1/s
+FULL, SPEED, THROTTLE = 0.523599, 25.0, 0.5  # rad as in the maps ardupilot and px4; m/s; throttle in trim
+EPOCH = 1_790_000_000_000_000  # us since 1970, of a tlog
+GROUND, DURATION, RATE = 10.0, 40.0, 50  # s on the ground before the flight, s, Hz
+LAG = 0.05  # s, of the servos
+
+
+class Flight(NamedTuple):
+    """A flight by known equations: stamps, us, y with the airspeed of trim taken off, and u."""
+
+    stamp_us: list[int]
+    y: FloatArray  # (N, 4)
+    u: FloatArray
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    """First-order channels y_dot = -damping y + Omega v, with servos v_dot = (u - v) / lag, behind held random inputs."""
+    random, steps, dt = np.random.default_rng(1), round(DURATION * RATE), 1.0 / RATE
+    held = np.repeat(random.choice([-1.0, 0.0, 1.0], (steps // 15 + 1, 4)), 15, axis=0)[:steps]
+    u = held * [0.04, 0.1, 0.04, 0.06]
+    y, v = np.zeros((steps, 4)), np.zeros(4)
+    for k in range(1, steps):
+        v += (u[k - 1] - v) * -np.expm1(-dt / LAG)
+        y[k] = y[k - 1] + dt * (OMEGA * v - DAMPING * y[k - 1])
+    y += random.normal(0.0, [0.002, 0.01, 0.002, 0.002], y.shape)
+    return Flight([round(1e6 * (1.0 + GROUND + k * dt)) for k in range(steps)], y, u)
+
+
+def sticks(u: FloatArray) -> FloatArray:
+    """Pulses of roll, pitch, throttle and yaw, us, between RCn_MIN 1000 and RCn_MAX 2000, those of the map ardupilot."""
+    elevator, thrust, aileron, rudder = u.T
+    surfaces = (1500.0 + 500.0 * surface / FULL for surface in (aileron, elevator, rudder))
+    roll, pitch, yaw = surfaces
+    return np.column_stack([roll, pitch, 1000.0 + 1000.0 * (THROTTLE + thrust), yaw])
+
+
+def on_ground(flight: Flight) -> Flight:
+    """Still time before the flight, at the same rate."""
+    count = round(GROUND * RATE)
+    still = np.zeros((count, 4))
+    still[:, 1] = -SPEED
+    return Flight([round(1e6 * (1.0 + k / RATE)) for k in range(count)], still, np.zeros((count, 4)))
+
+
+def dataflash(path: Path, flight: Flight, mode: int = 0) -> Path:
+    parts = (on_ground(flight), flight)
+    stamps = [stamp for part in parts for stamp in part.stamp_us]
+    y, pulses = np.concatenate([part.y for part in parts]), np.concatenate([sticks(part.u) for part in parts])
+    servos = pulses.copy()
+    servos[:, 1] = 3000.0 - servos[:, 1]  # a reversed servo moves the other way
+    speed = y[:, [1]] + SPEED
+    messages = {
+        "MODE": (("Mode", "ModeNum"), [(1, (mode, mode))]),
+        "IMU": (("GyrX", "GyrY", "GyrZ"), list(zip(stamps, y[:, [2, 0, 3]], strict=True))),
+        "CTUN": (("As", "E2T"), list(zip(stamps, np.column_stack([speed / 1.05, np.full(len(speed), 1.05)]), strict=True))),
+        "ATT": (("Roll", "Pitch", "Yaw"), [(stamp, (5.0, -2.0, 350.0)) for stamp in stamps]),
+        "RCIN": (("C1", "C2", "C3", "C4"), list(zip(stamps, pulses, strict=True))),
+        "RCOU": (("C1", "C2", "C3", "C4"), list(zip(stamps, servos, strict=True))),
+    }
+    parameters = {f"SERVO{n}_FUNCTION": function for n, function in enumerate((4, 19, 70, 21), start=1)}
+    ends = {
+        f"{kind}{n}_{end}": value
+        for kind in ("RC", "SERVO")
+        for n in range(1, 5)
+        for end, value in (("MIN", 1000.0), ("MAX", 2000.0))
+    }
+    write_dataflash(path, messages, parameters | ends | {"SERVO2_REVERSED": 1.0})
+    return path
+
+
+def tlog(path: Path, flight: Flight) -> Path:
+    messages = [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))]
+    for part in (on_ground(flight), flight):
+        for stamp, y, pulses in zip(part.stamp_us, part.y, np.rint(sticks(part.u)).astype(int).tolist(), strict=True):
+            ms, at = stamp // 1000, EPOCH + stamp
+            messages.append((at, mavlink.MAVLink_attitude_message(ms, 0.1, -0.03, -0.2, y[2], y[0], y[3])))
+            messages.append((at, mavlink.MAVLink_vfr_hud_message(y[1] + SPEED, 0.0, 0, 50, 0.0, 0.0)))
+            channels = [*pulses, *[0] * 14]
+            messages.append((at, mavlink.MAVLink_rc_channels_message(ms, 16, *channels, 0)))
+    write_tlog(path, messages)
+    return path
+
+
+def ulog(path: Path, flight: Flight) -> Path:
+    def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
+        return list(zip(flight.stamp_us, values, strict=True))
+
+    elevator, thrust, aileron, rudder = flight.u.T
+    still = np.zeros(len(thrust))
+    level = np.column_stack([np.ones(len(thrust)), still, still, still])
+    topics = {
+        "vehicle_angular_velocity": ("float[3] xyz;", rows(flight.y[:, [2, 0, 3]])),
+        "airspeed_validated": ("float true_airspeed_m_s;", rows(flight.y[:, [1]] + SPEED)),
+        "vehicle_attitude": ("float[4] q;", rows(level)),
+        "vehicle_torque_setpoint": ("float[3] xyz;", rows(np.column_stack([aileron, elevator, rudder]) / FULL)),
+        "vehicle_thrust_setpoint": ("float[3] xyz;", rows(np.column_stack([THROTTLE + thrust, still, still]))),
+    }
+    write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0})
+    return path
+
+
+WRITERS = {"flight.bin": (dataflash, "ardupilot"), "flight.tlog": (tlog, "ardupilot"), "flight.ulg": (ulog, "px4")}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path: Path) -> None:
+    write, map_name = WRITERS[name]
+    path, bag = write(tmp_path / name, flight), tmp_path / "bag"
+    result = CliRunner().invoke(app, ["import", str(path), "--map", map_name, "--output", str(bag)])
+    assert result.exit_code == 0, result.output
+    tape = read_run(bag).tape
+    assert (tape["y"].names, tape["u"].names) == (OUTPUTS, INPUTS)
+    assert len(tape["y"].stamp_ns) == len(flight.y)  # of the flight, without the time on the ground
+    assert tape["y"].values == pytest.approx(flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0], abs=1e-5)  # float32
+    resolution = 0.5 / 500.0 * FULL if name == "flight.tlog" else 0.0  # rad: pulses are whole us in MAVLink
+    assert tape["u"].values == pytest.approx(flight.u, abs=resolution + 1e-6)
+    assert np.median(tape["commands"].values, axis=0) == pytest.approx([0.0, THROTTLE, 0.0, 0.0], abs=1e-6)
+
+
+def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    command = ["import", str(ulog(tmp_path / "flight.ulg", flight)), "--map", "px4", "--output", str(bag)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    response = recorded_response(bag, OUTPUTS, INPUTS)
+    assert (response.sign_ratio >= MIN_RATIO).all()
+    assert response.Omega.diagonal() == pytest.approx(OMEGA, rel=0.15)  # the least that the log of a real flight has to reach
+
+
+def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: Path) -> None:
+    path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11), tmp_path / "bag"
+    command = ["import", str(path), "--map", "ardupilot", "--output", str(bag)]
+    refused = CliRunner().invoke(app, command)
+    assert str(refused.exception) == (
+        "the log: found no flight in MANUAL in the log, expected it, for only there the sticks are the commands, or --servos"
+    )
+    assert not bag.exists()
+    assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
+    assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
+
+
+def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
+    assert CliRunner().invoke(app, [*command, "--from", "15", "--until", "25"]).exit_code == 0
+    tape = read_run(bag).tape
+    assert tape.time("y")[-1] == pytest.approx(10.0)
+    assert tape["pose"].names == ("phi", "theta", "psi")
+    assert tape["pose"].values[0] == pytest.approx(np.radians([5.0, -2.0, -10.0]), abs=1e-6)
+    assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
+
+
+def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match="found a CSV file, expected a DataFlash log"):
+        read_vehicle_log(tmp_path / "a.csv")
+    path = tmp_path / "cut.ulg"
+    path.write_bytes(ulog(tmp_path / "flight.ulg", flight).read_bytes()[:100])
+    with pytest.raises(ParameterError, match="a ULog of PX4"):
+        read_vehicle_log(path)
+    for name, map_name, sentence in (
+        ("flight.ulg", "ardupilot", "inputs.elevator: found no joy.axes"),
+        ("absent.bin", "ardupilot", "no such file"),
+    ):
+        result = CliRunner().invoke(app, ["import", str(tmp_path / name), "--map", map_name, "--output", str(tmp_path / "no")])
+        assert sentence in str(result.exception)

@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Writers of the logs of autopilots, by the published formats."""
+
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+Rows = Sequence[tuple[int, Any]]  # stamp, us, and the values of the fields
+
+FMT = struct.Struct("<3sBB4s16s64s")  # ArduPilot, AP_Logger/LogStructure.h, log_Format
+HEAD = b"\xa3\x95"
+
+
+def write_dataflash(path: Path, messages: Mapping[str, tuple[Sequence[str], Rows]], parameters: Mapping[str, float]) -> None:
+    """A DataFlash log: every field a float. Messages are in the order of their stamps, the parameters before them."""
+    packets: list[tuple[int, bytes]] = [
+        (-1, FMT.pack(HEAD + b"\x80", 0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"))
+    ]
+    row = struct.Struct("<3sQ16sf")
+    packets.append((-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value")))
+    packets += [(0, row.pack(HEAD + b"\x81", 0, name.encode(), value)) for name, value in parameters.items()]
+    for identity, (name, (fields, rows)) in enumerate(messages.items(), start=0x82):
+        packet = struct.Struct(f"<3sQ{len(fields)}f")
+        labels = ",".join(("TimeUS", *fields)).encode()
+        packets.append((-1, FMT.pack(HEAD + b"\x80", identity, packet.size, name.encode(), b"Q" + b"f" * len(fields), labels)))
+        packets += [(stamp, packet.pack(HEAD + bytes([identity]), stamp, *values)) for stamp, values in rows]
+    path.write_bytes(b"".join(packet for _, packet in sorted(packets, key=lambda pair: pair[0])))
+
+
+def write_ulog(path: Path, topics: Mapping[str, tuple[str, Rows]], parameters: Mapping[str, float]) -> None:
+    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file format)."""
+
+    def message(kind: bytes, content: bytes) -> bytes:
+        return struct.pack("<H", len(content)) + kind + content
+
+    def key_value(key: str, value: bytes) -> bytes:
+        return bytes([len(key)]) + key.encode() + value
+
+    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message(b"B", bytes(40))]
+    parts += [message(b"F", f"{name}:uint64_t timestamp;{fields}".encode()) for name, (fields, _) in topics.items()]
+    parts += [message(b"P", key_value(f"float {name}", struct.pack("<f", value))) for name, value in parameters.items()]
+    parts += [message(b"A", bytes([0]) + struct.pack("<H", k) + name.encode()) for k, name in enumerate(topics)]
+    samples = [(stamp, k, values) for k, (_, rows) in enumerate(topics.values()) for stamp, values in rows]
+    parts += [message(b"D", struct.pack(f"<HQ{len(v)}f", k, stamp, *v)) for stamp, k, v in sorted(samples, key=lambda s: s[:2])]
+    path.write_bytes(b"".join(parts))
+
+
+def write_tlog(path: Path, messages: Sequence[tuple[int, Any]], system: int = 1) -> None:
+    """A tlog: before each packet its time, us since 1970 (MAVLink guide). The messages are those of pymavlink."""
+    sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=1)
+    ordered = sorted(messages, key=lambda pair: pair[0])
+    path.write_bytes(b"".join(struct.pack(">Q", stamp) + message.pack(sender) for stamp, message in ordered))
