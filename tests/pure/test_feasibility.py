@@ -4,6 +4,7 @@
 
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from tests.conftest import REPOSITORY
 
 from flight_bringup.scenarios import find_scenario, with_route
 from flight_core.parameters import ParameterError
-from flight_guidance.feasibility import Performance, flyable_legs, speeds
-from flight_guidance.path import Arc, Line
+from flight_guidance.feasibility import Performance, flyable, speeds
+from flight_guidance.path import Arc, Line, Route, along, route_outline
 from flight_guidance.route_file import Waypoint, read_route
 
 pytestmark = pytest.mark.package("flight_guidance")
@@ -29,7 +30,7 @@ STRAIGHT = 3000.0 - RADIUS * math.tan((math.pi / 2.0 - math.asin(RADIUS / 3000.0
 
 def refusal(waypoints: tuple[Waypoint, ...], radius: float = RADIUS, period: float = PERIOD, **can: Any) -> str:
     with pytest.raises(ParameterError) as refused:
-        flyable_legs(waypoints, radius, period, CAN._replace(**can))
+        flyable(waypoints, radius, period, CAN._replace(**can))
     return str(refused.value)
 
 
@@ -41,7 +42,7 @@ def number(sentence: str) -> float:
 
 
 def test_route_within_all_limits_gives_legs() -> None:
-    first, fillet, second, orbit = flyable_legs(CORNER, RADIUS, PERIOD, CAN)
+    first, fillet, second, orbit = flyable(CORNER, RADIUS, PERIOD, CAN).legs
     assert (type(first), type(fillet), type(second), type(orbit)) == (Line, Arc, Line, Arc)
     assert first.end == pytest.approx((STRAIGHT, 0.0))
 
@@ -54,8 +55,8 @@ def test_a_speed_lasts_until_the_next_one() -> None:
 def test_radius_too_small_for_wind_refused() -> None:
     sentence = refusal(CORNER, radius=400.0)
     assert sentence == "guidance.radius: found 400 m, expected at least 573 m at this speed, wind and bank"
-    assert flyable_legs(CORNER, number(sentence), PERIOD, CAN)
-    assert flyable_legs(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
+    assert flyable(CORNER, number(sentence), PERIOD, CAN)
+    assert flyable(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
 
 
 def test_stall_limits_bank_and_radius() -> None:
@@ -67,29 +68,48 @@ def test_stall_limits_bank_and_radius() -> None:
 def test_a_period_below_the_rule_is_refused() -> None:
     sentence = refusal(CORNER, roll_rate=0.15)  # 11 * 30 deg / 0.15 = 38.40
     assert sentence == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
-    assert flyable_legs(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
+    assert flyable(CORNER, RADIUS, number(sentence), CAN._replace(roll_rate=0.15))
 
 
 def test_a_speed_below_the_floor_is_refused() -> None:
     slow = (*CORNER[:2], CORNER[2]._replace(speed=28.0))
     sentence = refusal(slow)  # 1.15 * 25 = 28.75
     assert sentence == "route[2].V: found 28 m/s, expected at least 28.8 m/s, the speed floor"
-    assert flyable_legs((*CORNER[:2], CORNER[2]._replace(speed=number(sentence))), RADIUS, PERIOD, CAN)
+    assert flyable((*CORNER[:2], CORNER[2]._replace(speed=number(sentence))), RADIUS, PERIOD, CAN)
 
 
 @pytest.mark.parametrize(("altitude", "side", "rate"), [(1300.0, "above", 2.5), (700.0, "below", 4.0)])
-def test_altitude_beyond_climb_to_next_point_refused(altitude: float, side: str, rate: float) -> None:
+def test_altitude_beyond_climb_flown_on_circles(altitude: float, side: str, rate: float) -> None:
+    """A climb is flown before the leg, a descent after the leg: clear of what the higher waypoint was meant to clear."""
     route = (CORNER[0], CORNER[1]._replace(altitude=altitude), CORNER[2]._replace(altitude=altitude))
-    sentence = refusal(route)
+    legs, waypoints, (note,) = flyable(route, RADIUS, PERIOD, CAN)
     reach = math.floor(rate * STRAIGHT / 50.0)  # the straight part, with the wind from behind
-    assert sentence == (
-        f"route[1].altitude: found 300 m {side} the waypoint before, "
-        f"expected at most {reach} m at {rate:g} m/s over {STRAIGHT:.0f} m"
+    assert note.startswith(f"route[1]: 300 m {side} the waypoint before, flown on circles round the waypoint")
+    assert note.endswith(f"takes {reach} m")
+    circles = [leg for leg in legs[:-1] if isinstance(leg, Arc) and leg.loiter]
+    assert [circle.centre for circle in circles] == [route[0 if altitude > 1000.0 else 1].point]
+    assert [waypoint.departure for waypoint in waypoints[:2]] == [max(altitude, 1000.0), altitude]
+    within = tuple(
+        waypoint._replace(altitude=1000.0 + math.copysign(reach, altitude - 1000.0) * (k > 0))
+        for k, waypoint in enumerate(route)
     )
-    change = math.copysign(number(sentence), altitude - 1000.0)
-    assert flyable_legs(
-        tuple(waypoint._replace(altitude=1000.0 + change * (k > 0)) for k, waypoint in enumerate(route)), RADIUS, PERIOD, CAN
-    )
+    assert flyable(within, RADIUS, PERIOD, CAN).notes == ()
+
+
+def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
+    """Two corners 300 m apart: the nearer one to the line of its neighbours goes, and the note tells the distance."""
+    near = (Waypoint(0, 0, 0), Waypoint(4000, 0, 0), Waypoint(4200, 200, 0), Waypoint(4200, 4000, 0))
+    legs, waypoints, (note,) = flyable(near, RADIUS, PERIOD, CAN)
+    assert len(waypoints) == 3
+    match = re.search(r"route\[(\d)\]: corner cut, (\d+) m from the waypoint", note)
+    assert match
+    point = near[int(match[1])].point
+    drawn = route_outline(Route(legs, (0.0,) * len(legs), (40.0,) * len(legs)))[:-38]  # without the last orbit
+    between = [along(*ends, k / 500) for ends in pairwise([place[:2] for place in drawn]) for k in range(501)]
+    nearest = min(math.dist(place, point) for place in between)
+    assert float(match[2]) == pytest.approx(nearest, abs=2.0)
+    far = (Waypoint(0, 0, 0), Waypoint(4000, 0, 0), Waypoint(4000, 600, 0), Waypoint(0, 600, 0))
+    assert "route[2]: found 600 m from the waypoint before" in refusal(far)
 
 
 def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:

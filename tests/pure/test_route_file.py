@@ -21,6 +21,7 @@ from flight_guidance.route_file import (
     Origin,
     Waypoint,
     local,
+    read_fence_file,
     read_route,
     read_route_file,
 )
@@ -142,9 +143,11 @@ def plan(items: list[dict[str, Any]], home: Any = (47.4, 8.5, 400.0), **more: An
 
 
 def wpl(*rows: tuple[float, ...]) -> str:
-    """Rows of frame, command, latitude, longitude, altitude, after the home at 400 m."""
-    lines = [(0, 16, 47.4, 8.5, 400.0), *rows]
-    texts = [f"{k}\t0\t{frame}\t{command}\t0\t0\t0\t0\t{a}\t{b}\t{c}\t1" for k, (frame, command, a, b, c) in enumerate(lines)]
+    """Rows of frame, command, latitude, longitude, altitude and perhaps the first parameter, after the home at 400 m."""
+    lines = [(*row, 0.0)[:6] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
+    texts = [
+        f"{k}\t0\t{frame}\t{command}\t{p}\t0\t0\t0\t{a}\t{b}\t{c}\t1" for k, (frame, command, a, b, c, p) in enumerate(lines)
+    ]
     return "\r\n".join(["QGC WPL 110", *texts, ""])
 
 
@@ -225,16 +228,86 @@ def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
         read_route_file(path, None, 7.0, above_sea=None)
 
 
-def test_unflown_items_of_mission_are_named(tmp_path: Path) -> None:
+def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) -> None:
     path = tmp_path / "r.waypoints"
-    rows = [(3, 22, 0.0, 0.0, 50.0), (3, 16, 47.4, 8.52, 50.0), (3, 18, 47.42, 8.52, 60.0), (2, 177, 0.0, 0.0, 0.0)]
+    rows = [
+        (3, 22, 0.0, 0.0, 50.0), (3, 16, 47.4, 8.52, 50.0), (3, 31, 47.41, 8.52, 90.0), (3, 18, 47.42, 8.52, 90.0, 2.0),
+        (2, 177, 0.0, 0.0, 0.0), (3, 17, 47.43, 8.52, 90.0), (3, 16, 47.44, 8.52, 90.0),
+    ]  # fmt: skip
     path.write_text(wpl(*rows), encoding="utf-8")
     route = read_route_file(path)
-    assert [waypoint.altitude for waypoint in route.waypoints] == [50.0, 60.0]
-    assert route.notes == (
-        "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 4)",
-        "flown as waypoints, without the wait: NAV_LOITER_TURNS (item 3)",
+    assert [(w.altitude, w.departure, w.turns) for w in route.waypoints] == [
+        *((50.0, 50.0, 0.0), (50.0, 90.0, 0.0), (90.0, 90.0, 2.0), (90.0, 90.0, 0.0))
+    ]
+    # A loiter without end is the last orbit.
+    assert route.notes == ("not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), MAV_CMD 16 (item 7)",)
+
+
+def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
+    path = tmp_path / "r.yaml"
+    path.write_text(
+        "route:\n- [0, 0, 0]\n- [900, 0, 0]\n- {north: 900, east: 0, altitude: 80, turns: 2}\n- [1800, 0, 80]\n",
+        encoding="utf-8",
     )
+    assert read_route(path)[1] == Waypoint(900.0, 0.0, 0.0, None, 2.0, 0.0, 80.0)
+    path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: -1}\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"route\[0\].turns: found -1, expected at least 0"):
+        read_route(path)
+
+
+CENTRE = {"center": [47.41, 8.51], "radius": 200.0}
+PLAN_FENCE = {
+    "fileType": "Plan",
+    "geoFence": {
+        "polygons": [{"polygon": [[47.39, 8.49], [47.42, 8.49], [47.42, 8.53]], "inclusion": True}],
+        "circles": [{"circle": CENTRE, "inclusion": False}],
+    },
+    "rallyPoints": {"points": [[47.5, 8.5, 50.0], [47.401, 8.5, 40.0]]},
+    "mission": {"plannedHomePosition": [47.40, 8.50, 450.0], "items": []},
+}
+GEOJSON_FENCE = {
+    "type": "FeatureCollection",
+    "features": [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": [[[8.49, 47.39], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]]},
+        },
+        {
+            "type": "Feature",
+            "properties": {"radius": 200, "exclude": True},
+            "geometry": {"type": "Point", "coordinates": [8.51, 47.41]},
+        },
+    ],
+}
+WPL_FENCE = [
+    *((3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))),  # of three corners
+    *((3, 5004, 47.41, 8.51, 0.0, 200.0), (3, 5100, 47.401, 8.5, 40.0)),
+]
+
+
+@pytest.mark.parametrize("ending", [".plan", ".geojson", ".waypoints"])
+def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"fence{ending}"
+    tree = PLAN_FENCE if ending == ".plan" else GEOJSON_FENCE
+    path.write_text(wpl(*WPL_FENCE) if ending == ".waypoints" else json.dumps(tree), encoding="utf-8")
+    sections = read_fence_file(path, ZURICH)
+    field, hole = sections["fence"].values()
+    corners = [local(47.39, 8.49, ZURICH), local(47.42, 8.49, ZURICH), local(47.42, 8.53, ZURICH)]
+    assert (field["north"], field["east"]) == tuple([corner[k] for corner in corners] for k in (0, 1))
+    assert (field["exclude"], hole["exclude"], hole["radius"]) == (False, True, 200.0)
+    if ending != ".geojson":  # the nearest rally point, above the home
+        assert sections["home"] == pytest.approx(
+            {"north": local(47.401, 8.5, ZURICH)[0], "east": local(47.401, 8.5, ZURICH)[1], "altitude": 40.0}
+        )
+
+
+def test_file_without_fence_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.geojson"
+    path.write_text(json.dumps({"type": "LineString", "coordinates": [[8.5, 47.4], [8.51, 47.4]]}), encoding="utf-8")
+    with pytest.raises(ParameterError, match="found a 'LineString', expected Polygons, or Points with a radius"):
+        read_fence_file(path, ZURICH)
+    with pytest.raises(ParameterError, match=r"expected one that ends in \.plan"):
+        read_fence_file(tmp_path / "r.kml", ZURICH)
 
 
 def test_line_cut_at_date_line_is_one(tmp_path: Path) -> None:
@@ -279,7 +352,11 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.yaml", "route: [[0, 0, 1, 0]]", r"route\[0\]\.V: found 0 m/s, expected a speed above 0"),
         ("r.yaml", "route: [[0, 200000, 1]]", r"route\[0\]: found 200 km from the origin, expected at most 100 km"),
         ("r.yaml", "route: [{latitude: 47.4, longitude: 8.5}]", r"route\[0\]\.altitude: found nothing, expected a"),
-        ("r.yaml", "route: [{lat: 47.4}]", r"route\[0\]: found the keys \['lat'\], expected latitude, longitude, altitude"),
+        (
+            "r.yaml",
+            "route: [{lat: 47.4}]",
+            r"route\[0\]: found the keys \['lat'\], expected north and east or latitude and longitude",
+        ),
         ("r.yaml", "route: 5", "found another content, expected the key route alone, with a list"),
         ("r.yaml", "{route: [], speed: 5}", "found another content, expected the key route alone"),
         ("r.geojson", "{", r"r\.geojson: not valid JSON .* expected a route file"),

@@ -154,15 +154,15 @@ def test_wind_that_airspeed_cannot_beat_refused(wind: float, V: tuple[float, ...
 class Flown:
     """Guidance on a route, with poses as given."""
 
-    def __init__(self, *waypoints: tuple[float, float, float], start: path.Point = (0.0, 0.0)) -> None:
-        self.made, self._k = Guidance(CONFIG), 0
-        self.made.take_route(CONFIG.plan([Waypoint(*waypoint) for waypoint in waypoints]))
+    def __init__(self, *waypoints: tuple[Any, ...], start: path.Point = (0.0, 0.0), config: GuidanceConfig = CONFIG) -> None:
+        self.made, self._k = Guidance(config), 0
+        self.made.take_route(config.plan([Waypoint(*waypoint) for waypoint in waypoints]))
         self.at(*start)
 
-    def at(self, north: float, east: float, course: float = 0.0) -> dict[str, float]:
+    def at(self, north: float, east: float, course: float = 0.0, altitude: float = 100.0) -> dict[str, float]:
         """The log of a step at a position, on a course through calm air, rad."""
         now, v = 20 * MS * self._k, (SPEED * math.cos(course), SPEED * math.sin(course))
-        self.made.take_pose(StampedVector(now, np.array([0.0, 0.0, course, north, east, 100.0, *v, 0.0, 0.0])), now)
+        self.made.take_pose(StampedVector(now, np.array([0.0, 0.0, course, north, east, altitude, *v, 0.0, 0.0])), now)
         self.made.take_y(StampedVector(now, np.zeros(4)), now)
         output = self.made.step(now, now)
         assert output is not None
@@ -179,7 +179,8 @@ def test_first_waypoint_has_to_be_reached() -> None:
     # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the tangent, and an arc of pi + 2 b.
     assert log["to_go"] == pytest.approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
     log = flown.at(2499.0, 3.0, math.pi)
-    assert (log["leg"], log["joining"], log["target.altitude"]) == (0.0, 0.0, 100.0)
+    assert (log["leg"], log["joining"]) == (0.0, 0.0)
+    assert log["target.altitude"] == pytest.approx(150.0, abs=0.1)  # at the begin of the slope
 
 
 def test_leg_passed_far_away_is_missed() -> None:
@@ -236,6 +237,83 @@ def test_resume_flies_last_leg_from_nearest_point() -> None:
     assert flown.made.resume()
     log = flown.at(701.0, 400.0)
     assert (log["mode.lateral"], log["leg"], log["target.along"]) == (Lateral.ROUTE, 0.0, 700.0)
+
+
+@pytest.mark.parametrize("profile", ["slope", "step"])
+def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
+    config = GuidanceConfig.validate_mapping(SECTION | {"profile": profile}, "guidance")
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 140.0), (4000.0, 0.0, 140.0), config=config)
+    log = flown.at(500.0, 5.0)
+    if profile == "step":
+        assert (log["target.altitude"], log["target.climb"]) == (140.0, 0.0)
+    else:  # the last line touches the orbit: the legs meet at an angle of 4 deg
+        assert log["target.altitude"] == pytest.approx(110.0, abs=0.1)
+        assert log["target.climb"] == pytest.approx(40.0 / 2000.0 * SPEED, abs=0.01)
+    assert flown.made.hold()
+    assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
+    flown.made.take_target({"leg": 0.0, "altitude": 120.0})
+    assert flown.at(540.0, 5.0)["target.altitude"] == 120.0  # a command of the user holds on the leg
+    assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
+
+
+def circling(flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0) -> dict[str, float]:
+    """The log after steps of flight clockwise round a centre, from a bearing of the centre in deg."""
+    log: dict[str, float] = {}
+    step = SPEED * 0.02 / R
+    for k in range(1, int(turns * 2.0 * math.pi / step) + 1):
+        bearing = math.radians(first) + k * step
+        place = (centre[0] + R * math.cos(bearing), centre[1] + R * math.sin(bearing))
+        log = flown.at(*place, bearing + math.pi / 2.0, altitude)
+        if log["leg"] != 1.0:
+            break
+    return log
+
+
+@pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0)])
+def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
+    """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west."""
+    centre = (2000.0, 0.0)
+    flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
+    route = flown.made.route
+    assert route is not None
+    circle = route.legs[1]
+    assert circle.end == pytest.approx((2000.0, -R), abs=10.0)  # the last line touches the orbit round the last waypoint
+    end = route.legs[0].end
+    assert end is not None
+    assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0
+    half = circling(flown, centre, (turns or 60.0 / 36.2) - 0.5)
+    assert 0.5 < half["loitered"] < 1.0
+    flown.at(*end, path.end_course(route.legs[0]))
+    log = circling(flown, centre, 2.0, first=math.degrees(path.course_of(centre, end)))
+    assert log["leg"] == 2.0
+
+
+def test_steep_leg_begins_with_circle_that_is_left_at_altitude() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1500.0, 0.0, 400.0), (1500.0, 2500.0, 400.0), start=(0.0, -R))
+    assert flown.made.route is not None
+    assert "flown on circles round the waypoint before" in flown.notices[0]
+    circle = flown.made.route.legs[0]
+    assert (isinstance(circle, Arc), flown.at(0.0, -R + 1.0)["target.altitude"]) == (True, 400.0)
+    assert circle.end is not None
+    course = path.end_course(circle)
+    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 300.0)["leg"] == 0.0
+    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 396.0)["leg"] == 1.0
+
+
+def test_yaw_rate_beside_bank() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (5000.0, 0.0, 100.0))
+    flown.made.take_target({"phi": 0.0, "r": 0.05})
+    for k in range(50):
+        log = flown.at(10.0 + k, 0.0)
+    assert log["u_m.r"] == pytest.approx(0.05)
+    flown.made.take_target({"heading": 0.0})
+    assert flown.at(70.0, 0.0)["target.r"] == 0.0
+    for values, sentence in (
+        ({"r": 0.1}, "found r without phi"),
+        ({"phi": 0.0, "r": 0.5}, "expected -12.9[0-9]* to 12.9[0-9]* deg/s"),
+    ):
+        with pytest.raises(ChannelError, match=sentence):
+            flown.made.take_target(values)
 
 
 def log_of(count: int, **channels: ArrayLike) -> Tape:

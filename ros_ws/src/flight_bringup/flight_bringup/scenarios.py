@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scenarios of the stack, the file of a scenario's name, and scenarios with a route."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_core.arguments import FilePath
@@ -32,16 +34,24 @@ def find_scenario(name: FilePath | Scenario, duration: float | None = None) -> S
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
 
 
-def with_route(scenario: Scenario, waypoints: Sequence[Waypoint]) -> Scenario:
+def with_route(scenario: Scenario, waypoints: Sequence[Waypoint], fence: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
     """The scenario with a route that guidance flies from the start, in place of its route and its program of targets.
+
+    `fence`: further sections of guidance, as of `read_fence_file`.
 
     Raises ParameterError where it cannot be flown.
     """
     flown = speeds(waypoints, scenario.aircraft.channels().speed)
     route = {key: [getattr(waypoint, key) for waypoint in waypoints] for key in ("north", "east", "altitude")} | {
-        "V": list(flown)
+        "V": list(flown),
+        "turns": [waypoint.turns for waypoint in waypoints],
+        "wait": [waypoint.wait for waypoint in waypoints],
+        "leave": [waypoint.departure for waypoint in waypoints],
     }
-    return scenario.vary(guidance={"route": route, "program": {}})
+    route = {key: values for key, values in route.items() if key not in {"turns", "wait"} or any(values)}
+    if route["leave"] == route["altitude"]:
+        del route["leave"]
+    return scenario.vary(guidance={"route": route, "program": {}, **fence})
 
 
 def written(scenario: Scenario, path: Path) -> Scenario:

@@ -55,6 +55,7 @@ class Legs(NamedTuple):
     )
     near: Array  # m, from the end, within which the leg counts as flown
     from_altitude: Array  # m, of the waypoint that the leg leaves
+    slope: Array  # of the altitude along a line, 1
     from_V: Array  # m/s
 
 
@@ -155,6 +156,8 @@ def build(scenario: Scenario, course: Course) -> Mission:
         Phi, Gamma = stepper.Phi @ Phi, stepper.Phi @ Gamma + held
     order = [reference.outputs.index(name) for name in names]
     route = guidance.plan(guidance.waypoints())
+    loiters = any(path.is_orbit(leg) for leg in route.legs[:-1])
+    require(not loiters, "guidance.route", "circles round a waypoint", "lines and fillets alone in a campaign of missions")
     airframe = aircraft.load()[0]
     states = list(airframe.states)
     places = tuple(states.index(name) if name in states else None for name in POSE_STATES)
@@ -200,6 +203,7 @@ def legs_of(route: Route) -> Legs:
         np.sign(curvature),
         np.array([route.near(number) for number in range(len(legs))]),
         np.array(route.from_altitude),
+        np.array([route.profile(number, 0.0)[1] for number in range(len(legs))]),
         np.array(route.from_V),
     )
 
@@ -281,7 +285,9 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             return jnp.where(joins_leg, onto(leg, place), entered(leg, following, place))
 
         entry = jnp.where(joins_leg, leg.start_curvature, leg.entry)
-        altitude = jnp.where(joins_leg, leg.from_altitude, leg.altitude)
+        altitude, climb = (
+            jnp.where(joins_leg, *pair) for pair in zip((leg.from_altitude, 0.0), _profile(leg, pose), strict=True)
+        )
         escape, home_altitude, homing = (
             Escape(state.fence, False, state.clearance, 0.0),
             state.home_altitude,
@@ -295,10 +301,11 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), position)
             error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))
             entry, altitude = jnp.where(homing, orbit.curvature, entry), jnp.where(homing, home_altitude, altitude)
+        climb = jnp.where(homing, 0.0, climb)
         wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
         wanted = jnp.where(jnp.abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
-        target = Target(altitude=altitude, V=jnp.where(joins_leg, leg.from_V, leg.V))
-        flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.ALTITUDE, target=target)
+        target = Target(altitude=altitude, climb=climb, V=jnp.where(joins_leg, leg.from_V, leg.V))
+        flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
         off, counts = pose["altitude"] - altitude, leg.has_end & ~joins_leg & ~homing
         return state._replace(
@@ -343,6 +350,15 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         return fly(before, number, jnp.where(missed, joins(at(number)), still), missed)
 
     return jax.lax.switch(action, (lambda: state, begin, step))
+
+
+def _profile(leg: Legs, pose: dict[str, Array]) -> tuple[Array, Array]:
+    """Altitude, m, and climb rate, m/s, of a leg at the nearest point, as `Route.profile`."""
+    north, east = jnp.cos(leg.end_course), jnp.sin(leg.end_course)
+    to_go = north * (leg.end[0] - pose["north"]) + east * (leg.end[1] - pose["east"])
+    length = jnp.hypot(leg.end[0] - leg.start[0], leg.end[1] - leg.start[1])
+    climb = leg.slope * (pose["v_north"] * north + pose["v_east"] * east)
+    return leg.altitude - leg.slope * jnp.clip(to_go, 0.0, length), climb
 
 
 def advance(state: MissionState, x: Array, mission: Mission) -> MissionState:

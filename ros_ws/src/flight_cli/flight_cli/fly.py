@@ -19,13 +19,14 @@ from flight_cli.output import (
     print_json,
     show_flight,
 )
-from flight_cli.route_options import Altitude, Simplify, read_waypoints
+from flight_cli.route_options import Altitude, Simplify, parse_origin, read_waypoints
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
 from flight_core.outcome import exit_status
 from flight_core.parameters import ParameterError, require
-from flight_guidance.route_file import ENDINGS
+from flight_guidance.route_file import ENDINGS, read_fence_file
+from flight_guidance.route_formats import FENCES
 
 
 def fly(
@@ -52,6 +53,9 @@ def fly(
         str | None,
         typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees; else the file's home."),
     ] = None,
+    fence: Annotated[
+        Path | None, typer.Option(metavar="FILE", help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.")
+    ] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
@@ -73,16 +77,16 @@ def fly(
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
+    files = route or fence
     for option, value in (("--origin", origin), ("--altitude", altitude), ("--simplify", simplify or None)):
-        require(value is None or route is not None, option, "no --route", "the file of a route: --route FILE")
-    if route is not None:
-        waypoints = read_waypoints(route, origin, altitude, simplify, above_sea=chosen.aircraft.is_jsbsim)
-        chosen = with_route(chosen, waypoints)
+        require(value is None or files is not None, option, "no --route", "the file of a route: --route FILE")
+    if files is not None:
+        chosen = _with_files(chosen, route, fence, origin, altitude, simplify)
     _require_flyable(chosen, autopilot, in_process=in_process)
     for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
         print(f"warning: {sentence}", file=sys.stderr)
     run = new_run(chosen, runs)
-    if route is not None:
+    if files is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
@@ -119,6 +123,18 @@ def fly(
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
     raise typer.Exit(exit_status(outcome))
+
+
+def _with_files(
+    scenario: Scenario, route: Path | None, fence: Path | None, origin: str | None, altitude: float | None, simplify: float
+) -> Scenario:
+    """The scenario with the route and the fence of files. Raises ParameterError."""
+    above_sea = scenario.aircraft.is_jsbsim
+    sections = {} if fence is None else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
+    require(not sections or scenario.guidance is not None, "--fence", "a scenario without guidance", "one with guidance")
+    if route is not None:
+        return with_route(scenario, read_waypoints(route, origin, altitude, simplify, above_sea=above_sea), sections)
+    return scenario.vary(guidance=sections)
 
 
 def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_process: bool) -> None:

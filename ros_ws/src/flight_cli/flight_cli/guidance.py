@@ -70,5 +70,7 @@ def route(
     for k, waypoint in enumerate(waypoints):
         if waypoint.speed is not None:
             raise ParameterError(f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di target V=VALUE")
+        if waypoint.loiters:
+            raise ParameterError(f"route[{k}]: found a circle round the waypoint, expected none in flight")
     points = [(waypoint.north, waypoint.east, waypoint.altitude) for waypoint in waypoints]
     _ask(namespace, lambda client: client.send_route(points), f"flies the route of {len(points)} waypoints")

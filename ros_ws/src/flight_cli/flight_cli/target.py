@@ -10,9 +10,8 @@ import typer
 
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import REMOVED, ParameterError, require
-from flight_guidance.modes import TARGETS
+from flight_guidance.modes import ANGLES, TARGETS
 
-ANGLES = ("phi", "theta", "heading", "course")
 REFUSED = 1
 
 
@@ -31,7 +30,7 @@ def target(
         typer.Argument(
             metavar="NAME=VALUE ...",
             help="One of phi, heading, course, leg, or north, east and radius of an orbit; one of theta, climb, altitude; V."
-            " phi, theta, heading and course in degrees; all else in m and m/s.",
+            " phi, theta, heading and course in degrees, r (beside phi) in degrees a second; all else in m and m/s.",
         ),
     ],
     namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",

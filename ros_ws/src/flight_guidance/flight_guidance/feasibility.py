@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_guidance import path, protection
 from flight_guidance.fence import Fence, clearance
 from flight_guidance.lateral import least_period, least_radius
 from flight_guidance.modes import LARGEST
-from flight_guidance.path import Leg, Line, Point, Route
+from flight_guidance.path import Leg, Line, Loiter, Point, Route
 from flight_guidance.route_file import Waypoint
 
 HEADWIND = 1.2
@@ -44,27 +44,26 @@ def speeds(waypoints: Sequence[Waypoint], first: float) -> tuple[float, ...]:
     return tuple(named)
 
 
-def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> tuple[Leg, ...]:
+class FlyableRoute(NamedTuple):
+    """The legs of a route, and the waypoints that the legs fly: without those that are cut, with the loiters of steep legs."""
+
+    legs: tuple[Leg, ...]
+    waypoints: tuple[Waypoint, ...]
+    notes: tuple[str, ...]  # sentences on what differs from the waypoints given
+
+
+def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Performance) -> FlyableRoute:
     """The legs of a route with fillets of `radius`, m, and path following with `period`, s.
 
+    Of a leg too short for the fillets one waypoint is left out, where the route still passes within `radius`, or 1 s of flight,
+    of the waypoint. A change of altitude beyond the climb or sink along the straight part of the leg, the wind from behind, is
+    flown on a circle: a climb round the waypoint before, a descent round the waypoint after.
     Raises ParameterError for a waypoint not finite or beyond LARGEST, an altitude or a speed beyond the bounds, a speed of at
-    most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), a leg too short for
-    the fillets, and an altitude out of reach of the climb or sink along the straight part of the leg, the wind from behind.
-    phi_max is the largest bank at V for the stall speed.
+    most HEADWIND times the wind, a period below the rule, a radius below (V + W)^2 / (g tan(0.8 phi_max)), and a leg too short
+    for the fillets. phi_max is the largest bank at V for the stall speed.
     """
-    for k, (north, east, altitude, _) in enumerate(waypoints):
-        known = all(abs(value) <= LARGEST for value in (north, east, altitude))
-        found = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
-        require(known, f"route[{k}]", found, f"finite values, at most {LARGEST:g} m either way")
-        permitted = can.lowest <= altitude <= can.highest
-        require(permitted, f"route[{k}].altitude", f"{altitude:g} m", f"{can.lowest:g} to {can.highest:g} m")
-    floor, flown = protection.speed_floor(can.stall_speed), speeds(waypoints, can.speed)
-    for k, speed in enumerate(flown):
-        require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
-        require(speed <= can.largest_speed, f"route[{k}].V", f"{speed:g} m/s", f"at most {can.largest_speed:g} m/s")
-        expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
-        found = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
-        require(speed > HEADWIND * can.wind, f"route[{k}].V", found, expected)
+    _require_bounds(waypoints, can)
+    flown = speeds(waypoints, can.speed)
     least, slowest = 0.0, 0.0
     for speed in flown:
         bank = protection.bank_limit(can.bank, can.stall_speed, speed)
@@ -72,16 +71,100 @@ def flyable_legs(waypoints: Sequence[Waypoint], radius: float, period: float, ca
         slowest = max(slowest, least_period(speed, bank, can.roll_rate))
     expected = f"at least {_up(slowest, 0.1):g} s at this speed, bank and roll rate"
     require(period >= slowest, "guidance.period", f"{period:g} s", expected)
-    legs = path.route([waypoint.point for waypoint in waypoints], radius, least)
-    lines = [leg for leg in legs if isinstance(leg, Line)]
-    for k, (line, speed) in enumerate(zip(lines, flown[1:], strict=True), 1):
-        change = waypoints[k].altitude - waypoints[k - 1].altitude
-        length, rate = math.dist(*line), can.climb if change > 0.0 else can.sink
-        reach = rate * length / (speed + can.wind)
-        found = f"{abs(change):g} m {'above' if change > 0.0 else 'below'} the waypoint before"
-        expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
-        require(abs(change) <= reach, f"route[{k}].altitude", found, expected)
-    return legs
+    named = [waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)]
+    kept, notes = _without_short_legs(named, radius, least)
+    return _with_circles(kept, notes, radius, least, can)
+
+
+def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[Leg, ...]:
+    loiters = {k: Loiter(waypoint.turns, waypoint.wait) for k, waypoint in enumerate(waypoints) if waypoint.loiters}
+    return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters)
+
+
+def _without_short_legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[list[Waypoint], tuple[str, ...]]:
+    """The waypoints without those left out for short legs, and a note on each. Raises ShortLegError where none can go."""
+    kept, refusal = list(enumerate(waypoints)), None
+    while True:
+        try:
+            legs = _legs([waypoint for _, waypoint in kept], radius, least)
+            break
+        except path.ShortLegError as short:
+            refusal = refusal or short
+            inner = [k for k in (short.number - 1, short.number) if 0 < k < len(kept) - 1 and not kept[k][1].loiters]
+            if not inner:
+                raise refusal from None
+            del kept[min(inner, key=lambda k: _offset(*(waypoint.point for _, waypoint in kept[k - 1 : k + 2])))]
+        except ParameterError as error:  # of the rest, which has corners of its own
+            raise refusal or error from None
+    numbers = {number for number, _ in kept}
+    notes = []
+    for number, waypoint in enumerate(waypoints):
+        if number in numbers:
+            continue
+        distance = path.distance_from(legs, waypoint.point)
+        if distance > max(radius, waypoint.speed or 0.0):
+            raise refusal or ParameterError("route")
+        notes.append(f"route[{number}]: corner cut, {distance:.0f} m from the waypoint: a leg is too short for the fillets")
+    return [waypoint for _, waypoint in kept], tuple(notes)
+
+
+def _offset(before: Point, at: Point, after: Point) -> float:
+    """Distance of a point from the line between two others, m."""
+    line = Line(before, after)
+    share = path.nearest(line, at) / max(path.length(line), 1e-9)
+    return math.dist(at, path.along(before, after, share))
+
+
+def _with_circles(
+    waypoints: list[Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
+) -> FlyableRoute:
+    """The route with a circle for each change of altitude beyond the climb or sink along the leg."""
+    waypoints, told = list(waypoints), list(notes)
+    while True:
+        legs = _legs(waypoints, radius, least)
+        lines: dict[int, float] = {}
+        for number, leg in zip(path.leads(legs), legs, strict=True):
+            if isinstance(leg, Line):
+                lines[number] = path.length(leg)
+        for k, length in lines.items():
+            before, at = waypoints[k - 1], waypoints[k]
+            change = at.altitude - before.departure
+            rate = can.climb if change > 0.0 else can.sink
+            reach = rate * length / ((at.speed or can.speed) + can.wind)
+            if abs(change) <= reach:
+                continue
+            rises = change > 0.0
+            found = f"{abs(change):g} m {'above' if rises else 'below'} the waypoint before"
+            expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
+            require(rate > 0.0 and (rises or at.leave is None), f"route[{k}].altitude", found, expected)
+            if rises:
+                waypoints[k - 1] = before._replace(leave=at.altitude)
+            else:
+                waypoints[k] = at._replace(altitude=before.departure, leave=at.altitude)
+            where = f"round the waypoint {'before' if rises else 'itself'}, where the leg takes {math.floor(reach)} m"
+            told.append(f"route[{k}]: {found}, flown on circles {where}")
+            break
+        else:
+            return FlyableRoute(legs, tuple(waypoints), tuple(told))
+
+
+def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
+    """Raise ParameterError for a waypoint, an altitude or an airspeed out of bounds."""
+    for k, waypoint in enumerate(waypoints):
+        north, east, altitude = waypoint[:3]
+        known = all(abs(value) <= LARGEST for value in (north, east, altitude, waypoint.departure))
+        found = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
+        require(known, f"route[{k}]", found, f"finite values, at most {LARGEST:g} m either way")
+        for value in (altitude, waypoint.departure):
+            permitted = can.lowest <= value <= can.highest
+            require(permitted, f"route[{k}].altitude", f"{value:g} m", f"{can.lowest:g} to {can.highest:g} m")
+    floor = protection.speed_floor(can.stall_speed)
+    for k, speed in enumerate(speeds(waypoints, can.speed)):
+        require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
+        require(speed <= can.largest_speed, f"route[{k}].V", f"{speed:g} m/s", f"at most {can.largest_speed:g} m/s")
+        expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
+        found = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
+        require(speed > HEADWIND * can.wind, f"route[{k}].V", found, expected)
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:

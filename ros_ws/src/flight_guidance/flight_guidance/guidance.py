@@ -57,6 +57,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
         *(f"target.{name}" for name in TARGETS),
         *(f"state.{name}" for name in STATE),
         *(f"wind.{name}" for name in WIND),
+        "loitered",
         *(f"pose.{name}" for name in POSE),
         *(f"y.{name}" for name in outputs),
         *(f"u_m.{name}" for name in outputs),
@@ -81,6 +82,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) ->
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
+            state.loitered,
             *inputs.pose,
             *inputs.y,
             *state.u_m,
@@ -118,6 +120,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
         logged["joining"],
         (logged["wind.north"], logged["wind.east"]),
         logged["fence.action"],
+        logged["loitered"],
     )
     return inputs, state
 
@@ -285,8 +288,9 @@ class Guidance:
             return None
         y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
+        told = self.route.notes if self.route is not None and self._route_waits else ()
         self._begin, self._given, self._route_waits = Begin.NO, {}, False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
         log = row(inputs, self._state, commands, self._digest)
         notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))
-        return GuidanceOutput(u_m(self._state), log, tuple(notice.text for notice in notices))
+        return GuidanceOutput(u_m(self._state), log, (*told, *(notice.text for notice in notices)))

@@ -23,12 +23,15 @@ from flight_guidance import path, protection
 from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
 from flight_guidance.fence import HOME, RIGHT, Escape, Fence, Motion, last_safe_turn
 from flight_guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
-from flight_guidance.path import Arc, Leg, Point, Route
+from flight_guidance.path import Arc, Leg, Loiter, Point, Route
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 from flight_guidance.wind import Wind, wind_estimate, wind_of
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
+
+LEVEL = 5.0
+"""m. Largest distance from the altitude at which an aircraft leaves a loiter."""
 
 STEEPEST = math.radians(89.0)
 """Largest bank that a mode asks for, before protection."""
@@ -59,6 +62,7 @@ class Vertical(IntEnum):
     THETA = 0
     CLIMB = 1
     ALTITUDE = 2
+    PROFILE = 3  # the altitude along the leg of the route
 
 
 class Target(NamedTuple):
@@ -72,15 +76,16 @@ class Target(NamedTuple):
     radius: float = 0.0  # m, positive clockwise from above
     leg: float = 0.0  # number of the leg of the route
     theta: float = 0.0  # rad
-    climb: float = 0.0  # m/s
+    climb: Scalar = 0.0  # m/s
     altitude: Scalar = 0.0  # m
     V: Scalar = 0.0  # airspeed, m/s, absolute
     along: float = 0.0  # m along a line of the route from the start, where the aircraft joins the line
+    r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
 
 
 TARGETS = Target._fields
 LATERAL: Mapping[str, Lateral] = {
-    "phi": Lateral.PHI,
+    **dict.fromkeys(("phi", "r"), Lateral.PHI),
     "heading": Lateral.HEADING,
     "course": Lateral.COURSE,
     **dict.fromkeys(("north", "east", "radius"), Lateral.ORBIT),
@@ -170,6 +175,7 @@ class GuidanceState(NamedTuple):
     joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
     fence: float = 0.0  # action of the fence: 1 and -1 turn to the right and left, 2 flies home after the turn, 0 none
+    loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
 
 
 class Commands(NamedTuple):
@@ -195,8 +201,8 @@ def bits(names: Collection[str]) -> int:
     return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
 
 
-ANGLES = ("phi", "heading", "course", "theta")
-"""Channels of Target in rad."""
+ANGLES = ("phi", "heading", "course", "theta", "r")
+"""Channels of Target in rad, and r in rad/s."""
 
 
 def read_target(
@@ -214,12 +220,16 @@ def read_target(
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
     if Lateral.ORBIT in modes[0] and not {"north", "east", "radius"} <= set(values):
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
+    for name, beside in (("r", "phi"), ("along", "leg")):
+        if name in values and beside not in values:
+            raise ChannelError("name", f"{what}: found {name} without {beside}, expected {beside} too")
     for name, value in values.items():
         if abs(value) > LARGEST:
             raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
     limits, vertical = params.limits, params.vertical
     for name, least, largest in (
         ("phi", -limits.bank, limits.bank),
+        ("r", -(turn := GRAVITY * math.tan(limits.bank) / params.speed), turn),
         ("theta", limits.least_pitch, limits.largest_pitch),
         ("climb", -vertical.sink, vertical.climb),
         ("altitude", limits.lowest, limits.highest),
@@ -228,13 +238,17 @@ def read_target(
         if name in values and not least <= values[name] <= largest:
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
             unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
+            unit += "/s" * (name == "r")
             found, expected = f"{values[name] * factor:.6g}", f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
             raise ChannelError("bounds", f"{what}.{name}: found {found}, expected {expected}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
-    if "along" in values and "leg" not in values:
-        raise ChannelError("name", f"{what}: found along without leg, expected the leg of the route too")
+    _read_leg(values, route, what)
+
+
+def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
+    """Raise ChannelError for a leg that the route does not have."""
     if "leg" in values and route is None:
         raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
     if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
@@ -303,6 +317,7 @@ def begin(state: GuidanceState | None, inputs: Inputs, params: GuidanceParams) -
         leg=state.leg,
         joining=state.joining,
         fence=state.fence,
+        loitered=state.loitered,
     )  # the mode, since after a lost pose the wings are levelled
     # Up to the age limit of u_m the reference model still flies the last u_m.
     return again._replace(u_m=state.u_m) if inputs.t_ns - state.t_ns <= params.max_age_ns else again
@@ -335,7 +350,7 @@ def step(
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
     pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
-    state, missed = _with_commands(state, inputs.given, pose, route)
+    state, missed = _with_commands(state, inputs.given, pose, dt, route)
     state, escape = _within_fence(state, pose, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
     if abs(state.fence) == RIGHT and state.mode is Mode.ENGAGED:
@@ -385,7 +400,10 @@ def command(
 
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
     beta = pose["beta"] if flies else 0.0
-    rates = body_rates(phi_c, theta_c, state.phi, state.theta, y["r"], beta, speed, attitude)
+    flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
+    rates = body_rates(phi_c, theta_c, state.phi, state.theta, y["r"], 0.0 if flat else beta, speed, attitude)
+    if flat:  # the sideslip is wanted
+        rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is Mode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
     wanted = {"V": V_c - params.speed, **rates._asdict()}
@@ -458,7 +476,7 @@ def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
 
 
 def _with_commands(
-    state: GuidanceState, given: Mapping[str, float], pose: Mapping[str, float], route: Route | None
+    state: GuidanceState, given: Mapping[str, float], pose: Mapping[str, float], dt: float, route: Route | None
 ) -> tuple[GuidanceState, float]:
     """The modes and commands in force: of the next leg once a leg is passed, then the commands given.
 
@@ -467,9 +485,11 @@ def _with_commands(
     """
     missed, on_route = 0.0, state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & given.keys()
     if on_route and route is not None:
-        state, missed = _along_route(state, pose, route)
+        state, missed = _along_route(state, pose, dt, route)
     if not given:
-        return state, missed
+        return _on_profile(state, pose, route), missed
+    if LATERAL.keys() & given.keys():
+        state = state._replace(target=state.target._replace(r=0.0))
     state = state._replace(target=state.target._replace(**given))
     if state.fence == HOME and LATERAL.keys() & given.keys():
         state = state._replace(fence=0.0)
@@ -479,11 +499,13 @@ def _with_commands(
         state = _joining(state, int(given["leg"]), given.get("along", 0.0), pose, route)
         state = state._replace(target=state.target._replace(**given))
         named = [VERTICAL[name] for name in given if name in VERTICAL]
-        state = state._replace(vertical=named[0] if named else Vertical.ALTITUDE)
-    return state, missed
+        state = state._replace(vertical=named[0] if named else Vertical.PROFILE)
+    if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
+        state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
+    return _on_profile(state, pose, route), missed
 
 
-def _along_route(state: GuidanceState, pose: Mapping[str, float], route: Route) -> tuple[GuidanceState, float]:
+def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route) -> tuple[GuidanceState, float]:
     """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and the distance missed by, m."""
     position, leg, near = (pose["north"], pose["east"]), route.legs[state.leg], route.near(state.leg)
     if state.joining:
@@ -491,6 +513,10 @@ def _along_route(state: GuidanceState, pose: Mapping[str, float], route: Route) 
         if path.joined(at, course, near, position, _over_ground(pose)[0]):
             state = _on_leg(state, state.leg, route)
         return state, 0.0
+    if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
+        state = _loitering(state, leg, leg.loiter, pose, dt)
+        ends = _has_loitered(state, pose, route) and _leaves(leg, route.near(state.leg), pose, position)
+        return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
     distance = math.dist(leg.end, position)
@@ -499,24 +525,62 @@ def _along_route(state: GuidanceState, pose: Mapping[str, float], route: Route) 
     return _on_leg(state, state.leg + 1, route), 0.0
 
 
+def _loitering(state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float) -> GuidanceState:
+    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle on."""
+    error, (course, ground_speed) = path.error(leg, (pose["north"], pose["east"])), _over_ground(pose)
+    if not state.loitered and abs(error.e) > ground_speed:
+        return state
+    share = 1.0
+    if loiter.turns:
+        share = dt * ground_speed * math.cos(course - error.track) / (2.0 * math.pi * abs(leg.radius) * loiter.turns)
+    elif loiter.wait:
+        share = dt / loiter.wait
+    return state._replace(loitered=min(state.loitered + share, 1.0))
+
+
+def _has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) -> bool:
+    return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
+
+
+def _leaves(leg: Leg, near: float, pose: Mapping[str, float], position: Point) -> bool:
+    """Whether an aircraft at a position leaves the circle of a loiter for the next leg."""
+    return leg.end is not None and bool(path.joined(leg.end, path.end_course(leg), near, position, _over_ground(pose)[0]))
+
+
 def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
     """The state on a leg of the route, with the leg's altitude and airspeed."""
-    target = state.target._replace(altitude=route.altitude[leg], V=route.V[leg], along=0.0)
-    return state._replace(leg=leg, target=target, vertical=Vertical.ALTITUDE, joining=0.0)
+    target = state.target._replace(V=route.V[leg], along=0.0)
+    return state._replace(leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0)
+
+
+def _on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | None) -> GuidanceState:
+    """The state with the altitude and the climb rate of the leg at the nearest point, or where the aircraft joins the leg."""
+    flies = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and state.vertical is Vertical.PROFILE
+    if not flies or route is None:
+        return state
+    leg, climb = route.legs[state.leg], 0.0
+    if state.joining or (path.is_orbit(leg) and leg.end is not None and not state.loitered):
+        altitude = route.joining_altitude(state.leg, state.target.along)
+    else:
+        altitude, slope = route.profile(state.leg, path.nearest(leg, (pose["north"], pose["east"])))
+        if slope:
+            course = path.end_course(leg)
+            climb = slope * (pose["v_north"] * math.cos(course) + pose["v_east"] * math.sin(course))
+    return state._replace(target=state.target._replace(altitude=altitude, climb=climb))
 
 
 def _joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route) -> GuidanceState:
     """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg where the point is near."""
     state, flown = _on_leg(state, leg, route), route.legs[leg]
-    if flown.end is None:  # the law of circles leads to an orbit from afar
+    if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
         return state
     at, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
     side = path.joining(at, course, route.radius, route.near(leg), position, _over_ground(pose)[0])
     if isinstance(flown, Arc) and side:  # the circle of the arc itself
         side = math.copysign(1.0, flown.radius)
-    if side and not along and route.from_altitude:
-        state = state._replace(target=state.target._replace(altitude=route.from_altitude[leg], V=route.from_V[leg]))
+    if side and not along and route.from_V:
+        state = state._replace(target=state.target._replace(V=route.from_V[leg]))
     return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))
 
 
@@ -548,7 +612,10 @@ def _bank(
         following = route.legs[state.leg + 1] if leg.end is not None else None
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
-    wanted = follow(error, entry, partial(path.entered, leg, following), state.slip, pose, speed, params)
+    entered: Callable[[Point], Any] = partial(path.entered, leg, following)
+    if route is not None and following is not None and path.is_orbit(leg) and _has_loitered(state, pose, route):
+        entered = partial(_leaves, leg, route.near(state.leg), pose)
+    wanted = follow(error, entry, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(leg, position)
 
 
@@ -596,6 +663,8 @@ def _climb(
         return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
     vertical, target = params.vertical, state.target
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
+    if state.vertical is Vertical.PROFILE:
+        wanted = wanted + target.climb
     least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)
     xp = array_namespace(speed)
     lower, upper = _climb_within(pose["altitude"], params)

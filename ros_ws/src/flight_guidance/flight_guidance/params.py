@@ -4,8 +4,7 @@
 
 import math
 from collections.abc import Sequence
-from itertools import repeat, starmap
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -27,12 +26,12 @@ from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
 from flight_guidance import protection
 from flight_guidance.attitude import AttitudeParams
-from flight_guidance.feasibility import Performance, flyable_legs, require_inside, speeds
+from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
 from flight_guidance.fence import MARGIN, Fence, Zone, clearance
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, read_target
 from flight_guidance.notices import Notices
-from flight_guidance.path import Route, leads
+from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
 from flight_guidance.vertical import VerticalParams, path_lag
 
@@ -71,11 +70,26 @@ class RouteConfig(Config):
     V: tuple[Positive, ...] = Field(
         default=(), description="airspeed on the way to each waypoint, m/s; the trim speed where left out"
     )
+    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint before the aircraft flies on, 1")
+    wait: tuple[NonNegative, ...] = Field(default=(), description="time on a circle round each waypoint, s")
+    leave: tuple[Number, ...] = Field(
+        default=(),
+        description="altitude at which the aircraft leaves a circle round each waypoint, m; `altitude` where left out",
+    )
 
     def _check(self) -> None:
         waypoints = [f"waypoint {k}" for k in range(len(self.north))]
-        for key in ("east", "altitude", *(["V"] if self.V else [])):
+        for key in ("east", "altitude", *(key for key in ("V", "turns", "wait", "leave") if getattr(self, key))):
             require_length(key, getattr(self, key), waypoints)
+        both = [k for k, (turns, wait) in enumerate(zip(self.turns, self.wait, strict=False)) if turns and wait]
+        require(not both, "turns", f"turns and a wait at waypoint {both[0] if both else 0}", "one of both")
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """The waypoints of the equations."""
+        count = len(self.north)
+        columns = (self.V or (None,) * count, self.turns or (0.0,) * count, self.wait or (0.0,) * count)
+        rows = zip(self.north, self.east, self.altitude, *columns, self.leave or (None,) * count, strict=True)
+        return tuple(Waypoint(*row) for row in rows)
 
 
 class ZoneConfig(Config):
@@ -166,6 +180,9 @@ class GuidanceConfig(NodeConfig):
         default=math.radians(30.0), description="largest angle at which a path is approached, rad"
     )
     radius: Positive | None = Field(default=None, description="radius of fillets and of the last orbit, m; none: by rule")
+    profile: Literal["slope", "step"] = Field(
+        default="slope", description="altitude of a leg: changes along the leg, or from the begin of the leg on"
+    )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which y and pose are stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long the attitude is known by dead reckoning when pose is stale, s"
@@ -317,10 +334,7 @@ class GuidanceConfig(NodeConfig):
 
     def waypoints(self) -> tuple[Waypoint, ...]:
         """The waypoints of the section's route; none without a route."""
-        route = self.route
-        if route is None:
-            return ()
-        return tuple(starmap(Waypoint, zip(route.north, route.east, route.altitude, route.V or repeat(None), strict=False)))
+        return () if self.route is None else self.route.waypoints()
 
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
         """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
@@ -331,16 +345,25 @@ class GuidanceConfig(NodeConfig):
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         # an empty route is refused below
         radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)
-        legs = flyable_legs(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
-        numbers = leads(legs)
-        # Fillets have the altitude of the waypoint that they lead to; a leg leaves the waypoint before.
-        altitude, before = [waypoint.altitude for waypoint in waypoints], [max(k - 1, 0) for k in numbers]
+        legs, waypoints, notes = flyable(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
+        flown, numbers = speeds(waypoints, self.speed), leads(legs)
+        # A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the altitude at its waypoint.
+        before = [max(k - 1, 0) for k in numbers]
+        slopes = self.profile == "slope"
+        altitude, left = [], []
+        for leg, to, at in zip(legs, numbers, before, strict=True):
+            fillet = isinstance(leg, Arc) and not is_orbit(leg)
+            left.append(waypoints[to].altitude if is_orbit(leg) else waypoints[at].departure)
+            end = waypoints[to].departure if is_orbit(leg) else waypoints[to].altitude
+            altitude.append(left[-1] if fillet and slopes else end)
         route = Route(
             legs,
-            tuple(altitude[k] for k in numbers),
+            tuple(altitude),
             tuple(flown[k] for k in numbers),
-            tuple(altitude[k] for k in before),
+            tuple(left),
             tuple(flown[k] for k in before),
+            slopes,
+            notes,
         )
         if (fence := self.fence_zones()) is not None:
             require_inside(route, fence, max(map(self.fence_margin, flown)))

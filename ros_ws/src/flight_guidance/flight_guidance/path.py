@@ -3,9 +3,10 @@
 """Paths: lines and arcs in the local tangent plane, and routes of waypoints whose corners are fillets."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from flight_core.parameters import ParameterError, require
@@ -37,12 +38,20 @@ class Line(NamedTuple):
     end: Point
 
 
+class Loiter(NamedTuple):
+    """What an aircraft does on a circle before it flies on; at the end it is at the altitude of the leg."""
+
+    turns: float = 0.0  # 1
+    wait: float = 0.0  # s
+
+
 class Arc(NamedTuple):
-    """A leg on a circle, less than a full turn; without an end an orbit."""
+    """A leg on a circle, less than a full turn; without an end an orbit, with a loiter an orbit until the loiter is flown."""
 
     centre: Point
     radius: float  # m, positive to the right (clockwise from above), negative to the left
     end: Point | None = None
+    loiter: Loiter | None = None
 
 
 Leg = Line | Arc
@@ -56,6 +65,8 @@ class Route(NamedTuple):
     V: tuple[float, ...]  # m/s
     from_altitude: tuple[float, ...] = ()  # m, of the waypoint that the leg leaves
     from_V: tuple[float, ...] = ()  # m/s, likewise
+    slopes: bool = False  # whether the altitude changes along a line; else at the begin of a leg
+    notes: tuple[str, ...] = ()  # sentences on what is flown otherwise than the waypoints say
 
     @property
     def radius(self) -> float:
@@ -72,10 +83,29 @@ class Route(NamedTuple):
         if isinstance(flown, Line):
             course = course_of(flown.start, flown.end)
             return _along(flown.start, course, along), course
-        if flown.end is None:
+        if is_orbit(flown):
             return flown.centre, 0.0
         before = self.legs[leg - 1]  # an arc follows a line
         return before.end or flown.centre, end_course(before)
+
+    def profile(self, leg: int, along: float) -> tuple[float, float]:
+        """The altitude at a distance along a leg, m, and its slope, 1: a straight line from waypoint to waypoint, or a step."""
+        altitude, distance = self.altitude[leg], length(self.legs[leg])
+        if not self.slopes or not distance:
+            return altitude, 0.0
+        slope = (altitude - self.from_altitude[leg]) / distance
+        return altitude - slope * (distance - along), slope
+
+    def joining_altitude(self, leg: int, along: float) -> float:
+        """The altitude at which the aircraft joins a leg at a distance along the leg, m."""
+        if along or not self.from_altitude:
+            return self.profile(leg, along)[0]
+        return self.from_altitude[leg]
+
+
+def is_orbit(leg: Leg) -> bool:
+    """Whether a leg is a full circle, with a loiter or for good."""
+    return isinstance(leg, Arc) and (leg.end is None or leg.loiter is not None)
 
 
 def length(leg: Leg) -> float:
@@ -130,7 +160,7 @@ def end_course(leg: Leg) -> float:
 
 def passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across the course there. Never for an orbit."""
-    return leg.end is not None and bool(beyond(leg.end, end_course(leg), position))
+    return leg.end is not None and not is_orbit(leg) and bool(beyond(leg.end, end_course(leg), position))
 
 
 def beyond(end: Point, course: Scalar, position: Point) -> Any:
@@ -146,7 +176,7 @@ def entered(leg: Leg, following: Leg | None, position: Point) -> bool:
 
 def to_go(leg: Leg, position: Point) -> float:
     """Distance along a leg from the point nearest to a position to the end, m; 0 for an orbit."""
-    if leg.end is None:
+    if leg.end is None or is_orbit(leg):
         return 0.0
     if isinstance(leg, Line):
         course = end_course(leg)
@@ -200,56 +230,108 @@ def joined(at: Point, course: Scalar, near: Scalar, position: Point, flown: Scal
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
-    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is a full turn."""
+    """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is at least a full turn."""
     if isinstance(leg, Line):
         return [leg.start, leg.end]
     side, first = math.copysign(1.0, leg.radius), course_of(leg.centre, start)
-    turn = 2.0 * math.pi if leg.end is None else side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
+    turn = 2.0 * math.pi if is_orbit(leg) else 0.0
+    if leg.end is not None:
+        turn += side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
     count = math.ceil(turn / math.radians(10.0)) + 1
     return [_along(leg.centre, first + side * turn * k / (count - 1), abs(leg.radius)) for k in range(count)]
 
 
 def route_outline(route: Route) -> list[tuple[float, float, float]]:
-    """Points along a route, for drawing: north, east and altitude, m. The altitude is constant along a leg."""
+    """Points along a route, for drawing: north, east and altitude, m."""
     points: list[tuple[float, float, float]] = []
-    for leg, altitude in zip(route.legs, route.altitude, strict=True):
+    for number, leg in enumerate(route.legs):
         start = leg.start if isinstance(leg, Line) else points[-1][:2] if points else _along(leg.centre, 0.0, abs(leg.radius))
-        points += [(*point, altitude) for point in outline(leg, start)]
+        points += [(*point, route.profile(number, nearest(leg, point))[0]) for point in outline(leg, start)]
     return points
 
 
+def distance_from(legs: Sequence[Leg], point: Point) -> float:
+    """Distance of a point from the lines and fillets of a route, m."""
+    distances = []
+    for leg in legs:
+        if isinstance(leg, Line):
+            distances.append(math.dist(point, along(leg.start, leg.end, nearest(leg, point) / length(leg))))
+        elif not is_orbit(leg) and leg.end is not None:
+            distances += [abs(math.dist(point, leg.centre) - abs(leg.radius)), math.dist(point, leg.end)]
+    return min(distances)
+
+
 def leads(legs: Sequence[Leg]) -> list[int]:
-    """Numbers of the waypoints at the ends of the legs of a route; an arc at a waypoint leads to the next waypoint."""
+    """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to the next waypoint."""
     numbers, at = [], 0
     for leg in legs:
         at += isinstance(leg, Line)
-        numbers.append(at + 1 if isinstance(leg, Arc) and leg.end is not None else at)
+        numbers.append(at + 1 if isinstance(leg, Arc) and not is_orbit(leg) else at)
     return numbers
 
 
-def route(waypoints: Sequence[Point], radius: float, least: float) -> tuple[Leg, ...]:
+class ShortLegError(ParameterError):
+    """A leg is too short for its fillets."""
+
+    def __init__(self, sentence: str, number: int) -> None:
+        super().__init__(sentence)
+        self.number = number  # of the waypoint at the end of the leg
+
+
+def route(
+    waypoints: Sequence[Point], radius: float, least: float, loiters: Mapping[int, Loiter] = MappingProxyType({})
+) -> tuple[Leg, ...]:
     """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint, clockwise.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. The last line touches the orbit; a line too
-    short for a tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius below `least`
-    (`lateral.least_radius`), a corner beyond SHARPEST, and a leg too short for the fillets.
-    Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. At a waypoint of `loiters`, by the number, a
+    clockwise circle round the waypoint takes the place of the fillet. Lines touch circles and the orbit; a line too short for a
+    tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius below `least`
+    (`lateral.least_radius`), a corner beyond SHARPEST, and a waypoint within the circle of a loiter; ShortLegError for a leg
+    too short for the fillets. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
-    before, last = waypoints[-2:]
-    orbit, distance = Arc(last, radius), math.dist(before, last)
+    legs: list[Leg] = []
+    first, last = 0, len(waypoints) - 1
+    for k in [*sorted(number for number in loiters if number < last), last]:
+        if k > 0:
+            lines = _between_circles(waypoints[first : k + 1], radius, first, leaves=bool(legs))
+            if legs and isinstance(circle := legs[-1], Arc):
+                legs[-1] = circle._replace(end=lines[0].start if isinstance(lines[0], Line) else None)
+            legs += lines
+        legs.append(Arc(waypoints[k], radius, None, None if k == last else loiters[k]))
+        first = k
+    return tuple(legs)
+
+
+def _between_circles(waypoints: Sequence[Point], radius: float, first: int, *, leaves: bool) -> list[Leg]:
+    """Lines and fillets onto a clockwise circle round the last waypoint, from a circle round the first where `leaves`.
+
+    `first`: number of the first waypoint. The centre of a clockwise circle is on the right of the tangent.
+    """
+    points = list(waypoints)
+    if leaves:
+        (centre, after), distance = points[:2], math.dist(*points[:2])
+        found = f"{distance:g} m from the loiter before"
+        require(distance > radius, f"route[{first + 1}]", found, f"more than {radius:g} m, the radius of the circle")
+        bearing = course_of(centre, after)
+        if len(points) == 2:  # to a circle of the same radius
+            start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
+            return [Line(start, end)]
+        points[0] = _along(after, bearing + math.asin(radius / distance), -math.sqrt(distance**2 - radius**2))
+    before, last = points[-2:]
+    distance = math.dist(before, last)
     if distance > radius:
-        course = course_of(before, last) - math.asin(radius / distance)  # the centre is on the right
+        course = course_of(before, last) - math.asin(radius / distance)
         with suppress(ParameterError):
-            return (*_filleted([*waypoints[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))], radius), orbit)
-    return (*_filleted(waypoints, radius), orbit)
+            return _filleted([*points[:-1], _along(before, course, math.sqrt(distance**2 - radius**2))], radius, first)
+    return _filleted(points, radius, first)
 
 
-def _filleted(waypoints: Sequence[Point], radius: float) -> list[Leg]:
-    """Lines through waypoints, and the fillets in the corners. Raises ParameterError as `route`."""
+def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg]:
+    """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number of the first waypoint."""
     turns = [0.0]
-    for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), 1):
+    for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), first + 1):
         turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
         actual, expected = f"a turn of {math.degrees(turn):.0f} deg", f"at most {math.degrees(SHARPEST):.0f} deg either way"
         require(abs(turn) <= SHARPEST, f"route[{k}]", actual, expected)
@@ -260,8 +342,10 @@ def _filleted(waypoints: Sequence[Point], radius: float) -> list[Leg]:
     start = waypoints[0]
     for k, (here, there) in enumerate(pairwise(waypoints)):
         length, needed = math.dist(here, there), cut[k] + cut[k + 1]
-        found = f"{length:g} m from the waypoint before"
-        require(length > needed, f"route[{k + 1}]", found, f"more than {math.ceil(needed)} m, for fillets of {radius:g} m")
+        if length <= needed:
+            expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
+            number = first + k + 1
+            raise ShortLegError(f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number)
         course, turn = course_of(here, there), turns[k + 1]
         end = _along(there, course, -cut[k + 1])
         legs.append(Line(start, end))

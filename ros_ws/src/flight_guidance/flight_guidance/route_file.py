@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Route files as waypoints in the local tangent plane; `route_formats` reads the formats with latitudes and longitudes.
 
-A YAML file holds the list `route` of [north, east, altitude], [north, east, altitude, V] or
-{latitude: ..., longitude: ..., altitude: ..., V: ...}.
+A YAML file holds the list `route` of [north, east, altitude], [north, east, altitude, V] or a mapping: north and east, or
+latitude and longitude, altitude, and perhaps V, turns, wait and leave of `Waypoint`.
 """
 
 import math
@@ -34,11 +34,24 @@ class Waypoint(NamedTuple):
     east: float  # m from the origin
     altitude: float  # m, as `pose` counts it
     speed: float | None = None  # airspeed on the leg to the waypoint, m/s; None: as on the leg before
+    turns: float = 0.0  # turns round the waypoint before the aircraft flies on, 1
+    wait: float = 0.0  # time on the circle round the waypoint, s
+    leave: float | None = None  # altitude at which the aircraft leaves a circle round the waypoint, m; None: `altitude`
 
     @property
     def point(self) -> Point:
         """The waypoint in the local tangent plane."""
         return self.north, self.east
+
+    @property
+    def loiters(self) -> bool:
+        """Whether the aircraft flies a circle round the waypoint before it flies on."""
+        return self.turns > 0.0 or self.wait > 0.0 or self.departure != self.altitude
+
+    @property
+    def departure(self) -> float:
+        """The altitude at which the aircraft flies on, m."""
+        return self.altitude if self.leave is None else self.leave
 
 
 class RouteFile(NamedTuple):
@@ -55,7 +68,8 @@ class Origin(NamedTuple):
     longitude: float  # deg
 
 
-GEODETIC = ("latitude", "longitude", "altitude", "V")  # keys of a waypoint of a YAML file
+POSITIONS = (("north", "east"), ("latitude", "longitude"))  # keys of a waypoint of a YAML file
+FURTHER = ("V", "turns", "wait", "leave")
 
 
 def local(latitude: float, longitude: float, origin: Origin) -> Point:
@@ -124,13 +138,68 @@ def read_route_file(
             origin = Origin(home.latitude, home.longitude)
         _require_order(route.places, origin)
         heights = _Heights(altitude, home, above_sea=above_sea)
-        waypoints = [_placed(place, origin, heights) for place in route.places]
-        waypoints = [waypoint for k, waypoint in enumerate(waypoints) if k == 0 or waypoint[:3] != waypoints[k - 1][:3]]
+        waypoints = []
+        for place in route.places:
+            waypoint = _placed(place, origin, heights)
+            if place.climbs and waypoints:
+                waypoint = waypoint._replace(altitude=waypoints[-1].departure, leave=waypoint.altitude)
+            waypoints.append(waypoint)
+    waypoints = _merged(waypoints)
     if simplify > 0.0:
         kept = thinned(waypoints, simplify)
         notes.append(f"{len(kept)} of {len(waypoints)} positions: the others are within {simplify:g} m of the line")
         waypoints = kept
     return RouteFile(tuple(waypoints), tuple(notes))
+
+
+def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
+    """The waypoints, successive ones at a place as a single waypoint that the aircraft leaves at the last altitude."""
+    merged: list[Waypoint] = []
+    for waypoint in waypoints:
+        if merged and waypoint.point == (last := merged[-1]).point:
+            turns, wait = max(last.turns, waypoint.turns), max(last.wait, waypoint.wait)
+            leave = None if waypoint.departure == last.altitude else waypoint.departure
+            merged[-1] = last._replace(turns=turns, wait=wait, leave=leave)
+        else:
+            merged.append(waypoint)
+    return merged
+
+
+def read_fence_file(
+    path: Path, origin: Origin | None = None, altitude: float | None = None, *, above_sea: bool = False
+) -> dict[str, Any]:
+    """The sections `fence` and `home` of guidance from a file, the arguments as of `read_route_file`.
+
+    Home is the rally point nearest to the origin, without rally points the home in the file, else not in the result. Raises
+    ParameterError for an unreadable file, a file without a zone, and a number missing or out of range.
+    """
+    suffix = path.suffix.lower()
+    require(
+        suffix in route_formats.FENCES, "--fence", f"the file {path}", f"one that ends in {', '.join(route_formats.FENCES)}"
+    )
+    read = route_formats.read_fence(read_file(path, str(path), "a fence file"), str(path), suffix)
+    if origin is None and read.home is not None:
+        origin = Origin(read.home.latitude, read.home.longitude)
+    zones: dict[str, Any] = {}
+    for k, area in enumerate(read.zones):
+        key = f"zone_{k}"
+        points = [
+            _placed(place._replace(key=f"fence.{key}", altitude=0.0, above=Above.AS_POSE), origin, _Heights()).point
+            for place in area.places
+        ]
+        zones[key] = {"north": [point[0] for point in points], "east": [point[1] for point in points], "exclude": area.exclude}
+        if area.radius is not None:
+            zones[key]["radius"] = _number(f"fence.{key}", area.radius, "radius")
+    heights = _Heights(altitude, read.home, above_sea=above_sea)
+    rally = [_placed(place._replace(key="rally point"), origin, heights) for place in read.rally]
+    sections: dict[str, Any] = {"fence": zones}
+    if rally:
+        home = min(rally, key=lambda point: math.hypot(*point.point))
+        sections["home"] = {"north": home.north, "east": home.east, "altitude": home.altitude}
+    elif read.home is not None and origin is not None:
+        north, east = local(read.home.latitude, read.home.longitude, origin)
+        sections["home"] = {"north": north, "east": east}
+    return sections
 
 
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
@@ -208,10 +277,17 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
     for k, point in enumerate(points or ()):
         name = f"route[{k}]"
         if isinstance(point, Mapping):
-            unknown = sorted(map(str, set(point) - set(GEODETIC)))
-            require(not unknown, name, f"the keys {short_repr(unknown)}", "latitude, longitude, altitude and perhaps V")
-            latitude, longitude, altitude, speed = (point.get(each) for each in GEODETIC)
-            yield _placed(Place(name, latitude, longitude, altitude, speed), origin, _Heights())
+            position = next((pair for pair in POSITIONS if pair[0] in point), POSITIONS[0])
+            unknown = sorted(map(str, set(point) - {*position, "altitude", *FURTHER}))
+            expected = "north and east or latitude and longitude, altitude, and perhaps V, turns, wait, leave"
+            require(not unknown, name, f"the keys {short_repr(unknown)}", expected)
+            first, second, altitude, speed, turns, wait, leave = (point.get(key) for key in (*position, "altitude", *FURTHER))
+            if position == POSITIONS[0]:
+                placed = _waypoint(name, _number(name, first, "north"), _number(name, second, "east"), altitude, speed)
+            else:
+                placed = _placed(Place(name, first, second, altitude, speed), origin, _Heights())
+            placed = placed._replace(turns=_loiter(name, turns or 0.0, "turns"), wait=_loiter(name, wait or 0.0, "wait"))
+            yield placed if leave is None else placed._replace(leave=_number(name, leave, "leave"))
         else:
             fits = isinstance(point, list) and 3 <= len(point) <= 4
             require(fits, name, short_repr(point), "[north, east, altitude], [north, east, altitude, V] or a mapping")
@@ -227,7 +303,14 @@ def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
         raise ParameterError(f"{key}: found a latitude and a longitude, expected an origin, where north and east are 0")
     degrees = (_number(key, place.latitude, "latitude", 90.0), _number(key, place.longitude, "longitude", 180.0))
     require(_is_above(*degrees, origin), key, "a position on the other half of the Earth", "one near the origin")
-    return _waypoint(key, *local(*degrees, origin), altitude, place.speed)
+    waypoint = _waypoint(key, *local(*degrees, origin), altitude, place.speed)
+    return waypoint._replace(turns=_loiter(key, place.turns or 0.0, "turns"), wait=_loiter(key, place.wait or 0.0, "wait"))
+
+
+def _loiter(key: str, value: Any, name: str) -> float:
+    number = _number(key, value, name)
+    require(number >= 0.0, f"{key}.{name}", f"{number:g}", "at least 0")
+    return number
 
 
 def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = None) -> Waypoint:

@@ -45,6 +45,9 @@ class Place(NamedTuple):
     speed: Any = None  # m/s
     above: Above = Above.AS_POSE
     found: str = ""  # what the file has in place of an altitude, for a sentence
+    turns: Any = 0.0  # round the place, 1
+    wait: Any = 0.0  # round the place, s
+    climbs: bool = False  # whether the altitude is reached round the place, and not on the way to the place
 
 
 class Home(NamedTuple):
@@ -317,8 +320,9 @@ def _gpx_places(parent: Element, kind: str) -> list[Place]:
 FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
 TERRAIN = (10, 11)
 WAYPOINT, SPLINE, CHANGE_SPEED, AIRSPEED = 16, 82, 178, 0  # MAV_CMD, and SPEED_TYPE
-LOITERS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
-COMMANDS = {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
+UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
+COMMANDS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
+COMMANDS |= {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
 COMMANDS |= {177: "DO_JUMP", 189: "DO_LAND_START", 206: "DO_SET_CAM_TRIGG_DIST", 201: "DO_SET_ROI", 183: "DO_SET_SERVO"}
 
 
@@ -332,27 +336,27 @@ class _Item(NamedTuple):
 
 
 def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequence[str] = ()) -> Places:
-    """The waypoints of a mission, each loiter as a waypoint; the items that are not flown in notes."""
+    """The waypoints and loiters of a mission up to a loiter without end; the items that are not flown in notes."""
     places: list[Place] = []
     skipped: list[str] = []
-    held: list[str] = []
     speed: Any = None
+    ended = False
     for item in items:
         latitude, longitude, altitude = item.params[4:7]
-        name = LOITERS.get(item.command) or COMMANDS.get(item.command, f"MAV_CMD {item.command}")
-        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (latitude or longitude):
+        name = COMMANDS.get(item.command, f"MAV_CMD {item.command}")
+        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (latitude or longitude) and not ended:
             expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
             found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
             require(item.frame in FRAMES, f"{key}: item {item.number}", found, expected)
-            places.append(Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame]))
-            if item.command in LOITERS:
-                held.append(f"{name} (item {item.number})")
+            loiter = {TURNS: {"turns": item.params[0]}, TIME: {"wait": item.params[0]}, TO_ALTITUDE: {"climbs": True}}
+            place = Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
+            places.append(place._replace(**loiter.get(item.command, {})))
+            ended = item.command == UNLIMITED
         elif item.command == CHANGE_SPEED and item.params[0] == AIRSPEED and (item.params[1] or 0) > 0:
             speed = item.params[1]
         else:
             skipped.append(f"{name} (item {item.number})")
     told = [f"not flown: {', '.join(skipped)}"] * bool(skipped)
-    told += [f"flown as waypoints, without the wait: {', '.join(held)}"] * bool(held)
     return Places(places, (*notes, *told), home)
 
 
@@ -375,10 +379,107 @@ def _read_plan_tree(tree: Any, key: str) -> Places:
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
         require(fits, f"{key}: item {k + 1}", short_repr(entry), "frame, command and seven params")
         items.append(_Item(k + 1, frame, command, params))
-    fence, rally = _member(tree, "geoFence"), _member(_member(tree, "rallyPoints"), "points")
-    fenced = any(_member(fence, name) for name in ("polygons", "circles"))
-    notes = ["the fence of the plan is no part of the route"] * fenced + ["rally points are no part of the route"] * bool(rally)
+    fence = _plan_fence(tree, key)
+    notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
     return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
+
+
+class Area(NamedTuple):
+    """A zone of a fence in a file: the corners of a polygon, or the centre of a circle."""
+
+    places: list[Place]
+    radius: Any  # m; None of a polygon
+    exclude: bool
+
+
+class FencePlaces(NamedTuple):
+    """The fence of a file."""
+
+    zones: list[Area]
+    rally: list[Place] = []  # noqa: RUF012 - never changed
+    home: Home | None = None
+
+
+def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
+    """The zones and the rally points of a plan of QGroundControl, a QGC WPL 110 or a GeoJSON. Raises ParameterError."""
+    if suffix in WPL_ENDINGS:
+        fence = _wpl_fence(content, key)
+    else:
+        tree = _parsed_json(content, key)
+        fence = _plan_fence(tree, key) if _member(tree, "fileType") == "Plan" else _json_fence(tree, key)
+    require(bool(fence.zones), key, "no zone", "a polygon or a circle of a fence")
+    return fence
+
+
+def _plan_fence(tree: Any, key: str) -> FencePlaces:
+    fence = _member(tree, "geoFence")
+    zones = []
+    for zone in _member(fence, "polygons") or ():
+        corners = [_lat_lon(corner) for corner in _listed(_member(zone, "polygon"), key)]
+        zones.append(Area(corners, None, not _member(zone, "inclusion")))
+    for zone in _member(fence, "circles") or ():
+        circle = _member(zone, "circle")
+        zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not _member(zone, "inclusion")))
+    rally = [_lat_lon(point, Above.HOME) for point in _member(_member(tree, "rallyPoints"), "points") or ()]
+    return FencePlaces(zones, rally, _home(_member(_member(tree, "mission"), "plannedHomePosition")))
+
+
+def _json_fence(tree: Any, key: str) -> FencePlaces:
+    """Polygons, whose holes are excluded, and Points with the property `radius`; the property `exclude` excludes a zone."""
+    _require_wgs84(tree, key)
+    zones: list[Area] = []
+    for feature in _member(tree, "features") or [tree]:
+        node, properties = _member(feature, "geometry") or feature, _member(feature, "properties")
+        kind, coordinates = _member(node, "type"), _listed(_member(node, "coordinates"), key)
+        require(kind in {"Polygon", "MultiPolygon", "Point"}, key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
+        exclude, radius = bool(_member(properties, "exclude")), _member(properties, "radius")
+        if kind == "Point":
+            require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
+            zones.append(Area([_lon_lat(coordinates)], radius, exclude))
+            continue
+        for rings in [coordinates] if kind == "Polygon" else coordinates:
+            for k, ring in enumerate(_listed(rings, key)):
+                corners = [_lon_lat(position) for position in _listed(ring, key)]
+                zones.append(Area(corners[:-1] if corners[0] == corners[-1] else corners, None, exclude or k > 0))
+    return FencePlaces(zones)
+
+
+def _wpl_fence(content: bytes, key: str) -> FencePlaces:
+    """The polygons, circles and rally points of MAVLink: MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT."""
+    items, home = _wpl_items(content, key)
+    zones: list[Area] = []
+    rally: list[Place] = []
+    missing = 0.0
+    for item in items:
+        latitude, longitude, altitude = item.params[4:7]
+        place, exclude = Place("fence", latitude, longitude, altitude), item.command in {FENCE_OUT, CIRCLE_OUT}
+        if item.command in {FENCE_IN, FENCE_OUT}:
+            if missing <= 0.0:
+                zones.append(Area([], None, exclude))
+                missing = item.params[0]  # the number of corners
+            zones[-1].places.append(place)
+            missing -= 1.0
+        elif item.command in {CIRCLE_IN, CIRCLE_OUT}:
+            zones.append(Area([place], item.params[0], exclude))
+        elif item.command == RALLY:
+            rally.append(place._replace(above=FRAMES.get(item.frame, Above.GROUND)))
+    return FencePlaces(zones, rally, home)
+
+
+FENCE_IN, FENCE_OUT, CIRCLE_IN, CIRCLE_OUT, RALLY = 5001, 5002, 5003, 5004, 5100  # MAV_CMD
+
+
+def _listed(value: Any, key: str) -> list[Any]:
+    require(isinstance(value, list) and bool(value), key, short_repr(value), "a list of positions")
+    return list(value)
+
+
+def _lat_lon(position: Any, above: Above = Above.AS_POSE) -> Place:
+    """A position of a plan: latitude, longitude and perhaps altitude."""
+    fits = isinstance(position, list) and 2 <= len(position) <= 3
+    require(fits, "fence", short_repr(position), "latitude and longitude")
+    latitude, longitude, *altitude = position
+    return Place("fence", latitude, longitude, altitude[0] if altitude else None, above=above)
 
 
 def _home(position: Any) -> Home | None:
@@ -394,6 +495,10 @@ WPL_COLUMNS = 12
 
 
 def _read_wpl(content: bytes, key: str) -> Places:
+    return _mission(key, *_wpl_items(content, key))
+
+
+def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
     lines = content.decode("utf-8-sig", errors="replace").splitlines()
     head = lines[0].strip() if lines else ""
     require(head.startswith(WPL), key, short_repr(head), "QGC WPL 110 in the first line")
@@ -410,7 +515,12 @@ def _read_wpl(content: bytes, key: str) -> Places:
             home = Home(*params[4:7]) if params[4] or params[5] else None
             continue
         items.append(_Item(int(index), int(frame), int(command), params))
-    return _mission(key, items, home)
+    return items, home
+
+
+WPL_ENDINGS = (".waypoints", ".mission", ".txt")
+FENCES = (".plan", ".geojson", ".json", *WPL_ENDINGS)
+"""Endings of files with a fence."""
 
 
 FORMATS: Mapping[str, Callable[[bytes, str], Places]] = MappingProxyType(
@@ -421,9 +531,7 @@ FORMATS: Mapping[str, Callable[[bytes, str], Places]] = MappingProxyType(
         ".kmz": _read_kmz,
         ".gpx": _read_gpx,
         ".plan": _read_plan,
-        ".waypoints": _read_wpl,
-        ".mission": _read_wpl,
-        ".txt": _read_wpl,
+        **dict.fromkeys(WPL_ENDINGS, _read_wpl),
     }
 )
 """Readers by the ending of a file."""

@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flight_analysis.closed_loop.guidance_replay import known_routes
 from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times, settling_time
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
 from flight_guidance.modes import TARGETS, Lateral, Vertical, bits
+from flight_guidance.notices import Notice, has_channels
 from flight_guidance.params import GuidanceConfig
 
 UNITS: Mapping[str, str] = {
@@ -71,7 +73,10 @@ def segments(tape: Tape) -> list[Segment]:
     log = tape["guidance"]
     targets = [name for name in (f"target.{name}" for name in TARGETS) if name in log.names]
     named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
-    changes = np.any(np.diff(np.column_stack([log[name] for name in named]), axis=0) != 0.0, axis=1)
+    columns = np.column_stack([log[name] for name in named])
+    follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
+    columns[np.ix_(log["mode.vertical"] == Vertical.PROFILE, follows)] = 0.0  # they change along the leg
+    changes = np.any(np.diff(columns, axis=0) != 0.0, axis=1)
     starts = [0]
     for k in np.flatnonzero(changes) + 1:
         if t[k] - t[starts[-1]] >= SETTLING_DWELL:
@@ -81,7 +86,7 @@ def segments(tape: Tape) -> list[Segment]:
         last = after - 1  # its modes and commands are those that the segment ends with
         lateral, vertical = Lateral(int(log["mode.lateral"][last])), Vertical(int(log["mode.vertical"][last]))
         on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
-        quantities = (on_path, vertical.name.lower(), "V")
+        quantities = (on_path, "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(), "V")
         held = [_held(name, t[first:after], errors[name][first:after], times[first:after]) for name in quantities]
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
         found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
@@ -151,8 +156,14 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     """The notices of a guided flight with their times."""
     if section is None or "guidance" not in tape:
         return []
-    log = tape["guidance"]
-    notices = section.notices().of_log(tape.time("guidance"), {name: log[name] for name in log.names})
+    log, t = tape["guidance"], tape.time("guidance")
+    if not has_channels(log.names):
+        return []
+    flown = known_routes(tape, section)
+    notes = []
+    for number, k in zip(*np.unique(log["route"], return_index=True), strict=True):
+        notes += [Notice(float(t[k]), text) for text in (flown[int(number)].notes if int(number) in flown else ())]
+    notices = notes + section.notices().of_log(t, {name: log[name] for name in log.names})
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 

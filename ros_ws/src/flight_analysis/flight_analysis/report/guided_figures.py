@@ -127,7 +127,7 @@ def _add_wind(figure: Figure, tape: Tape, speed: float) -> None:
 def vertical_figure(context: PlotContext, speed: float, bounds: Bounds) -> Figure:
     """Altitude and airspeed over their commands, with the limits of the commands. `speed`: trim speed V0, m/s."""
     log = context.tape["guidance"]
-    commanded = np.where(log["mode.vertical"] == Vertical.ALTITUDE, log["target.altitude"], np.nan)
+    commanded = np.where(np.isin(log["mode.vertical"], [Vertical.ALTITUDE, Vertical.PROFILE]), log["target.altitude"], np.nan)
     commands = {"altitude": commanded, "V": log["V_c"]}
     return _over_commands(context, commands, {"altitude": log["pose.altitude"], "V": speed + log["y.V"]}, bounds)
 
