@@ -14,19 +14,23 @@ import typer
 from tests.damaged import DAMAGES, damage
 from tests.recordings import EPOCH
 
+from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import Account, account_of_json
 from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
 from flight_analysis.report.summary import taken_over
 from flight_bringup.fly import fly_and_report
+from flight_bringup.processes import leave_outcome
 from flight_bringup.scenarios import find_scenario
 from flight_cli.replay import replay
 from flight_cli.report import report
 from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
 from flight_log.rosbag2_metadata import METADATA, bag_files
+from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
@@ -126,6 +130,15 @@ def test_outcome_survives_lost_summary(whole: Path, tmp_path: Path) -> None:
         if not kept:
             (run / SUMMARY).unlink()
         assert write_report(run).flight.summary["outcome"] == expected
+
+
+def test_outcome_that_launch_left_is_kept(tmp_path: Path) -> None:
+    """A recorder that was killed, or `ros2 bag record`, took it into no log."""
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
+    run = write_run(simulate(scenario), tmp_path / "run", LogAttachments(scenario.path)).parent
+    assert read_flight(run).summary["outcome"].startswith("unknown")
+    leave_outcome(run, "controller-1 ended before the flight did")
+    assert read_flight(run).summary["outcome"] == "controller-1 ended before the flight did"
 
 
 def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:

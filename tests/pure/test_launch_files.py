@@ -192,14 +192,20 @@ def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None
         NODES[executable].validate_mapping(section | given_to_node, executable)
 
 
-def test_end_of_any_node_ends_launch_with_error(case: Case) -> None:
-    actions, context, *_ = case
+def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> None:
+    actions, context, first, _ = case
+    left = [file.read_text(encoding="utf-8") for file in tmp_path.glob("runs/*/outcome")]
+    assert left == (["interrupted"] if "recorder" in first else [])  # the outcome of Ctrl-C
     for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
         assert node.on_exit is not None
         for status in (0, 3, -9):
             context.is_shutdown = False
             with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
                 node.on_exit(ProcessExited(f"{executable}-1", status), context)
+            if "recorder" in first:
+                assert (
+                    next(tmp_path.glob("runs/*/outcome")).read_text(encoding="utf-8").startswith(f"{executable}-1 ended before")
+                )
             context.is_shutdown = True
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 

@@ -5,11 +5,13 @@
 import json
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from diagnostic_msgs.msg import KeyValue
+from sensor_msgs.msg import JointState
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes
@@ -17,9 +19,12 @@ from flight_bringup.graph import ONE_PROCESS, NodeSpec, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 from flight_bringup.processes import FlightProcesses
 from flight_core.parameters import ParameterError
-from flight_ros.topics import NODE_STATE, STATES
+from flight_ros.messages import instant
+from flight_ros.topics import NODE_STATE, PUBLISH, START, STATE, STATES
 
 pytestmark = pytest.mark.package("flight_bringup")
+
+PEER_TOPICS = ("/y",)
 
 
 def received_states(peer_node: Peer, topic: str = NODE_STATE.name) -> dict[str, str]:
@@ -104,6 +109,41 @@ def test_process_that_ends_named_with_fatal_line_not_last_one(only_stage: Path, 
     only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"):
         start_stage(osprey_gust, tmp_path / "run")
+
+
+def test_flight_without_matched_nodes_never_begins(
+    osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "READY_TIMEOUT", 0.05)
+    given: list[float] = []
+    state = {"controller": {"ready"}, "aircraft": {"ready", "matched"}, "recorder": set[str]()}
+    monitor = SimpleNamespace(
+        is_ready=lambda name, _: "ready" in state[name], is_matched=lambda name, _: "matched" in state[name], start=given.append
+    )
+    flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)  # type: ignore[arg-type]
+    popen = SimpleNamespace(pid=1, poll=lambda: None)
+    flight.processes = [SimpleNamespace(node=NodeSpec("fake", name), popen=popen) for name in state]  # type: ignore[misc]
+    late = "controller has an input without a publisher; recorder not ready after 0.05 s"
+    assert flight.begin() == f"never flew: {late}"
+    assert given == []
+    state |= {name: {"ready", "matched"} for name in state}
+    assert flight.begin() == ""
+    assert given == [flight.start_time] == [pytest.approx(time.time() + 0.5, abs=0.4)]
+
+
+def test_aircraft_waits_for_start(start_node: Start, peer_node: Peer) -> None:
+    """It is matched with the publisher of u, and its first y has the stamp of t = 0."""
+    aircraft = start_node("aircraft_sim", "-p", "start_time:=-1.0").wait_for("ready")
+    states = received_states(peer_node)
+    send = peer_node.node.create_publisher(START.type, START.name, STATE)
+    peer_node.until(lambda: set(states.values()) == {"ready"})
+    peer_node.node.create_publisher(JointState, "u", PUBLISH)
+    peer_node.until(lambda: states[f"/aircraft#{aircraft.popen.pid}"] == "matched")
+    assert peer_node.received["/y"] == []
+    start_ns = time.time_ns() + 200_000_000
+    send.publish(instant(start_ns))
+    peer_node.until(lambda: bool(peer_node.received["/y"]))
+    assert stamp_ns(peer_node.received["/y"][0]) == start_ns
 
 
 LOSES_CONTACT = "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"

@@ -71,9 +71,10 @@ def handle_signals(handler: Any) -> Iterator[None]:
 
 
 def leave_outcome(run: Path, outcome: str) -> None:
-    """Leave the outcome of a flight for the recorder. A full disk costs the log the outcome alone."""
-    with suppress(OSError, ParameterError):
-        write_file(run / OUTCOME_FILE, outcome)
+    """Leave the outcome of a flight for the recorder; `Path()` records none. A full disk costs the log the outcome alone."""
+    if run.name:
+        with suppress(OSError, ParameterError):
+            write_file(run / OUTCOME_FILE, outcome)
 
 
 class NotReadyError(ParameterError):

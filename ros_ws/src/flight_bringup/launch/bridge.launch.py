@@ -80,7 +80,7 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     def node(spec: NodeSpec, start_time: float = math.inf) -> Node:
         overrides = parameter_overrides(spec, scenario, run, start_time, lockstep=False, autopilot=autopilot)
-        return flight_node(spec, scenario, overrides)
+        return flight_node(spec, scenario, overrides, run)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         end = [TimerAction(period=lead + scenario.flight.duration, actions=complete(run))] if duration else []
@@ -88,7 +88,7 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     page = watch_page(context, run) if recorded else []
     first = FIRST_STAGE if recorder == "true" else (CONTROLLER,)
-    actions = page + start_in_stages(context, {spec: node(spec) for spec in first}, follow)
+    actions = page + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
     if recorder == "rosbag2":
         overrides = parameter_overrides(RECORDER, scenario, run, math.inf, lockstep=False, autopilot=autopilot)
         actions.append(rosbag2(context, scenario, overrides))

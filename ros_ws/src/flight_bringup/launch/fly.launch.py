@@ -81,7 +81,7 @@ def _fly(context: LaunchContext) -> list[Action]:
     end_with_launch(context)
 
     def node(spec: NodeSpec, start_time: float = ON_START) -> Node:
-        return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep))
+        return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep), run)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
         nodes, duration = second_stage(scenario), scenario.flight.duration
@@ -95,7 +95,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE
-    actions = watch_page(context, run) + start_in_stages(context, {spec: node(spec) for spec in first}, follow)
+    actions = watch_page(context, run) + start_in_stages(context, run, {spec: node(spec) for spec in first}, follow)
     if by_rosbag2:
         overrides = parameter_overrides(RECORDER, scenario, run, ON_START, lockstep=False)
         actions.append(rosbag2(context, scenario, overrides))

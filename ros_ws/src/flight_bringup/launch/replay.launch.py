@@ -94,10 +94,11 @@ def _play(context: LaunchContext) -> list[Action]:
     recorded = recorded.keys() - unsendable(recorded)
     topics = argument(context, "topics") or ",".join(replayed_topics(recorded, nodes, namespace, autopilot))
     end_with_launch(context)
+    run = Path()
 
     def end(event: ProcessExited, context: LaunchContext) -> Sequence[Action] | None:
         if event.returncode != 0:
-            fail_on_exit(event, context)
+            fail_on_exit(event, context, run)
         return complete(run, "playback completed") if RECORDER in nodes else [Shutdown(reason="playback completed")]
 
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
@@ -109,11 +110,12 @@ def _play(context: LaunchContext) -> list[Action]:
         return [player]
     name = argument(context, "scenario")
     scenario = find_scenario(name) if name else recorded_scenario(log, namespace or None)
-    run = new_run(scenario, Path(argument(context, "runs"))) if RECORDER in nodes else Path()
+    if RECORDER in nodes:
+        run = new_run(scenario, Path(argument(context, "runs")))
 
     def node(spec: NodeSpec) -> Node:
         overrides = parameter_overrides(spec, scenario, run, 0.0, lockstep=lockstep, autopilot=autopilot)
-        return flight_node(spec, scenario, overrides)
+        return flight_node(spec, scenario, overrides, run)
 
     second_stage = [LogInfo(msg=f"playing {topics}"), player]
-    return start_in_stages(context, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage)
+    return start_in_stages(context, run, {spec: node(spec) for spec in nodes}, lambda lead, start_time: second_stage)

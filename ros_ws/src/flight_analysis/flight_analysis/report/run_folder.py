@@ -22,8 +22,8 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Tape
-from flight_core.text import printable
-from flight_log.bag import LogAttachments
+from flight_core.text import bounded, printable
+from flight_log.bag import OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
@@ -90,7 +90,7 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     folder, scenario = _folder(run), _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     log = replace(recorded.tape, signals=signals)
-    outcome = outcome or _previous_outcome(folder / SUMMARY, recorded.tape.outcome)
+    outcome = outcome or _previous_outcome(folder, recorded.tape.outcome)
     engagements = recorded.engagements
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
@@ -113,7 +113,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
         return None
     simulated = recorded.engagements is None
     folder = None if recorded.path is None else _folder(recorded.path)
-    outcome = recorded.tape.outcome if folder is None else _previous_outcome(folder / SUMMARY, recorded.tape.outcome)
+    outcome = recorded.tape.outcome if folder is None else _previous_outcome(folder, recorded.tape.outcome)
     return account(recorded.tape, scenario, outcome, simulated=simulated)
 
 
@@ -201,12 +201,14 @@ def _folder(run: Path) -> Path:
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
-def _previous_outcome(summary: Path, of_log: str) -> str:
-    """The outcome in the run's summary, else the outcome in the log."""
-    try:
-        return printable(str(json.loads(summary.read_text(encoding="utf-8"))["outcome"]))
-    except (OSError, ValueError, TypeError, KeyError):
-        return of_log if of_log != UNKNOWN else f"{UNKNOWN}: neither the run nor the log has one"
+def _previous_outcome(folder: Path, of_log: str) -> str:
+    """The outcome in the summary of a run, else in the log, else that which a launch left for a recorder that took none."""
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        return printable(str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"]))
+    with suppress(ParameterError):
+        if of_log == UNKNOWN and (left := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace")):
+            return bounded(left.strip())
+    return of_log if of_log != UNKNOWN else f"{UNKNOWN}: neither the run nor the log has one"
 
 
 def link_latest(run: Path) -> None:

@@ -7,6 +7,7 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import AIRCRAFT, LEAD, NodeSpec, start_instant, start_lead
 from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
 from flight_bringup.scenarios import scenarios
-from flight_core.outcome import COMPLETED, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
@@ -114,8 +115,8 @@ def end_with_launch(context: LaunchContext) -> None:
     context.launch_configurations.setdefault("launch-prefix", shlex.join(end_with_parent()))
 
 
-def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides) -> Node:
-    """A node of a flight with a section of the scenario and parameter overrides."""
+def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverrides, run: Path) -> Node:
+    """A node of a flight into the folder `run`, with a section of the scenario and parameter overrides."""
     return Node(
         package=spec.package,
         executable=spec.executable,
@@ -123,7 +124,7 @@ def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverride
         namespace=LaunchConfiguration("namespace"),
         parameters=[str(scenario.path), overrides],
         output="screen",
-        on_exit=fail_on_exit,
+        on_exit=partial(fail_on_exit, run=run),
     )
 
 
@@ -142,13 +143,15 @@ def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOver
     topics = [*(topic.name for topic in FLIGHT), "/rosout", "/parameter_events", *further]
     names = dict.fromkeys(name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics)
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(run / ROSBAG2), "--topics", *names]
-    return ExecuteProcess(cmd=command, name="recorder", output="screen", on_exit=fail_on_exit)
+    return ExecuteProcess(cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, run=run))
 
 
-def fail_on_exit(event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch with exit status 1 when a process ends before the flight."""
+def fail_on_exit(event: ProcessExited, context: LaunchContext, run: Path) -> None:
+    """End the launch with exit status 1 when a process ends before the flight, with the outcome in the folder `run`."""
     if not context.is_shutdown:
-        raise RuntimeError(f"{event.process_name} ended before the flight did")
+        reason = f"{event.process_name} ended before the flight did"
+        leave_outcome(run, reason)
+        raise RuntimeError(reason)
 
 
 def on_state(
@@ -167,13 +170,14 @@ def on_state(
 
 
 def start_in_stages(
-    context: LaunchContext, first: Mapping[NodeSpec, Node], second: Callable[[float, float], Sequence[Action]]
+    context: LaunchContext, run: Path, first: Mapping[NodeSpec, Node], second: Callable[[float, float], Sequence[Action]]
 ) -> list[Action]:
-    """Start the first stage. Once the nodes are ready, run the actions of `second`.
+    """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the actions of `second`.
 
     The arguments of `second` are the time until t = 0 and the system time of t = 0, s.
     """
     _subscribe_states(context)
+    leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
     begin = time.monotonic()
     waiting = dict.fromkeys(first)  # in order
 
