@@ -286,7 +286,7 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     assert ends(flown)
     (leave,) = every(OpaqueFunction, flown)
     leave.function(context)
-    assert (next(tmp_path.glob("*-osprey_gust")) / "outcome").read_text(encoding="utf-8") == "completed"
+    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8") == "completed"
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ def test_flight_without_u_at_aircraft_never_flew(states: Sequence[str], reason: 
         return
     with pytest.raises(RuntimeError, match=reason):
         [check.function(context) for check in checks]
-    assert (next(tmp_path.glob("*-osprey_gust")) / "outcome").read_text(encoding="utf-8").startswith(reason)
+    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8").startswith(reason)
 
 
 def test_lockstep_flight_ends_when_aircraft_completes_it(tmp_path: Path) -> None:
@@ -386,7 +386,7 @@ def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path)
     (tmp_path / "flipped.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     with pytest.raises(ParameterError, match="D of r and rudder is -1, the controller has \\+1"):
         started("bridge", map=tmp_path / "flipped.yaml", runs=tmp_path)
-    assert not list(tmp_path.glob("*-osprey_gust"))
+    assert not list(tmp_path.glob("*-osprey_servo"))
 
 
 def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
@@ -395,7 +395,7 @@ def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path)
     sentence = r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of thrust in the map ardupilot"
     with pytest.raises(ParameterError, match=sentence):
         started("bridge", map="ardupilot", scenario=scenario, dry_run="false", runs=tmp_path)
-    with pytest.raises(ParameterError, match=r"osprey_gust: controller\.lower: found -inf"):
+    with pytest.raises(ParameterError, match=r"osprey_servo: controller\.lower: found -0\.5"):
         started("bridge", map="ardupilot", dry_run="false", runs=tmp_path)
     assert not list(tmp_path.iterdir())
 

@@ -53,7 +53,7 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("map", description=f"name of a channel map ({', '.join(maps())}), or path of a file (.yaml)"),
-            scenario_argument("osprey_gust"),
+            scenario_argument("osprey_servo"),
             boolean_argument(
                 "dry_run", True, "true: publish on bridge/would_send, send nothing; false: send once the bridge is engaged"
             ),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_gust.
+"""Fly a scenario on a full ROS 2: ros2 launch flight_bringup fly.launch.py scenario:=osprey_servo.
 
 The same graph and the same scenario file as `rise-di fly`. The flight begins once each node is ready and matched. It ends
 once the log holds the scenario's duration, in lockstep when the aircraft completes it. It ends early with exit status 1 when a
@@ -53,7 +53,7 @@ def generate_launch_description() -> LaunchDescription:
     """The arguments and the flight."""
     return LaunchDescription(
         [
-            scenario_argument("osprey_gust"),
+            scenario_argument("osprey_servo"),
             DeclareLaunchArgument("duration", default_value="", description="seconds to fly; empty flies the scenario's"),
             DeclareLaunchArgument(
                 "lockstep",

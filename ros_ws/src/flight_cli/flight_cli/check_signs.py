@@ -23,7 +23,7 @@ CONTRADICTS = 1
 def check_signs(
     map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")],
     airframe: Annotated[str | None, typer.Option(help="Airframe; by default that of the scenario.")] = None,
-    scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_gust",
+    scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_servo",
     bag: Annotated[
         Path | None, typer.Option(help="A recorded flight with y and u, each input excited; with a bridge, its engaged time.")
     ] = None,

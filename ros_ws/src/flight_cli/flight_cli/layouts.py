@@ -13,7 +13,7 @@ from flight_core.files import write_file, writing
 
 
 def layouts(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_gust",
+    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
     folder: Annotated[Path, typer.Option(help="Folder to write the two files to.")] = Path(),
 ) -> None:
     """Write layouts for Foxglove and PlotJuggler that plot the runs of a scenario."""

@@ -4,7 +4,7 @@
 
     import rise_di
 
-    scenario = rise_di.find_scenario("osprey_gust").vary(controller={"beta": [2.0, 2.0, 1.0, 1.0]})
+    scenario = rise_di.find_scenario("osprey_servo").vary(controller={"beta": [2.0, 2.0, 1.0, 1.0]})
     tape = rise_di.simulate(scenario)
     q, t = tape["y"]["q"], tape.time("y")
 
