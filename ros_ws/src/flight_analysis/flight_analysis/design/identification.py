@@ -477,7 +477,7 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 {% endif %}
 
 # Omega and the lags are those of step tests; the slew behind beta is that of u with K and Lambda alone in moderate turbulence.
-# beta of V is K Lambda times the rms of a light one, for V holds the wind itself: more drives the throttle from stop to stop.
+# beta of V is K bandwidth / 4 times the rms of a light one, for V holds the wind itself: more drives it from stop to stop.
 {{ controller }}
 {% if guided %}
 /**/guidance:                  # what is left out follows by rule: docs/guidance.md
