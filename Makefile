@@ -29,7 +29,7 @@ MADE_IN := $(shell sed -n 's/^command = .* -m venv --clear //p' .venv/pyvenv.cfg
 MOVED := $(if $(filter-out $(subst $() ,?,$(CURDIR)/.venv),$(subst $() ,?,$(MADE_IN))),yes)
 
 FLY := --extra ros --group build
-ALL := $(FLY) --extra campaign --extra autopilot --group messages --group docs --group dev
+ALL := $(FLY) --extra campaign --extra autopilot --extra tools --group messages --group docs --group dev
 # uv holds every package to the version and the hashes of the lock.
 INSTALL := $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python --constraint requirements.lock --requirement pyproject.toml
 

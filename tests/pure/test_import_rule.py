@@ -57,7 +57,8 @@ IMPORTS: dict[str, set[str]] = {
     },
     "rise_di": {
         "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "rise_di_controller",
+        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "reference_model",
+        "rise_di_controller",
     },
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.c_export", "flight_analysis.closed_loop",

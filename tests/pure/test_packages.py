@@ -34,9 +34,11 @@ KEYS = {name: f"python3-{name}" for name in PYTHON3} | {"markupsafe": "python3-j
 # Without a key, or (rosbags) with one for pip, which Ubuntu 24.04 refuses for its own Python.
 WITHOUT_KEY = {
     "cma",
+    "control",
     "dask",
     "distributed",
     "foxglove",
+    "gymnasium",
     "jax",
     "jsbsim",
     "lz4",

@@ -10,7 +10,13 @@ from flight_core.parameters import ParameterError
 CHECKOUT = Path(__file__).resolve().parents[4]
 """The root of the repository, if this file is ros_ws/src/flight_core/flight_core/installation.py there."""
 
-TARGETS = {"ros": "make setup", "campaign": "make setup-all", "foxglove": "make foxglove", "autopilot": "make autopilot"}
+TARGETS = {
+    "ros": "make setup",
+    "campaign": "make setup-all",
+    "foxglove": "make foxglove",
+    "autopilot": "make autopilot",
+    "tools": "make setup-all",
+}
 """The targets of the Makefile by the extras of pyproject.toml."""
 
 EXTRAS = {
@@ -21,6 +27,8 @@ EXTRAS = {
     "foxglove": "foxglove",
     "pymavlink": "autopilot",
     "pyulog": "autopilot",
+    "control": "tools",
+    "gymnasium": "tools",
 }
 """The extras of pyproject.toml by the packages that a command may lack."""
 

@@ -22,11 +22,13 @@ __all__ = [
     "Controller",
     "ControllerConfig",
     "Field",
+    "FlightEnv",
     "FlightResult",
     "GainAssessment",
     "LawParams",
     "LawState",
     "Limits",
+    "Loop",
     "LoopMargins",
     "Measurements",
     "NewAirframe",
@@ -48,6 +50,7 @@ __all__ = [
     "airframe_facts",
     "airframes",
     "array_namespace",
+    "as_control",
     "best_error",
     "check_gains",
     "data_frame",
@@ -57,6 +60,7 @@ __all__ = [
     "find_scenario",
     "fly",
     "fly_campaign",
+    "fly_plant",
     "gains_yaml",
     "law_schema",
     "laws",
@@ -102,8 +106,10 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_core.vectors import Array, StampedVector, array_namespace
     from flight_log.tape_reader import RecordedRun, read_run
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
+    from rise_di.flight_env import FlightEnv
     from rise_di.gain_design import check_gains, select_gains
     from rise_di.own_airframe import NewAirframe, new_airframe
+    from rise_di.own_loop import Loop, as_control, fly_plant
     from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
     from rise_di_controller.controller import Controller
     from rise_di_controller.decomposition import decompose
@@ -137,8 +143,10 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_core.vectors": ("Array", "StampedVector", "array_namespace"),
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
+        "rise_di.flight_env": ("FlightEnv",),
         "rise_di.gain_design": ("check_gains", "select_gains"),
         "rise_di.own_airframe": ("NewAirframe", "new_airframe"),
+        "rise_di.own_loop": ("Loop", "as_control", "fly_plant"),
         "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),
         "rise_di_controller.controller": ("Controller",),
         "rise_di_controller.decomposition": ("decompose",),

@@ -24,6 +24,7 @@ from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
+RECORDER_RATE = 100.0  # Hz, of a scenario without the section `recorder`: that of the shipped scenarios
 STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits
 
 ParameterOverrides = dict[str, str | float | bool | list[str] | list[float]]
@@ -49,6 +50,21 @@ class Scenario:
     controller: ControllerConfig
     recorder: RecorderConfig
     guidance: GuidanceConfig | None = None  # None: the commands are those of the reference model
+
+    @classmethod
+    def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
+        """A scenario without a file: flight, aircraft, reference_model, controller and, if any, recorder and guidance.
+
+        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays. Raises ParameterError.
+        """
+        needed = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
+        missing = [key for key in needed if key not in sections]
+        unknown = [key for key in sections if key not in SCHEMAS]
+        expected = f"the sections {', '.join(needed)}, and {' or '.join(key for key in SCHEMAS if key not in needed)}"
+        require(not missing, name, f"no section {', '.join(missing)}", expected)
+        require(not unknown, name, f"a section {', '.join(unknown)}", expected)
+        values = {key: part.model_dump() if isinstance(part, Config) else part for key, part in sections.items()}
+        return scenario_of(name, Path(f"{name}.yaml"), {"recorder": {"rate": RECORDER_RATE}} | values)
 
     def vary(self, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """A copy with some parameters replaced, as in scenario.vary(controller={"rate": 200.0}).

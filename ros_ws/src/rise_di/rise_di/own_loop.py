@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controller in a loop of the user's own: tick by tick, around a plant that is a function, and in python-control."""
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flight_core.arguments import as_number
+from flight_core.installation import require_package
+from flight_core.modes import Mode
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import require, require_channels
+from flight_core.rates import nanoseconds, seconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray, StampedVector, as_array, select
+from reference_model.params import ReferenceModelConfig
+from reference_model.reference import Reference
+from rise_di_controller.control_law import Measurements, fields, restored
+from rise_di_controller.controller import Controller, ControlOutput
+from rise_di_controller.laws import AnyLaw
+from rise_di_controller.linear_loop import linear_law
+from rise_di_controller.params import ControllerConfig
+
+if TYPE_CHECKING:
+    import control
+
+Plant = Callable[[float, FloatArray, float], ArrayLike]
+"""plant(t, u, dt) -> y: advances from t to t + dt with u (p,) held, and measures y (m,) then; SI, deviations from trim."""
+
+
+class Loop:
+    """The controller behind its guard, a call a tick. The node runs the same `Controller`, so u has the same bits.
+
+        loop = rise_di.Loop(scenario.controller)
+        u = loop.step(t, y, y_m)
+
+    Args:
+        controller: Parameters of the controller, or a mapping of these as in the section `controller` of a scenario.
+
+    Raises ParameterError for parameters that the controller does not accept.
+    """
+
+    def __init__(self, controller: ControllerConfig | Mapping[str, Any]) -> None:
+        if not isinstance(controller, ControllerConfig):
+            controller = AnyLaw.validate_mapping(controller, "controller")
+        self.config = controller
+        self._controller = Controller(self.config)
+        self.outputs, self.inputs = self.config.outputs, self.config.inputs
+        self.period = seconds(self._controller.period_ns)
+        self._now_ns = -1  # of the last tick
+        self.output: ControlOutput | None = None  # of the last tick; None where nothing is to be sent
+
+    @property
+    def mode(self) -> Mode:
+        """Mode of the guard: WAITING until y and y_m are fresh, then ENGAGED; a failsafe where they are old."""
+        return self._controller.mode
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Channels of `output.internals`."""
+        return self._controller.names
+
+    def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
+        """A tick at t in s: u of (22), shape (m,), SI, deviation from trim, in the order of `inputs`; 0 before the engagement.
+
+        y and y_m, shape (m,), SI, deviations from trim, belong to t and have the order of `outputs`; None is a lost sample.
+        t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
+        Raises ParameterError for a t that goes back, for a wrong length and for a value that is not finite.
+        """
+        now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
+        last_ns = self._now_ns
+        require(now_ns > last_ns, "t", f"{t:g} s", f"more than {seconds(last_ns):g} s, the t of the last tick")
+        self._now_ns = now_ns
+        for key, value, take in (("y", y, self._controller.take_y), ("y_m", y_m, self._controller.take_y_m)):
+            if value is not None:
+                take(StampedVector(now_ns, self.vector(value, key)), now_ns)
+        self.output = self._controller.tick(now_ns)
+        return self._controller.state.u.copy()
+
+    def retune(self, controller: ControllerConfig) -> None:
+        """Replace the parameters before the next tick, without a jump of u. Raises ParameterError as `Controller.retune`."""
+        self._controller.retune(controller)
+        self.config = controller
+
+    def vector(self, value: ArrayLike, key: str) -> FloatArray:
+        """A sample of y or y_m as an array of its own, shape (m,). Raises ParameterError with the key."""
+        expected = f"{len(self.outputs)} finite numbers: {', '.join(self.outputs)}"
+        vector = as_array(value, key, expected)
+        require(vector.shape == (len(self.outputs),) and bool(np.isfinite(vector).all()), key, value, expected)
+        return vector.copy()
+
+
+def fly_plant(
+    plant: Plant,
+    controller: ControllerConfig | Mapping[str, Any],
+    reference_model: ReferenceModelConfig | Mapping[str, Any],
+    duration: float,
+) -> Tape:
+    """Fly a plant of the user's own under the controller and return the tape: y, y_m, u and internals.
+
+    `plant(t, u, dt)` advances by dt with u held and returns y; the first call has t = dt = 0. Outputs and inputs have the order
+    of the controller. A plant that raises FlightEnded ends the flight early, with the reason in `outcome` of the tape.
+    Raises ParameterError for parameters, for a wrong y, and for outputs or rates that do not fit each other.
+    """
+    loop, config = Loop(controller), reference_model
+    if not isinstance(config, ReferenceModelConfig):
+        config = ReferenceModelConfig.validate_mapping(config, "reference_model")
+    require_channels("reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller")
+    reference, period_ns = Reference(config), nanoseconds(loop.period)
+    whole = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
+    require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", whole)
+    each = period_ns // reference.period_ns
+    ticks = int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
+    channels = {"y": loop.outputs, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
+    rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
+    u, outcome = np.zeros(len(loop.inputs)), COMPLETED
+    for k in range(ticks):
+        t_ns, dt = k * period_ns, loop.period if k else 0.0
+        try:
+            y = loop.vector(plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant")
+        except FlightEnded as error:
+            outcome = str(error)
+            break
+        y_m = select(loop.outputs, config.outputs, reference.sample(k * each))
+        u = loop.step(seconds(t_ns), y, y_m)
+        sample = {"y": y, "y_m": y_m} | ({} if loop.output is None else {"u": u, "internals": loop.output.internals})
+        for topic, value in sample.items():
+            rows[topic].append((t_ns, value))
+    signals = {}
+    for topic, names in channels.items():
+        stamp_ns = np.array([stamp for stamp, _ in rows[topic]], dtype=np.int64)
+        signals[topic] = Signal(stamp_ns, names, np.array([row for _, row in rows[topic]]).reshape(-1, len(names)))
+    return Tape(signals, outcome=outcome)
+
+
+def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool = False) -> "control.NonlinearIOSystem":
+    """The engaged law as a discrete system of python-control, with limits and anti-windup: `y_NAME`, `y_m_NAME` -> `u_NAME`.
+
+    The period is that of the controller. The state is that of the law, then u and y_m of the last tick; from 0 the flight
+    starts in trim. With `linear` the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins.
+    Raises ParameterError without python-control, for a controller with a feedforward, whose model is beside the law, and with
+    `linear` for the literal sign.
+    """
+    require_package("control")
+    import control  # noqa: PLC0415 - an extra
+
+    config = Loop(controller).config
+    require(config.feedforward is None, "controller.feedforward", "a model", "none: as_control has the law alone")
+    dt, (law, params), m = 1.0 / config.rate, config.tuned_law(), len(config.outputs)
+    measured, names = [f"y_{name}" for name in config.outputs], [f"u_{name}" for name in config.inputs]
+    if linear:
+        near = linear_law(config.tuned_law(), m, dt)
+        return control.ss(near.A, near.B, near.C, near.D, dt, inputs=measured, outputs=names, name=config.law)
+    limits, zero = config.guard().limits, np.zeros(m)
+    start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    sizes = [value.size for value in start.values()]
+    offset = np.concatenate([value.ravel() for value in start.values()])  # so that x = 0 is the engagement in trim
+    ends = np.cumsum(sizes)
+
+    def tick(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        parts = np.split(offset + x[: ends[-1]], ends[:-1])
+        state = restored(law, {name: part.reshape(start[name].shape) for name, part in zip(start, parts, strict=True)})
+        u_before, y_m_before = x[ends[-1] : -m], x[-m:]
+        sample = Measurements(v[:m], v[m:], (v[m:] - y_m_before) / dt, zero, u_before)
+        after, _, u = law.limited(state, sample, np.float64(dt), params, limits)
+        flat = np.concatenate([value.ravel() for value in fields(after).values()])
+        return np.concatenate([flat - offset, u, v[m:]]), np.asarray(u)
+
+    return control.nlsys(
+        lambda t, x, v, _: tick(x, v)[0],
+        lambda t, x, v, _: tick(x, v)[1],
+        dt=dt,
+        states=int(ends[-1]) + 2 * m,
+        inputs=[*measured, *(f"y_m_{name}" for name in config.outputs)],
+        outputs=names,
+        name=config.law,
+    )

@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controller in a loop of the user's own and in python-control, and the aircraft as an environment of gymnasium."""
+
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import ArrayLike
+
+import rise_di
+from aircraft_sim.simulator import Simulator
+from flight_core.modes import Mode
+from flight_core.outcome import FlightEnded
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray, select
+from rise_di_controller.margins import loop_transfer
+
+SCENARIO = rise_di.find_scenario("osprey_servo", 3.0)
+CONTROLLER = SCENARIO.controller
+M = len(CONTROLLER.outputs)
+
+
+@pytest.fixture(scope="module")
+def flown() -> Tape:
+    """Two seconds are enough for a pulse, noise and servos. y has no delay here, so each tick has the y of its instant."""
+    return rise_di.simulate(SCENARIO)
+
+
+def columns(tape: Tape, topic: str, names: tuple[str, ...]) -> FloatArray:
+    """Samples of a topic at the ticks, (N, m), in the law's order."""
+    signal = tape[topic]
+    at = np.isin(signal.stamp_ns, tape["u"].stamp_ns)
+    return np.array([signal[name][at] for name in names]).T
+
+
+def test_loop_gives_bits_of_simulation(flown: Tape) -> None:
+    loop = rise_di.Loop(CONTROLLER)
+    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    u = [loop.step(t, *row) for t, *row in zip(flown.time("u"), y, y_m, strict=True)]
+    assert np.array_equal(u, flown["u"].values)
+    assert loop.mode is Mode.ENGAGED
+    assert np.array_equal(loop.output.internals, flown["internals"].values[-1]) if loop.output else pytest.fail("no output")
+
+
+def test_lost_samples_start_failsafe() -> None:
+    loop = rise_di.Loop(CONTROLLER)
+    e = np.full(M, 0.01)
+    for k in range(50):
+        held = loop.step(k * loop.period, e, 0.0 * e)
+    late = 0.5 + CONTROLLER.max_age + loop.period
+    assert np.array_equal(loop.step(late, None, None), held)
+    assert loop.mode.name == "HOLD"
+    past = late + CONTROLLER.hold + CONTROLLER.ramp
+    assert not loop.step(past, None, None).any()
+    assert loop.mode.name == "TRIM"
+
+
+@pytest.mark.parametrize(
+    ("t", "y", "sentence"),
+    [
+        (1.0, [0.0], "y: found [0.0], expected 4 finite numbers: q, p, r, V"),
+        (1.0, [0.0, 0.0, np.nan, 0.0], "y: found [0.0, 0.0, nan, 0.0], expected 4 finite numbers: q, p, r, V"),
+        (0.0, np.zeros(4), "t: found 0 s, expected more than 0.5 s, the t of the last tick"),
+        (-1.0, np.zeros(4), "t: found -1.0, expected 0 or more, s"),
+    ],
+)
+def test_loop_refuses_wrong_sample(t: float, y: ArrayLike, sentence: str) -> None:
+    loop = rise_di.Loop(CONTROLLER.model_dump())
+    loop.step(0.5, np.zeros(M), np.zeros(M))
+    with pytest.raises(rise_di.ParameterError) as refused:
+        loop.step(t, y, np.zeros(M))
+    assert str(refused.value) == sentence
+
+
+def test_plant_of_own_flies_as_simulation(flown: Tape) -> None:
+    aircraft, numbers = Simulator(SCENARIO.aircraft), iter(range(10_000))
+
+    def plant(t: float, u: FloatArray, dt: float) -> FloatArray:
+        held = select(aircraft.inputs, CONTROLLER.inputs, u)
+        for _ in range(round(dt * SCENARIO.aircraft.rate) or 1):
+            (sample,) = aircraft.sample(next(numbers), held)
+        return select(CONTROLLER.outputs, aircraft.outputs, sample.value)
+
+    tape = rise_di.fly_plant(plant, CONTROLLER, SCENARIO.reference_model, 3.0)
+    assert np.array_equal(tape["u"].values, flown["u"].values)
+    assert np.array_equal(tape["internals"].values, flown["internals"].values)
+    assert rise_di.best_error(tape)[1].values.shape == (301, M)
+
+
+def test_plant_ends_its_flight() -> None:
+    def crash(t: float, u: FloatArray, dt: float) -> FloatArray:
+        if t + dt > 1.0:
+            raise FlightEnded("below the ground")
+        return np.zeros(M)
+
+    tape = rise_di.fly_plant(crash, CONTROLLER, SCENARIO.reference_model, 3.0)
+    assert tape.outcome == "below the ground"
+    assert tape.time("y")[-1] == 1.0
+
+
+def test_reference_of_other_outputs_refused() -> None:
+    pitch = {
+        "rate": 100.0,
+        "outputs": ["q"],
+        "second_order": {"natural_frequency": [3.0], "damping": [0.9]},
+        "rise": 0.2,
+        "pulses": {},
+    }
+    with pytest.raises(rise_di.ParameterError, match="found q, expected the outputs of the controller"):
+        rise_di.fly_plant(lambda t, u, dt: np.zeros(M), CONTROLLER, pitch, 1.0)
+
+
+PARTS: dict[str, Any] = {
+    "flight": {"duration": 3.0},
+    "aircraft": SCENARIO.aircraft,
+    "reference_model": SCENARIO.reference_model.model_dump(),
+    "controller": CONTROLLER,
+}
+
+
+def test_scenario_of_parts_flies_as_its_file(flown: Tape) -> None:
+    assert np.array_equal(rise_di.simulate(rise_di.Scenario.from_parts("own", **PARTS))["u"].values, flown["u"].values)
+
+
+@pytest.mark.parametrize(
+    ("parts", "sentence"),
+    [
+        ({}, "own: found no section flight, aircraft, reference_model, controller, expected the sections flight"),
+        (
+            PARTS | {"winds": {}},
+            "own: found a section winds, expected the sections flight, aircraft, reference_model, controller",
+        ),
+        (PARTS | {"flight": {"duration": -1.0}}, "flight.duration: "),
+        (PARTS | {"controller": {"rate": 100.0}}, "controller."),
+    ],
+)
+def test_wrong_parts_are_refused(parts: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(rise_di.ParameterError, match=f"^{sentence}"):
+        rise_di.Scenario.from_parts("own", **parts)
+
+
+# python-control
+
+
+def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
+    law = rise_di.as_control(CONTROLLER)
+    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    v = np.concatenate([y - y[0], y_m], axis=1).T  # from trim: the engagement of x = 0 has y = y_m = 0
+    loop = rise_di.Loop(CONTROLLER)
+    u = np.array([loop.step(t, *np.split(row, 2)) for t, row in zip(flown.time("u"), v.T, strict=True)])
+    response = control.input_output_response(law, np.arange(v.shape[1]) / CONTROLLER.rate, v)
+    # stamps in ns against t = k T: dt of the law differs in the last bits
+    np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
+
+
+def test_linear_law_has_loop_transfer_of_margins() -> None:
+    from flight_analysis.closed_loop.margins import scenario_loop  # noqa: PLC0415 - imported with python-control's cases
+
+    law = rise_di.as_control(CONTROLLER, linear=True)
+    of = scenario_loop(SCENARIO, CONTROLLER)
+    w = np.array([0.5, 2.0, 8.0])
+    z = np.exp(1j * w * of.loop.period)
+    near = np.array([of.law.C @ np.linalg.solve(value * np.eye(len(of.law.A)) - of.law.A, of.law.B) + of.law.D for value in z])
+    np.testing.assert_allclose(np.moveaxis(law(z), 2, 0), near, rtol=1e-9)
+    assert loop_transfer(of.nominal, of.law, of.loop, w).shape == (3, M)
+
+
+# gymnasium
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space (min|max)imum value is.*infinity")
+@pytest.mark.filterwarnings("ignore:.*we recommend using a symmetric and normalized space")
+def test_environment_passes_checks_of_gymnasium() -> None:
+    check_env(rise_di.FlightEnv(SCENARIO, uncertainty=0.3), skip_render_check=True)
+
+
+def test_environment_under_law_flies_as_simulation(flown: Tape) -> None:
+    env, loop = rise_di.FlightEnv(SCENARIO), rise_di.Loop(CONTROLLER)
+    observed, _ = env.reset()
+    flight, ended, reward = [], False, 0.0
+    while not ended:
+        flight.append(observed)
+        u = loop.step((len(flight) - 1) * loop.period, observed[:M], observed[M:])
+        observed, step_reward, terminated, ended, _ = env.step(u)
+        reward += step_reward
+        assert not terminated
+    y, y_m = columns(flown, "y", CONTROLLER.outputs), columns(flown, "y_m", CONTROLLER.outputs)
+    assert np.array_equal([*flight, observed], np.concatenate([y, y_m], axis=1))
+    units = np.array([{"p": 0.02, "V": 0.1}.get(name, 0.01) for name in CONTROLLER.outputs])
+    assert reward == pytest.approx(-np.sum(np.abs(y - y_m)[1:] / units) / CONTROLLER.rate)
+
+
+def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = rise_di.FlightEnv(SCENARIO)
+    env.reset()
+    u = np.zeros(M)
+    assert not env.step(u)[2]
+
+    def diverge(self: Simulator, number: int, u: FloatArray) -> None:
+        raise FlightEnded("diverged at t = 0.02 s")
+
+    monkeypatch.setattr(Simulator, "sample", diverge)
+    _, reward, terminated, truncated, info = env.step(u)
+    assert (terminated, truncated, info) == (True, False, {"outcome": "diverged at t = 0.02 s"})
+    assert reward == pytest.approx(-10.0 * (3.0 - 0.01))  # the score of a loss of track for the seconds from the last tick on
+    with pytest.raises(rise_di.ParameterError, match="expected reset"):
+        env.step(u)
