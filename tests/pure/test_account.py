@@ -13,6 +13,7 @@ import pytest
 import typer
 from tests.damaged import DAMAGES, damage
 from tests.recordings import EPOCH
+from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
@@ -22,6 +23,7 @@ from flight_analysis.report.summary import taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.processes import leave_outcome
 from flight_bringup.scenarios import find_scenario
+from flight_cli.cli import application
 from flight_cli.replay import replay
 from flight_cli.report import report
 from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
@@ -113,6 +115,26 @@ def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: 
     assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
     assert "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in output
     assert "over 33 % of truth" in (log.parent / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["identify", "--airframe", "f16_lateral", "--log"],  # each is refused at what follows
+        ["check-signs", "ardupilot", "--airframe", "f16_lateral", "--bag"],
+        ["play", "--start", "1"],
+        ["export", "osprey_servo", "--c", "code", "--run"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_commands_that_take_log_warn_of_what_it_lacks(
+    words: list[str], whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "none")
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
+    result = CliRunner().invoke(application(words[:1]), [*words, str(log)])
+    assert "warning: the log lacks truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in result.stderr, result.exception
 
 
 def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

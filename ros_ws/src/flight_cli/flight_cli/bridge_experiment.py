@@ -34,6 +34,7 @@ from flight_analysis.design.sign_check import OPEN_LOOP
 from flight_analysis.report.run_folder import link_latest, new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
+from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import flight_progress, new_table, print_json
 from flight_core.files import display_path, write_file, writing
 from flight_core.parameters import ParameterError, require
@@ -141,6 +142,7 @@ def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
     Raises ParameterError for a log without an engagement, and for a flight under feedback: its u follows y.
     """
     recorded = read_run(run)
+    warn_of_lacks(recorded)
     tape, flown = recorded.tape, recorded.engagements
     if COMMANDS in tape:
         recorded.require("y", "u")

@@ -14,7 +14,7 @@ from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 from flight_bringup.scenarios import find_scenario
-from flight_cli.log_options import LogNamespace
+from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
 
 CONTRADICTS = 1
@@ -38,6 +38,8 @@ def check_signs(
     channel_map = load_map(map_name)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
+    if bag is not None:
+        warn_of_lacks_in(bag, namespace)
     checked = check_scenario(channel_map, chosen, frame, bag, namespace)
     if as_json:
         channels, sentences = [channel._asdict() for channel in checked.channels], list(checked.contradictions)

@@ -16,6 +16,7 @@ from flight_analysis.c_export.library import build_fmu
 from flight_analysis.c_export.proof import FMU, REPORT, compilers, prove, report, write_code
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.scenarios import find_scenario
+from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import options, print_json
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
@@ -73,7 +74,9 @@ def export(
             sets = parameter_sets(controller)
             recordings = _recordings(chosen.vary(flight={"duration": length}), sets, 0 if float32 else drawn, seed)
         else:
-            sets, recording, as_logged = run_recording(read_run(run))
+            recorded = read_run(run)
+            warn_of_lacks(recorded)
+            sets, recording, as_logged = run_recording(recorded)
             require(sets[0].digest() == controller.digest(), "--run", "a flight with other parameters", f"those of {scenario}")
             recordings = iter([recording])
         proof = prove(folder, commands, sets, recordings, float32=float32)

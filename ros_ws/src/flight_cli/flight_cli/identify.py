@@ -34,7 +34,7 @@ from flight_analysis.report.plotting import Curve, Interval, PlotContext, Sample
 from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
-from flight_cli.log_options import scenario_file
+from flight_cli.log_options import scenario_file, warn_of_lacks
 from flight_cli.output import COUNT_COLUMNS, new_table, options, print_json, progress_bar, write_text
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -210,6 +210,7 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
     recorded = read_run(source.log, source.namespace, scenario_file(source.scenario))
     recorded.require()
+    warn_of_lacks(recorded)
     if recorded.scenario is None:
         raise ParameterError(f"{source.log}: found a log without its scenario, expected --scenario with the controller's lags")
     controller = recorded_parameters(recorded.scenario)

@@ -1,13 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of every command that reads a log: the scenario of a log without a scenario, the aircraft of several."""
+"""What the commands that read a log share: the scenario of a log without a scenario, the aircraft of several, what it lacks."""
 
+import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from flight_analysis.report.run_folder import log_account
 from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_log.tape_reader import RecordedRun, read_run
 
 LogNamespace = Annotated[str | None, typer.Option("--namespace", help="Namespace of the aircraft, if the log holds several.")]
 LogScenario = Annotated[
@@ -18,3 +23,16 @@ LogScenario = Annotated[
 def scenario_file(name: str | None) -> Path | None:
     """The file of a scenario by name or path; None without a name. Raises ParameterError for an invalid scenario."""
     return None if name is None else find_scenario(name).path
+
+
+def warn_of_lacks(recorded: RecordedRun) -> None:
+    """Print what a log lacks, a warning each on standard error, so that no result stands for more than was recorded."""
+    of = log_account(recorded)
+    for sentence in (*recorded.tape.notes, *(() if of is None else of.notes())):
+        print(f"warning: {sentence}", file=sys.stderr)
+
+
+def warn_of_lacks_in(run: Path, namespace: str | None) -> None:
+    """As `warn_of_lacks`, of a log that need not hold a flight."""
+    with suppress(ParameterError):
+        warn_of_lacks(read_run(run, namespace))

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from flight_cli.log_options import LogNamespace
+from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import CLOCK_COLUMNS, progress_bar
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import require
@@ -47,6 +47,7 @@ def play(
         require(math.isfinite(value), option, value, "a number")  # NaN passes the ranges above
     names = [name.strip() for name in topics.split(",") if name.strip()]
     playback = read_playback(run, names, start, namespace)
+    warn_of_lacks_in(run, namespace)
     require_ros_environment()
     from flight_bringup.player import Player, unsendable  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
