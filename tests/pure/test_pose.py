@@ -172,3 +172,47 @@ def test_place_of_jsbsim_is_that_of_own_latitude_and_longitude() -> None:
     assert abs(start[0]) < 1e-12  # it flies from the equator: no cosine of the latitude
     assert (found["north"], found["east"]) == (pytest.approx(north, rel=0.01), pytest.approx(east, rel=0.01))
     assert east > 300.0  # m: it has turned
+
+
+POOR = {"rate": 5.0, "delay": 0.1, "bias": {"psi": 0.1}, "noise": {"north": 2.0, "psi": 0.02}, "drift": {"altitude": 0.3}}
+
+
+def test_poor_pose_is_late_rare_and_off_as_specified() -> None:
+    """100 s: the noise of 500 samples has a standard deviation within 4 / sqrt(2 N) of that specified."""
+    simulator = Simulator(aircraft_parameters(pose=POOR, rate=100.0))
+    truth, arrived = {}, []
+    for number in range(100 * 100 + 1):
+        simulator.sample(number, np.zeros(4))
+        truth[number * 10_000_000] = simulator.pose()
+        arrived += [(number * 10_000_000, sample) for sample in simulator.poses()]
+        if number % 20 == 0:
+            errors = dict(zip(simulator.truth_names, simulator.truth(), strict=True))
+    assert {now - sample.stamp_ns for now, sample in arrived} == {100_000_000}
+    assert [sample.stamp_ns for _, sample in arrived[:3]] == [0, 200_000_000, 400_000_000]
+    off = np.array([sample.value - truth[sample.stamp_ns] for _, sample in arrived])
+    assert off[:, POSE.index("north")].std() == pytest.approx(2.0, rel=4.0 / math.sqrt(2.0 * len(off)))
+    assert off[:, POSE.index("psi")].mean() == pytest.approx(0.1, abs=4.0 * 0.02 / math.sqrt(len(off)))
+    steps = np.diff(off[:, POSE.index("altitude")])
+    assert steps.std() == pytest.approx(0.3 * math.sqrt(0.2), rel=4.0 / math.sqrt(2.0 * len(steps)))
+    assert not off[:, POSE.index("phi")].any()
+    assert errors["noise.pose.psi"] == pytest.approx(0.1, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("section", "sentence"),
+    [
+        ({"noise": {"pitch": 1.0}}, "pose.noise: found pitch, expected some of phi, theta"),
+        ({"delay": 0.123}, "pose.delay: found 0.123 s, expected a whole multiple of 1 / rate"),
+        ({"rate": 40.0}, r"rate: found 0.01 s, expected a whole fraction of 1 / pose.rate \(0.025 s\)"),
+    ],
+)
+def test_pose_that_aircraft_cannot_measure_refused(section: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        aircraft_parameters(pose=section, rate=100.0)
+
+
+def test_flight_with_pose_too_late_ends_with_number_and_key() -> None:
+    late = find_scenario("osprey_route").vary(flight={"duration": 10.0}, aircraft={"pose": {"delay": 0.3}})
+    assert simulate(late).outcome == "ended at t = 2.30 s: no u_m: pose is 0.30 s old, guidance.max_age 0.2 s"
+    flown = late.vary(flight={"duration": 1.0}, guidance={"max_age": 0.4})
+    assert simulate(flown)["guidance"]["age.pose"].max() == pytest.approx(0.3, abs=0.021)

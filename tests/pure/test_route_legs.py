@@ -361,4 +361,4 @@ def test_flight_carried_back_is_noticed_once() -> None:
 def test_log_without_channels_has_no_notices() -> None:
     old = Tape({"guidance": Signal(np.array([0]), ("leg", "given"), np.zeros((1, 2)))}, 0)
     assert (flown_legs(old), guidance_notices(old, CONFIG)) == ([], [])
-    assert Notices(0.0, lambda speed: speed).of_log(np.array([0.0]), {"leg": np.array([0.0])}) == []
+    assert Notices(0.0, 0.2, lambda speed: speed).of_log(np.array([0.0]), {"leg": np.array([0.0])}) == []

@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from aircraft_sim.applied_input import AppliedInput
 from aircraft_sim.params import AircraftConfig
+from aircraft_sim.pose import every
 from aircraft_sim.simulator import Simulator
 from flight_core import channels
 from flight_core.publisher_lock import PublisherLock
@@ -82,8 +83,12 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def _publish_motion(self, number: int, start_ns: int) -> None:
         stamp_ns = start_ns + number * self.period_ns()
-        if number % self._simulator.pose_every == 0:
-            self._publish_pose(self._pose_encoder.encode(stamp_ns, self._simulator.pose()))
+        poses = self._simulator.poses()
+        for pose in poses:
+            self._publish_pose(self._pose_encoder.encode(start_ns + pose.stamp_ns, pose.value))
+        awaited = self.parameters.lockstep and number % every(self.parameters.rate) == 0
+        if awaited and not (poses and start_ns + poses[-1].stamp_ns == stamp_ns):
+            self._publish_pose(self._empty_encoder.encode(stamp_ns, NO_CHANNELS))  # no pose of this instant comes later
         self._publish_truth(self._truth_encoder.encode(stamp_ns, self._simulator.truth()))
 
     def advance(self) -> bool:

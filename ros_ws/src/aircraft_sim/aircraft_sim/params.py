@@ -14,10 +14,12 @@ from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
 from aircraft_sim.plant import PlantParams
+from aircraft_sim.pose import every
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from flight_core import parameters
+from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numbers, ParameterError, Positive, require
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
@@ -132,6 +134,24 @@ class SensorConfig(Config):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
+PerPose = dict[str, Number]
+
+
+class PoseConfig(Config):
+    """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to 50 Hz."""
+
+    rate: Positive | None = Field(
+        default=None, description="the rate of pose, Hz, a whole fraction of the aircraft's; none: 50 Hz"
+    )
+    delay: float = Field(
+        default=0.0, ge=0, le=1e6, description="from measurement to arrival, s; whole periods of the aircraft. A stamp stays"
+    )
+    bias: PerPose = Field(default={}, description="constant errors by channel of `pose`, SI")
+    drift: dict[str, NonNegative] = Field(default={}, description="random walks by channel: standard deviation, SI per sqrt(s)")
+    noise: dict[str, NonNegative] = Field(default={}, description="standard deviation of the noise per sample by channel, SI")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
+
+
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
@@ -169,6 +189,7 @@ class AircraftConfig(NodeConfig):
     )
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
+    pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
 
     control_rate: float = Field(
         default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, at whose instants u is waited for, Hz"
@@ -206,12 +227,14 @@ class AircraftConfig(NodeConfig):
         for key in ("bias", "drift", "noise", "quantisation"):
             if values := getattr(self.sensors, key):
                 parameters.require_length(f"sensors.{key}", values, list(channels.outputs))
-        require(
-            nanoseconds(self.sensors.delay) % period == 0,
-            "sensors.delay",
-            f"{self.sensors.delay:g} s",
-            f"a whole multiple of 1 / rate ({seconds(period):g} s)",
-        )
+        for key in ("bias", "drift", "noise"):
+            unknown = [name for name in getattr(self.pose, key) if name not in POSE]
+            require(not unknown, f"pose.{key}", ", ".join(unknown), f"some of {', '.join(POSE)}")
+        if self.pose.rate is not None:
+            divide(period_ns(self.pose.rate, "pose.rate"), period, "rate", "1 / pose.rate")
+        for name, delay in (("sensors", self.sensors.delay), ("pose", self.pose.delay)):
+            whole = f"a whole multiple of 1 / rate ({seconds(period):g} s)"
+            require(nanoseconds(delay) % period == 0, f"{name}.delay", f"{delay:g} s", whole)
 
     def _check_airframe(self) -> None:
         for key in ("speed", "altitude"):
@@ -342,6 +365,24 @@ class AircraftConfig(NodeConfig):
             drift=None if drift is None else drift * np.sqrt(1.0 / self.rate),
             quantum=_array(sensors.quantisation, zero_is_none=True),
         )
+
+    def pose_every(self) -> int:
+        """Number of the aircraft's instants from pose to pose."""
+        rate = self.pose.rate
+        return (
+            every(self.rate) if rate is None else divide(period_ns(rate, "pose.rate"), period_ns(self.rate, "rate"), "rate", "")
+        )
+
+    def pose_sensors(self) -> Sensors | None:
+        """The errors of pose as arrays, in the order of `channels.POSE`; None of an ideal pose. Independent of those of y."""
+        pose = self.pose
+        if not (pose.delay or any(pose.bias.values()) or any(pose.drift.values()) or any(pose.noise.values())):
+            return None
+        bias, drift, noise = (
+            np.array([values.get(name, 0.0) for name in POSE]) for values in (pose.bias, pose.drift, pose.noise)
+        )
+        walk = drift * np.sqrt(self.pose_every() / self.rate) if drift.any() else None
+        return Sensors(noise, nanoseconds(pose.delay), 0.0, pose.seed + 2**64, bias, walk)
 
 
 EULER_STATES = ("phi", "theta", "p", "q", "r")

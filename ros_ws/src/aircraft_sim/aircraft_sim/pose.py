@@ -15,7 +15,7 @@ from flight_core.channels import POSE
 from flight_core.vectors import FloatArray, Scalar, array_namespace
 
 RATE = 50.0
-"""Hz, the highest rate of pose: the aircraft publishes it at every k-th of its instants, with the least such k."""
+"""Hz, the highest rate of pose without `pose.rate`: the aircraft publishes at every k-th instant, with the least such k."""
 
 
 def every(rate: float) -> int:

@@ -14,15 +14,19 @@ from aircraft_sim import plant, pose, sensors, truth
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
+from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import divide, period_ns, seconds
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 
 BLOCK = 100  # steps
 POSE_STATES = ("V", "alpha", "beta", "phi", "theta", "q", "r")
 """States of an airframe from which its pose follows."""
+
+WRAPPED = [POSE.index(name) for name in ("phi", "psi")]
+"""Channels of pose within half a turn."""
 
 
 class FlightDynamicsModel(Protocol):
@@ -146,9 +150,13 @@ class Simulator:
         else:
             self._model = StateSpaceModel(parameters)
         self._wind, self._gusts, self._speed = parameters.wind, parameters.gusts, channels.speed
-        self.pose_every = pose.every(parameters.rate)
+        self._pose_every, self._pose_sensors = parameters.pose_every(), parameters.pose_sensors()
+        self._poses: DelayLine = ()
         self._sensors = parameters.sensor_arrays()
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
+        if self._pose_sensors is not None:
+            self.truth_names += tuple(f"noise.pose.{name}" for name in POSE)
+            self._pose_drift, self._pose_error = sensors.initial_drift(self._pose_sensors), np.zeros(len(POSE))
         self._drift = sensors.initial_drift(self._sensors)
         self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
@@ -190,7 +198,24 @@ class Simulator:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
         return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind)
 
+    def poses(self) -> DelayLine:
+        """The poses that arrive at the instant of the last sample, the oldest first, as measured; stamps are flight time."""
+        due, t_ns = self._number % self._pose_every == 0, self._number * self.period_ns
+        if self._pose_sensors is None:
+            return (StampedVector(t_ns, self.pose()),) if due else ()
+        measured = None
+        if due:
+            number = self._number // self._pose_every
+            measured, self._pose_error, self._pose_drift = sensors.measure(
+                number, self.pose(), self._pose_drift, self._pose_sensors
+            )
+            for k in WRAPPED:
+                measured[k] = pose.wrapped(float(measured[k]))
+        self._poses, arrived = sensors.transmit(self._poses, t_ns, measured, self._pose_sensors)
+        return arrived
+
     def truth(self) -> FloatArray:
         """The true values at the instant of the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
-        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error])
+        of_pose = () if self._pose_sensors is None else (self._pose_error,)
+        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error, *of_pose])

@@ -28,6 +28,7 @@ from flight_guidance.modes import (
     Target,
     Vertical,
 )
+from flight_guidance.notices import STALE_TIME
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 
@@ -147,6 +148,7 @@ class Guidance:
         self._state: GuidanceState | None = None
         self._engaged, self._paused, self._begin = True, False, Begin.HOLD
         self._notices = parameters.notices()
+        self._waits_from_ns: int | None = None  # for a pose that is young enough
 
     @property
     def mode(self) -> Mode:
@@ -271,6 +273,14 @@ class Guidance:
         samples = {"y": self._y, "pose": self._pose}
         return {name: seconds(now_ns - sample.stamp_ns) for name, sample in samples.items() if sample is not None}
 
+    def waits(self, now_ns: int) -> str:
+        """Why there is no u_m, once guidance has waited for STALE_TIME for a pose that is young enough; else ""."""
+        since, pose = self._waits_from_ns, self._pose
+        if since is None or pose is None or now_ns - since < nanoseconds(STALE_TIME):
+            return ""
+        age, limit = seconds(now_ns - pose.stamp_ns), seconds(self._params.max_age_ns)
+        return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
+
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """A step at an instant and flight time t; None without fresh y, before the first pose, and while disengaged.
 
@@ -285,7 +295,9 @@ class Guidance:
             return None
         age_ns = now_ns - pose.stamp_ns
         if self._begin is not Begin.NO and age_ns > self._params.max_age_ns:
+            self._waits_from_ns = now_ns if self._waits_from_ns is None else self._waits_from_ns
             return None
+        self._waits_from_ns = None
         y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
         told = self.route.notes if self.route is not None and self._route_waits else ()

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, PoseStamped
@@ -86,7 +87,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
-        self._allowed, self._mode = True, Mode.OFF
+        self._allowed, self._mode, self._waits = True, Mode.OFF, ""
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
             self._inputs = LockstepInputs(y_period_ns, self.period_ns(), self._y.receive, self._pose.receive)
@@ -127,7 +128,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             if y is not None:
                 self._y.accept(y, now_ns)
             for pose in poses:
-                self._pose.accept(pose, now_ns)
+                if pose.value.size:  # one without channels says that no pose of the instant comes
+                    self._pose.accept(pose, now_ns)
             if due and (output := self._step(now_ns, now_ns)) is not None:
                 self._publish(output, now_ns)
             elif due:
@@ -142,6 +144,10 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._target.poll(now_ns, MAX_TARGETS)
         self._take_routes()
         output = self._guidance.step(now_ns, t_ns)
+        waits = self._guidance.waits(now_ns)
+        if waits and not self._waits:
+            self.get_logger().warning(waits)
+        self._waits = waits
         for notice in () if output is None else output.notices:
             self.get_logger().warning(notice)
         if (mode := self._guidance.mode) is not self._mode:
@@ -174,6 +180,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _decode_pose(self, raw: bytes) -> StampedVector:
         """A pose in the order of `channels.POSE`, without sideslip where there is none."""
         sample = self._named.decode(raw)
+        if self.parameters.lockstep and not sample.channels:
+            return StampedVector(sample.stamp_ns, np.array(()), sample.sender)
         values = {"beta": 0.0} | sample.channels
         return StampedVector(sample.stamp_ns, select(channels.POSE, [*values], [*values.values()]), sample.sender)
 
@@ -257,7 +265,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         further: dict[str, object] = {f"age of {name} (s)": f"{age:.4f}" for name, age in ages.items()}
         if (state := self._guidance.state) is not None:
             further |= {"lateral": state.lateral.name, "vertical": state.vertical.name, "leg": state.leg}
-        return LEVELS.get(self._mode, DiagnosticStatus.WARN), SENTENCES[self._mode], further
+        return LEVELS.get(self._mode, DiagnosticStatus.WARN), self._waits or SENTENCES[self._mode], further
 
 
 def _service(answer: Callable[[Any], bool | str]) -> Callable[[Any, Any], Any]:

@@ -16,6 +16,9 @@ from flight_guidance.modes import Lateral
 DWELL = 10.0
 """Time for which a condition lasts before the notice, and ends before a second notice, s."""
 
+STALE_TIME = 2.0
+"""The same for a pose older than its limit, s."""
+
 
 class Notice(NamedTuple):
     """A sentence and the flight time."""
@@ -40,16 +43,16 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
 
 
 class _Lasting:
-    """Whether a condition has lasted for DWELL; due once, and again after the condition has been away for DWELL."""
+    """Whether a condition has lasted for `dwell`; due once, and again after the condition has been away for `dwell`."""
 
-    def __init__(self) -> None:
-        self._holds, self._since, self._said = False, -math.inf, False
+    def __init__(self, dwell: float = DWELL) -> None:
+        self._dwell, self._holds, self._since, self._said = dwell, False, -math.inf, False
 
     def due(self, t: float, *, holds: bool) -> bool:
         """Whether a notice is due at the flight time t, s."""
         if holds != self._holds:
             self._holds, self._since = holds, t
-        if t - self._since < DWELL:
+        if t - self._since < self._dwell:
             return False
         before, self._said = self._said, holds
         return holds and not before
@@ -58,16 +61,18 @@ class _Lasting:
 class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
-    `wind`: guidance.wind, m/s; `largest_wind`: of the airspeed command, m/s, the wind up to which circles fit into the bank.
+    `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed command, m/s, the wind up to
+    which circles fit into the bank.
     """
 
     CHANNELS = (
         *("leg", "missed", "mode.lateral", "track", "V_c", "pose.v_north", "pose.v_east", "wind.north", "wind.east"),
-        *("fence.action", "fence.clearance"),
+        *("fence.action", "fence.clearance", "age.pose"),
     )
 
-    def __init__(self, wind: float, largest_wind: Callable[[float], float]) -> None:
-        self._wind, self._largest_wind = wind, largest_wind
+    def __init__(self, wind: float, max_age: float, largest_wind: Callable[[float], float]) -> None:
+        self._wind, self._max_age, self._largest_wind = wind, max_age, largest_wind
+        self._stale = _Lasting(STALE_TIME)
         self._blown, self._strong, self._leg, self._action = _Lasting(), _Lasting(), 0, 0.0
 
     def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
@@ -80,6 +85,8 @@ class Notices:
             side = "right" if self._action == RIGHT else "left"
             texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
         wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
+        if self._stale.due(t, holds=log["age.pose"] > self._max_age):
+            texts.append(f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s")
         if self._blown.due(t, holds=bool(is_blown_back(log))):
             texts.append(f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of {wind:.1f} m/s")
         if self._strong.due(t, holds=wind > largest):

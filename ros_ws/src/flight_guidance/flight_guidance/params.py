@@ -276,7 +276,7 @@ class GuidanceConfig(NodeConfig):
 
     def notices(self) -> Notices:
         """What the notices of a flight depend on."""
-        return Notices(self.wind, lambda speed: largest_wind(speed, self.wind, self.bank))
+        return Notices(self.wind, self.max_age, lambda speed: largest_wind(speed, self.wind, self.bank))
 
     def climb_limits(self) -> tuple[float, float]:
         """Largest climb and sink rate, m/s: 0.4 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0."""

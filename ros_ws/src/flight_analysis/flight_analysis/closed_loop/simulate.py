@@ -115,17 +115,18 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
                         y = select(scenario.reference_model.outputs, aircraft.outputs, sample.value)
                         with suppress(ChannelError):  # refused, as by the node
                             guidance.take_y(StampedVector(sample.stamp_ns, y), t_ns)
-                if t_ns % (aircraft.pose_every * aircraft.period_ns) == 0:
-                    pose = aircraft.pose()
-                    signals["pose"].add(t_ns, pose)
+                for pose in aircraft.poses():
+                    signals["pose"].add(pose.stamp_ns, pose.value)
                     if guidance is not None:
                         with suppress(ChannelError):
-                            guidance.take_pose(StampedVector(t_ns, pose), t_ns)
+                            guidance.take_pose(pose, t_ns)
                 signals["truth"].add(t_ns, aircraft.truth())
             if t_ns % reference.period_ns == 0:
                 y_m = reference.sample(t_ns // reference.period_ns)
                 signals["y_m"].add(t_ns, y_m)
                 controller.take_y_m(StampedVector(t_ns, select(outputs, scenario.reference_model.outputs, y_m)), t_ns)
+            if guidance is not None and (waits := guidance.waits(t_ns)):
+                raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {waits}")
             if guidance is not None and t_ns % guidance.period_ns == 0 and (guided := guidance.step(t_ns, t_ns)) is not None:
                 signals["u_m"].add(t_ns, guided.u_m)
                 signals["guidance"].add(t_ns, guided.log)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from aircraft_sim.pose import every
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.guided import FlownLeg, flown_legs
 from flight_core.modes import Mode
@@ -146,7 +145,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
     guided = [topics[name] for name in GUIDED if name in topics]
     unguided = bool(guided) and all(topic.expected and not topic.found and not topic.unset for topic in guided)
-    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end))]
+    late = {} if scenario is None else _latest(scenario)
+    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end, late.get(name, 0.0)))]
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
@@ -169,12 +169,13 @@ def _lost_parts(notes: Iterable[str]) -> list[str]:
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
     """The number of samples by topic that the log of a flight should hold, where this is known."""
-    sensors, expected = scenario.aircraft.sensors, {}
+    sensors, pose, expected = scenario.aircraft.sensors, scenario.aircraft.pose, {}
+    delays = {"y": sensors.delay, "pose": pose.delay}
     for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
         first_ns = tape.start_ns
         if not from_start and name in tape:
             first_ns = int(tape[name].stamp_ns[0])
-        delay_ns = nanoseconds(sensors.delay) if name == "y" else 0
+        delay_ns = nanoseconds(delays.get(name, 0.0))
         count = max((end_ns - delay_ns - first_ns) // step_ns + 1, 0)
         if name == "y" and sensors.dropout:
             mean = count * (1.0 - sensors.dropout)
@@ -185,7 +186,8 @@ def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, 
     ticks, engaged = _ticks(tape, period_ns(scenario.controller.rate, "controller.rate"), end_ns)
     expected |= dict.fromkeys(TICKS, ticks)
     if scenario.guidance is not None:
-        steps = max(math.floor(engaged * scenario.guidance.rate / scenario.controller.rate) - 2, 0)
+        before_pose = math.ceil(pose.delay * scenario.guidance.rate)
+        steps = max(math.floor(engaged * scenario.guidance.rate / scenario.controller.rate) - 2 - before_pose, 0)
         expected |= dict.fromkeys(GUIDED, steps)
     return expected
 
@@ -195,7 +197,7 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
     periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
     if simulated:
         y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
-        of_aircraft = {"y": y_ns, "truth": y_ns, "pose": every(scenario.aircraft.rate) * y_ns}
+        of_aircraft = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
         periods |= {name: step for name, step in of_aircraft.items() if name in {"y", *tape.signals, *tape.recording}}
     return periods
 
@@ -245,8 +247,14 @@ def _topic(tape: Tape, name: str, expected: int | None, end_ns: int) -> TopicAcc
     )  # fmt: skip
 
 
-def _lack(name: str, topic: TopicAccount, end: float) -> str:
-    """What a topic lacks, as a sentence without a verb; empty for a whole topic."""
+def _latest(scenario: Scenario) -> dict[str, float]:
+    """How long before the end the last sample of a topic may be stamped, s: the delay, and the period of a slow pose."""
+    aircraft = scenario.aircraft
+    return {"y": aircraft.sensors.delay, "pose": aircraft.pose.delay + aircraft.pose_every() / aircraft.rate}
+
+
+def _lack(name: str, topic: TopicAccount, end: float, late: float) -> str:
+    """What a topic lacks, as a sentence without a verb; empty for a whole topic. `late`: of the last sample, s."""
     facts = []
     if topic.step and topic.last is not None:
         facts.append(f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s")
@@ -257,7 +265,7 @@ def _lack(name: str, topic: TopicAccount, end: float) -> str:
     missing = topic.expected is not None and topic.found + topic.unsent < WHOLE * topic.expected
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
-        if tail > min((1.0 - WHOLE) * end, SILENCE):
+        if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
             facts.append(f"ends at t = {topic.last:.3f} of {end:.3f} s")
         if topic.gap is not None and topic.gap_at is not None and topic.gap > SILENCE:
             facts.append(f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s")
