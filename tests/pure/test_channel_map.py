@@ -39,6 +39,7 @@ MOTION = {"p": 0.3, "q": 0.2, "r": 0.1}  # the expected channels for each map
 RATES = {
     "ardupilot": Message(angular_velocity=Message(x=0.3, y=0.2, z=0.1)),
     "ardupilot_2024": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
+    "ardupilot_mavlink": Message(rollspeed=0.3, pitchspeed=0.2, yawspeed=0.1),
     "mavros": Message(angular_velocity=FLU),
     "px4": Message(angular_velocity=FRD),
     "rosflight": Message(p=0.3, q=0.2, r=0.1, va=27.0),
@@ -46,6 +47,7 @@ RATES = {
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
     "ardupilot": Message(true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
     "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
+    "ardupilot_mavlink": Message(airspeed=27.0),
     "mavros": Message(airspeed=27.0),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
     "rosflight": RATES["rosflight"],
@@ -53,11 +55,14 @@ AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
 SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
     "ardupilot": {"axes[1]": 0.1 / 0.523599, "axes[2]": 0.2, "axes[0]": 0.1 / 0.523599, "axes[3]": 0.1 / 0.523599},
     "px4": {"torque.xyz[1]": 0.1 / 0.523599, "thrust.xyz[0]": 0.6, "torque.xyz[0]": 0.1 / 0.523599, "torque.xyz[2]": 0.190986},
+    "ardupilot_mavlink": {"chan2_raw": 1595.493, "chan3_raw": 1600.0, "chan1_raw": 1595.493, "chan4_raw": 1595.493},
     "mavros": {"channels[1]": 1595.493, "channels[2]": 1600.0, "channels[0]": 1595.493, "channels[3]": 1595.493},
     "rosflight": {"u[4]": -0.1 / 0.523599, "u[0]": 0.6, "u[3]": 0.1 / 0.523599, "u[5]": -0.1 / 0.523599},
 }
 SENT["ardupilot_2024"] = SENT["ardupilot"]
-RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "px4": None, "mavros": 0.0, "rosflight": 0.0}
+RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "px4": None} | dict.fromkeys(
+    ("ardupilot_mavlink", "mavros", "rosflight"), 0.0
+)
 
 
 @pytest.mark.parametrize("name", MAPS)
@@ -120,6 +125,13 @@ def test_each_input_of_map_states_own_trim_and_sign(name: str) -> None:
 
 MEASURED = {  # Hz, as the stack receives them from PX4 1.16.0 and ArduPlane 4.8.0-dev in SITL
     "px4": {"vehicle_odometry": 99.2, "airspeed_validated": 9.9, "vehicle_status_v1": 2.0},
+    "ardupilot_mavlink": {
+        "ATTITUDE": 40.0,
+        "VFR_HUD": 20.0,
+        "LOCAL_POSITION_NED": 20.0,
+        "HEARTBEAT": 5.0,
+        "EXTENDED_SYS_STATE": 2.0,
+    },
     "ardupilot": {"imu/experimental/data": 139.0, "airspeed": 28.4, "pose/filtered": 28.4, "rc": 9.6, "status": 1.9},
 }
 
@@ -131,7 +143,9 @@ def test_lost_message_does_not_end_engagement(name: str) -> None:
     rows = (*channel_map.outputs.values(), *channel_map.pose.values(), *channel_map.trims.values())
     ages = [(row.topic, row.max_age) for row in rows] + [(row.topic, row.max_age) for row in channel_map.conditions.values()]
     for topic, rate in MEASURED[name].items():
-        found = [age for full, age in ages if full.removeprefix("/fmu/out/").removeprefix("/ap/") == topic]
+        found = [
+            age for full, age in ages if full.removeprefix("/fmu/out/").removeprefix("/ap/").removeprefix("mavlink/") == topic
+        ]
         assert found, topic
         assert min(found) > 2.0 / rate, topic
 
@@ -337,7 +351,7 @@ def test_moved_map_named_with_file(name: str) -> None:
 
 
 def test_a_missing_map_is_one_sentence() -> None:
-    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, px4, or the path of a channel map"
+    sentence = r"bridge\.map: found 'nowhere', expected one of ardupilot, ardupilot_mavlink, px4, or the path of a channel map"
     with pytest.raises(ParameterError, match=sentence):
         BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):

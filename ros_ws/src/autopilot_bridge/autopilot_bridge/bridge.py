@@ -163,7 +163,7 @@ class Bridge:
         reading = self._conditions.get(name)
         if stale := _staleness(row.topic, reading, row.max_age, now_ns):
             return _sentence({f"{name}: {row.field}": stale})
-        holds = reading is not None and reading.value in row.one_of
+        holds = reading is not None and row.masked(reading.value) in row.one_of
         return "" if holds or reading is None else f"{row.sentence} ({row.field} is {reading.value:g})"
 
     def _is_active(self, name: str, now_ns: int) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -18,9 +19,12 @@ from rclpy.task import Future
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+from autopilot_bridge import mavlink_link
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
+from autopilot_bridge.mavlink_link import MavlinkPublisher, MavlinkReader
 from autopilot_bridge.params import (
+    MAVLINK,
     BridgeConfig,
     ConditionRow,
     InputRow,
@@ -74,12 +78,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
         rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
-        self._readers: list[tuple[PolledSubscription, list[NamedRow]]] = []
+        self._link = None if self._map.link is None else mavlink_link.Link(self._map.link)
+        self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}  # what comes over MAVLink, as named vectors
+        self._readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
-            kind = message_type(rows[0][1].type)
+            kind = _message_type(rows[0][1].type)
             for name, row in rows:
                 _require_field(kind(), name, row)
-            self._readers.append((self.subscribe(Topic(topic, kind, foreign=True), _qos(self._map.topics[topic])), rows))
+            self._readers.append((self._reader(Topic(topic, kind, foreign=True)), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
         self._u = self.receive(U, decode, self._bridge.take_u, max_age_ns=self._bridge.max_u_age_ns, lock=self._bridge.u_lock)
@@ -101,13 +107,22 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._activation: Any = None  # the pending activation of the controller
         self._activation_ns = 0
         self._awaits_controller = False  # engaged before the service of the controller was found
+        if self._link is not None:
+            self._link.start()
         self.get_logger().info(
             f"map {self._map.name}: "
             + ("dry run, nothing is sent" if dry_run else f"disengaged, waiting for {self.get_name()}/engage")
         )
 
+    def _reader(self, topic: Topic) -> PolledSubscription | MavlinkReader:
+        if self._link is None or not topic.name.startswith(f"{MAVLINK}/"):
+            return self.subscribe(topic, _qos(self._map.topics[topic.name]))
+        reader = MavlinkReader(self._link, topic)
+        self._recorded[topic.name] = self.advertise(Topic(topic.name, JointState)), self.encoder(reader.fields)
+        return reader
+
     def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
-        message = message_type(row.type)()
+        message = _message_type(row.type)()
         rows = [(number, channel) for number, channel in enumerate(self._map.inputs.values()) if channel.message == name]
         try:
             for path, value in row.values.items():
@@ -120,6 +135,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 get_field(message, "header.stamp")
         except ChannelError as error:
             raise ParameterError(f"map {self._map.name}: messages.{name} of type {row.type}: {error}") from None
+        if self._link is not None and row.topic.startswith(f"{MAVLINK}/"):
+            return OutgoingMessage(MavlinkPublisher(self._link, row.topic), message, row, rows)
         publisher = self.create_publisher(type(message), row.topic, _qos(self._map.topics[row.topic]))
         return OutgoingMessage(publisher, message, row, rows)
 
@@ -167,14 +184,27 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._bridge.disengage(f"the bridge did not run for {seconds(pause_ns):.2f} s", now_ns)
 
     def _read(
-        self, subscription: PolledSubscription, rows: list[NamedRow], raw: bytes, arrived_ns: int, now_ns: int, step_ns: int
+        self,
+        subscription: PolledSubscription | MavlinkReader,
+        rows: list[NamedRow],
+        raw: Any,
+        arrived_ns: int,
+        now_ns: int,
+        step_ns: int,
     ) -> None:
         """Give the fields of a message to the bridge. The system clock, of which its stamps are, is ahead by `step_ns`."""
-        try:
-            message = deserialize_message(raw, subscription.topic.type)
-        except DeserializationError as error:
-            self.refusals.add(subscription, "malformed", " ".join(str(error).split()))
-            return
+        if isinstance(subscription, MavlinkReader):
+            message = raw
+            publish, encoder = self._recorded[subscription.topic.name]
+            publish(
+                encoder.encode(arrived_ns, np.array([getattr(raw, field) for field in subscription.fields], dtype=np.float64))
+            )
+        else:
+            try:
+                message = deserialize_message(raw, subscription.topic.type)
+            except DeserializationError as error:
+                self.refusals.add(subscription, "malformed", " ".join(str(error).split()))
+                return
         for name, row in rows:
             try:
                 if isinstance(row, WatchedRow):
@@ -276,8 +306,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._bridge.stale(now_ns)
         for subscription, rows in self._readers:
-            if any(name in stale for name, row in rows if isinstance(row, MeasuredRow)):
+            is_stale = any(name in stale for name, row in rows if isinstance(row, MeasuredRow))
+            if is_stale and isinstance(subscription, PolledSubscription):
                 self.warn_no_publisher(subscription)
+        if self._link is not None and (problem := self._link.problem()):
+            self.get_logger().warning(f"link: {problem}", throttle_duration_sec=10.0)
         if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u.subscription)
 
@@ -295,8 +328,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         )
         raise FlightEnded(f"no y after {limit:g} s: {'; '.join(found)}")
 
-    def _cause(self, subscription: PolledSubscription) -> str:
+    def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""
+        if isinstance(subscription, MavlinkReader):
+            refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
+            return next(filter(None, (subscription.link.problem(subscription.message_name), *refused)), "no such message comes")
         publishers = self.get_publishers_info_by_topic(subscription.name)
         if not publishers:
             profile = os.environ.get(PROFILE_VARIABLE, "")
@@ -314,6 +350,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)
             for outgoing_message in self._outgoing.values()
+            if not isinstance(outgoing_message.publisher, MavlinkPublisher)
         )
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
@@ -326,17 +363,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
         read = {
             subscription.name
             for subscription, rows in self._readers
-            if not all(isinstance(row, OverrideRow) for _, row in rows)
+            if isinstance(subscription, PolledSubscription) and not all(isinstance(row, OverrideRow) for _, row in rows)
         }
-        setpoints = {self._outgoing[row.message].publisher.topic_name for row in self._map.inputs.values()}
+        publishers = [self._outgoing[row.message].publisher for row in self._map.inputs.values()]
+        setpoints = {publisher.topic_name for publisher in publishers if not isinstance(publisher, MavlinkPublisher)}
         own = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())  # two messages may share a topic
         counts = {topic: self.count_publishers(topic) - own[topic] for topic in sorted(read | setpoints)}
-        self._bridge.conflict = "; ".join(
+        conflicts = [
             f"{topic} has {count} publishers{' beside this bridge' if topic in setpoints else ''}, expected "
             f"{'none' if topic in setpoints else 'the autopilot alone'}"
             for topic, count in counts.items()
             if count > (topic not in setpoints)
-        )
+        ]
+        self._bridge.conflict = "; ".join(filter(None, [*conflicts, "" if self._link is None else self._link.conflict]))
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         bridge, now_ns = self._bridge, self.now_ns()
@@ -346,12 +385,13 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return level, sentence, {"phase": bridge.phase.name, "map": self._map.name, "would refuse": refusal or "nothing"}
 
     def close(self) -> None:
-        if self._bridge.phase is Phase.DISENGAGED or self._map.silence.release == 0.0:
-            return
-        self._bridge.disengage("bridge shut down", self.now_ns())
-        for _ in range(RELEASES_AT_SHUTDOWN):
-            self._send(self.now_ns(), NANOSECONDS)  # this slack makes every message due
-            time.sleep(0.01)
+        if self._bridge.phase is not Phase.DISENGAGED and self._map.silence.release > 0.0:
+            self._bridge.disengage("bridge shut down", self.now_ns())
+            for _ in range(RELEASES_AT_SHUTDOWN):
+                self._send(self.now_ns(), NANOSECONDS)  # this slack makes every message due
+                time.sleep(0.01)
+        if self._link is not None:
+            self._link.close()
 
 
 class OutgoingMessage:
@@ -376,6 +416,12 @@ class OutgoingMessage:
             stamp.sec, stamp.nanosec = divmod(now_ns, NANOSECONDS)
         self.publisher.publish(self._message)
         self._sent_ns = now_ns
+
+
+def _message_type(name: str) -> Any:
+    """The class of a type of a map, of a message package or of MAVLink."""
+    package, _, kind = name.split("/")
+    return mavlink_link.message_type(kind) if package == MAVLINK else message_type(name)
 
 
 def _qos(row: QosRow) -> QoSProfile:

@@ -18,6 +18,8 @@ from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numb
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
 
+MAVLINK = "mavlink"  # the package of the types of MAVLink messages, and the begin of their topics
+
 Motion = Literal[
     "nose up",
     "nose down",
@@ -40,6 +42,7 @@ Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"]
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
+SystemId = Annotated[int, Field(ge=1, le=255)]
 Raw = Annotated[float, Field(allow_inf_nan=True)]
 Range = tuple[Raw, Raw]
 Limits = tuple[float, float]
@@ -137,6 +140,11 @@ class WatchedRow(Config):
     type: MessageType = Field(description="its type, package/msg/Type")
     field: str = Field(description="the path of the field")
     source: str = Field(min_length=1, description="where the row is from")
+    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
+
+    def masked(self, raw: float) -> float:
+        """The value of the bits that count."""
+        return raw if self.bits is None else float(int(raw) & self.bits)
 
 
 class ConditionRow(WatchedRow):
@@ -162,19 +170,15 @@ class OverrideRow(WatchedRow):
     moved: Positive | None = Field(
         default=None, description="the override is active where the field has moved by more than this since engagement"
     )
-    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
     max_age: Positive = Field(default=1.0, description="the age above which the override is not active any more, s")
     transmitter: bool = Field(default=True, description="whether the override has no effect without the pilot's transmitter")
 
     def is_active(self, raw: float, at_engagement: float | None) -> bool:
         """Whether the override is active. `at_engagement` is its value at engagement; None where it is not engaged."""
-        raw = self._masked(raw)
+        raw = self.masked(raw)
         if self.moved is not None:
-            return at_engagement is not None and abs(raw - self._masked(at_engagement)) > self.moved
+            return at_engagement is not None and abs(raw - self.masked(at_engagement)) > self.moved
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
-
-    def _masked(self, raw: float) -> float:
-        return raw if self.bits is None else float(int(raw) & self.bits)
 
 
 class QosRow(Config):
@@ -183,6 +187,21 @@ class QosRow(Config):
     reliability: Literal["reliable", "best_effort"]
     durability: Literal["volatile", "transient_local"]
     depth: Annotated[int, Field(ge=1, le=1000)]
+
+
+class LinkConfig(Config):
+    """A MAVLink link, for rows with the type mavlink/msg/NAME."""
+
+    url: str = Field(
+        pattern=r"^((udpin|udpout|tcp|tcpin):[^:]+:\d+|/dev/\S+)$",
+        description="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device",
+    )
+    baud: Annotated[int, Field(gt=0)] = Field(default=57600, description="the rate of a serial device, bit/s")
+    system: SystemId = Field(default=1, description="the autopilot's system, MAV_SYSID; its component is 1")
+    source_system: SystemId = Field(
+        default=255, description="the system of the bridge: ArduPilot takes RC overrides of MAV_GCS_SYSID alone, 255 by default"
+    )
+    rates: dict[str, Rate] = Field(default={}, description="requested rates by message, Hz")
 
 
 class SilenceConfig(Config):
@@ -226,7 +245,8 @@ class ChannelMap(Config):
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
     conditions: dict[str, ConditionRow] = Field(default={}, description="the conditions of an engagement")
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
-    topics: dict[str, QosRow] = Field(description="the quality of service by topic")
+    topics: dict[str, QosRow] = Field(default={}, description="the quality of service by topic; none for MAVLink")
+    link: LinkConfig | None = Field(default=None, description="the MAVLink link of rows with a type mavlink/msg/NAME")
 
     def _check(self) -> None:
         outputs, messages = ", ".join(self.outputs), ", ".join(self.messages)
@@ -275,11 +295,31 @@ class ChannelMap(Config):
     def _check_topics(self) -> None:
         types: dict[str, str] = {}
         for key, topic, kind in self.used_topics():
-            require(topic in self.topics, f"{key}.topic", topic, "one with a quality of service in `topics`")
+            if kind.startswith(f"{MAVLINK}/"):
+                self._check_mavlink(key, topic, kind)
+            else:
+                require(topic in self.topics, f"{key}.topic", topic, "one with a quality of service in `topics`")
             other = types.setdefault(topic, kind)
             require(other == kind, f"{key}.type", kind, f"{other}, as elsewhere in this map for {topic}")
         for topic in self.topics:
             require(topic in types, f"topics.{topic}", "a topic", "one that a row uses")
+
+        rates = {} if self.link is None else self.link.rates
+        for name in rates:
+            require(f"{MAVLINK}/{name}" in types, f"link.rates.{name}", "a message", "one that a row uses")
+
+    def _check_mavlink(self, key: str, topic: str, kind: str) -> None:
+        name = kind.rpartition("/")[2]
+        require(self.link is not None, "link", "none", f"one, for {key} of type {kind}")
+        require(topic == f"{MAVLINK}/{name}", f"{key}.topic", topic, f"{MAVLINK}/{name}, for its type {kind}")
+
+    @property
+    def recorded_topics(self) -> list[str]:
+        """The topics that the log has: those with a quality of service, and what comes over MAVLink."""
+        read = [
+            row.topic for named in self._readers().values() for row in named.values() if row.topic.startswith(f"{MAVLINK}/")
+        ]
+        return [*self.topics, *dict.fromkeys(read)]
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
         """The sections whose rows read a field of a topic."""

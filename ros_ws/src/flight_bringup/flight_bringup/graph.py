@@ -69,7 +69,7 @@ class Autopilot(NamedTuple):
     @property
     def topics(self) -> list[str]:
         """The topics to record: topics of the map, the pose of a map with a pose, WOULD_SEND, ENGAGEMENT."""
-        return [*self.channel_map.topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND, ENGAGEMENT]
+        return [*self.channel_map.recorded_topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND, ENGAGEMENT]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:

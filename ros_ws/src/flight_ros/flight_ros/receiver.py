@@ -15,6 +15,7 @@ from flight_core.vectors import ChannelError, require_not_future, require_not_ol
 from flight_ros.messages import sender_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
+from flight_ros.topics import Topic
 
 MAX_SIZE = 16_384
 """Bytes of a message of named vectors. `internals` of four channels with an observer, the longest of a flight, has 1,844."""
@@ -43,6 +44,13 @@ def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
         raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
 
 
+class Source(Protocol):
+    """Where samples come from: the topic, and its full name."""
+
+    topic: Topic
+    name: str
+
+
 class Refusals:
     """The refused samples of a node."""
 
@@ -53,7 +61,7 @@ class Refusals:
         self._throttle = Throttle(LOG_PERIOD_NS)
         self._conflict = ""
 
-    def add(self, subscription: PolledSubscription, reason: str, sentence: str) -> None:
+    def add(self, subscription: Source, reason: str, sentence: str) -> None:
         """Count a refused sample, and log at most one in 2 s for each topic and reason.
 
         A conflicting publisher is an ERROR, here and in the diagnostics.

@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A MAVLink link to an autopilot, as a source and a sink of messages of a channel map.
+
+A thread receives, sends a heartbeat each second and requests the rates of messages. Source: MAVLink guide (heartbeat protocol,
+SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as pymavlink has them.
+"""
+
+import time
+from collections import deque
+from threading import Event, Lock, Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from autopilot_bridge.params import MAVLINK, LinkConfig
+from flight_core.installation import require_package
+from flight_core.parameters import ParameterError
+
+DIALECT = "ardupilotmega"
+AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # MAV_CMD, MAV_RESULT
+GCS, INVALID = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
+BEAT = 1.0  # s; ArduPilot's FS_GCS_ENABL waits 5 s for the next one
+ANSWER = 1.0  # s, for an answer to a request, which is then repeated
+SILENCE = 3.0  # s without the autopilot, after which all rates are requested again: it may have started again
+MEASURED = 5.0  # s over which the rate of a message is measured
+GRANTED = 0.7  # of a requested rate: below, the link or the autopilot does not keep up
+QUEUE = 256  # messages between two ticks
+RETRIES = 2  # of a connection by TCP, 1 s each
+
+
+class ReceivedMessage(NamedTuple):
+    """A message and its arrival, ns of the system clock."""
+
+    message: Any
+    received_ns: int
+
+
+def message_type(name: str) -> Any:
+    """A class with the numeric fields of a message, all zero; `fields` has the names. Raises ParameterError for no message."""
+    require_package("pymavlink")
+    from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
+
+    of_message = dialect.mavlink_map.get(getattr(dialect, f"MAVLINK_MSG_ID_{name}", None))
+    if of_message is None:
+        raise ParameterError(f"{MAVLINK}/msg/{name}: found no message {name}, expected one of the dialect {DIALECT}")
+    pairs = zip(of_message.fieldnames, of_message.fieldtypes, of_message.array_lengths, strict=True)
+    zeros = {field: _zero(kind) for field, kind, length in pairs if length == 0 and kind != "char"}
+
+    def init(self: Any) -> None:
+        vars(self).update(zeros)
+
+    return type(name, (), {"__init__": init, "fields": tuple(zeros), "packed": of_message})
+
+
+def _zero(kind: str) -> Any:
+    return 0.0 if kind in {"float", "double"} else np.dtype(kind.partition("_t")[0]).type(0)
+
+
+class Link:
+    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none."""
+
+    def __init__(self, config: LinkConfig) -> None:
+        require_package("pymavlink")
+        from pymavlink import mavutil  # noqa: PLC0415 - an extra
+
+        self._config = config
+        try:
+            self._connection: Any = mavutil.mavlink_connection(
+                config.url,
+                baud=config.baud,
+                source_system=config.source_system,
+                dialect=DIALECT,
+                autoreconnect=True,
+                retries=RETRIES,
+                force_connected=True,  # a serial device that comes later
+            )
+        except (OSError, ValueError) as error:
+            expected = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device"
+            raise ParameterError(
+                f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
+            ) from None
+        self.conflict = ""
+        self._queues: dict[str, deque[ReceivedMessage]] = {}
+        self._heard: dict[str, deque[float]] = {}  # instants of messages by name, of the last MEASURED seconds
+        self._to_request = dict(config.rates)
+        self._requested: tuple[str, float] | None = None  # the message whose interval was requested, and when
+        self._denied: dict[str, str] = {}
+        self._beat, self._alive, self._began = 0.0, 0.0, time.monotonic()
+        self._sending, self._closed = Lock(), Event()
+        self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
+
+    def listen(self, name: str) -> deque[ReceivedMessage]:
+        """The queue in which messages of a name arrive."""
+        return self._queues.setdefault(name, deque(maxlen=QUEUE))
+
+    def start(self) -> None:
+        """Begin to receive, after the last `listen`."""
+        self._thread.start()
+
+    def send(self, message: Any) -> None:
+        """Send a message of `message_type`, to the autopilot of the configuration."""
+        fields = message.packed.fieldnames
+        values = {field: getattr(message, field) for field in fields}
+        values |= {"target_system": self._config.system, "target_component": AUTOPILOT}
+        self._send(message.packed(*(values[field] for field in fields)))
+
+    def close(self) -> None:
+        """End the thread and the connection."""
+        self._closed.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+        self._connection.close()
+
+    def problem(self, name: str = "") -> str:
+        """What is wrong with the link, or with a message of it."""
+        now = time.monotonic()
+        if now - max(self._alive, self._began) > SILENCE:
+            return f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
+        denied = [sentence for at, sentence in self._denied.items() if at == name or not name]
+        return "; ".join([*denied, *self._slow(now, name)])
+
+    def _slow(self, now: float, name: str) -> list[str]:
+        """The messages that come at less than their requested rates."""
+        if now - self._began < 2.0 * MEASURED or self._to_request:
+            return []
+        slow = []
+        for at, rate in self._config.rates.items():
+            found = sum(now - instant < MEASURED for instant in tuple(self._heard.get(at, ()))) / MEASURED
+            if name in {"", at} and at not in self._denied and found < GRANTED * rate:
+                slow.append(f"{at} comes at {found:.3g} Hz, requested are {rate:g} Hz")
+        return slow
+
+    def _send(self, message: Any) -> None:
+        with self._sending:
+            try:
+                self._connection.mav.send(message)
+            except OSError:
+                return  # the cable is out: the ages of what is received say so
+
+    def _receive(self) -> None:
+        while not self._closed.is_set():
+            now = time.monotonic()
+            if now - self._beat >= BEAT:
+                self._beat = now
+                self._send(self._connection.mav.heartbeat_encode(GCS, INVALID, 0, 0, 0))
+            self._request(now)
+            try:
+                message = self._connection.recv_match(blocking=True, timeout=0.1)
+            except OSError:
+                self._closed.wait(0.1)
+                continue
+            if message is not None:
+                self._take(message, time.time_ns())
+
+    def _take(self, message: Any, received_ns: int) -> None:
+        name, now = message.get_type(), time.monotonic()
+        if message.get_srcSystem() == self._config.source_system:
+            self.conflict = (
+                f"another sender on {self._config.url} has system {self._config.source_system} too, and the autopilot takes its"
+                " RC overrides: give it another number"
+            )
+        if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
+            return
+        if now - self._alive > SILENCE:
+            self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
+        self._alive = now
+        if name == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL:
+            self._answered(message.result)
+        if name in self._config.rates:
+            instants = self._heard.setdefault(name, deque())
+            instants.append(now)
+            while now - instants[0] > MEASURED:
+                instants.popleft()
+        if (queue := self._queues.get(name)) is not None:
+            queue.append(ReceivedMessage(message, received_ns))
+
+    def _request(self, now: float) -> None:
+        """Request one rate after another: an answer does not say to which message it belongs."""
+        if not self._to_request or now - self._alive > SILENCE or (self._requested and now - self._requested[1] < ANSWER):
+            return
+        name, rate = next(iter(self._to_request.items()))
+        identity = message_type(name).packed.id
+        self._requested = name, now
+        self._send(
+            self._connection.mav.command_long_encode(
+                self._config.system, AUTOPILOT, SET_MESSAGE_INTERVAL, 0, identity, 1e6 / rate, 0, 0, 0, 0, 0
+            )
+        )
+
+    def _answered(self, result: int) -> None:
+        if self._requested is None:
+            return
+        name, self._requested = self._requested[0], None
+        rate = self._to_request.pop(name, 0.0)
+        if result != ACCEPTED:
+            self._denied[name] = (
+                f"the autopilot denied {rate:g} Hz of {name} (MAV_RESULT {result}): ArduPilot grants 0.8 SCHED_LOOP_RATE"
+            )
+
+
+class MavlinkReader:
+    """A message of a link in the place of a subscription."""
+
+    def __init__(self, link: Link, topic: Any) -> None:
+        self.link, self.topic, self.name = link, topic, str(topic.name)
+        self.message_name, self.fields = topic.type.__name__, tuple(topic.type.fields)
+        self._queue = link.listen(self.message_name)
+
+    def take(self) -> list[ReceivedMessage]:
+        """The messages since the last call, oldest first."""
+        return [self._queue.popleft() for _ in range(len(self._queue))]
+
+
+class MavlinkPublisher:
+    """A message of a link in the place of a publisher."""
+
+    def __init__(self, link: Link, topic: str) -> None:
+        self._link, self.topic_name = link, topic
+
+    def publish(self, message: Any) -> None:
+        """Send a message."""
+        self._link.send(message)

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The MAVLink link over UDP, against a peer that is made with pymavlink alone."""
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from tests.maps import named_map
+
+from autopilot_bridge.channel_map import set_field
+from autopilot_bridge.mavlink_link import Link, message_type
+from autopilot_bridge.params import ChannelMap, LinkConfig
+from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError
+
+pytestmark = pytest.mark.package("autopilot_bridge")
+
+DENIED = 2  # MAV_RESULT_DENIED, which ArduPilot answers to a rate that it does not grant
+PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
+
+
+class Peer:
+    """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
+
+    def __init__(self, port: int, system: int = 1) -> None:
+        self.connection: Any = mavutil.mavlink_connection(
+            f"udpout:127.0.0.1:{port}", source_system=system, source_component=1, dialect="ardupilotmega"
+        )
+        self.requested: dict[int, float] = {}  # Hz by message
+
+    def beat(self) -> None:
+        """A heartbeat, armed and in MANUAL."""
+        time.sleep(0.01)
+        self.connection.mav.heartbeat_send(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4)
+
+    def answer(self) -> Any:
+        """The next message, after an answer where it is a request."""
+        message = self.connection.recv_match(blocking=True, timeout=0.05)
+        if message is not None and message.get_type() == "COMMAND_LONG":
+            self.requested[int(message.param1)] = 1e6 / message.param2
+            result = 0 if 1e6 / message.param2 <= 40.0 else DENIED
+            self.connection.mav.command_ack_send(message.command, result)
+        return message
+
+
+class Ends(NamedTuple):
+    """Makes a link that listens on a free port, and peers of it."""
+
+    link: Callable[..., tuple[Link, int]]
+    peer: Callable[..., Peer]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    links: list[Link] = []
+    peers: list[Peer] = []
+
+    def make(**rates: float) -> tuple[Link, int]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        links.append(Link(LinkConfig(url=f"udpin:127.0.0.1:{port}", rates=rates)))
+        return links[-1], port
+
+    def peer(port: int, system: int = 1) -> Peer:
+        peers.append(Peer(port, system))
+        return peers[-1]
+
+    yield Ends(make, peer)
+    for made in links:
+        made.close()
+    for end in peers:
+        end.connection.close()
+
+
+def until(condition: Callable[[], object], each: Callable[[], object]) -> None:
+    """Call `each` until the condition holds."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        each()
+
+
+def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) -> None:
+    made, port = ends.link(ATTITUDE=50.0, VFR_HUD=20.0)
+    made.start()
+    peer = ends.peer(port)
+    peer.beat()
+    until(lambda: made.problem("ATTITUDE") and len(peer.requested) == 2, peer.answer)
+    assert peer.requested == {
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: pytest.approx(50.0),
+        mavlink.MAVLINK_MSG_ID_VFR_HUD: pytest.approx(20.0),
+    }
+    assert made.problem() == ("the autopilot denied 50 Hz of ATTITUDE (MAV_RESULT 2): ArduPilot grants 0.8 SCHED_LOOP_RATE")
+    assert made.problem("VFR_HUD") == ""
+
+
+def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others_do_not(ends: Ends) -> None:
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    before = time.time_ns()
+    ends.peer(port, system=2).connection.mav.attitude_send(1, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9)
+    peer = ends.peer(port)
+
+    def send() -> None:
+        peer.beat()
+        peer.connection.mav.attitude_send(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+
+    until(lambda: queue, send)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.5)] * len(queue)
+    assert before <= queue[0].received_ns <= time.time_ns()
+    assert made.conflict == ""
+
+
+def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    peer = ends.peer(port)
+    peer.beat()
+    message = message_type("RC_CHANNELS_OVERRIDE")()
+    for path, value in {**named_map("ardupilot_mavlink").messages["override"].values, "chan2_raw": 1612.4}.items():
+        set_field(message, path, value)
+    taken: list[Any] = []
+
+    def take() -> None:
+        made.send(message)
+        if (received := peer.answer()) is not None and received.get_type() == "RC_CHANNELS_OVERRIDE":
+            taken.append(received)
+
+    until(lambda: taken, take)
+    sent = taken[0]
+    assert (sent.get_srcSystem(), sent.target_system, sent.target_component) == (255, 1, 1)
+    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]  # released, set, as is, as is
+
+
+def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    other = ends.peer(port, system=255)
+    until(lambda: made.conflict, other.beat)
+    assert "another sender" in made.conflict
+    assert "system 255 too" in made.conflict
+
+
+def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, port = ends.link()
+    now = time.monotonic
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: now() + 4.0)
+    assert made.problem() == f"no message of system 1 over udpin:127.0.0.1:{port} for 3 s"
+
+
+def test_wrong_map_or_message_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"):
+        message_type("ALTITUD")
+    with pytest.raises(ChannelError, match="chan1_raw cannot be 70000"):
+        set_field(message_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
+    content = named_map("ardupilot_mavlink").model_dump()
+    for changes, sentence in (
+        ({"link": None}, "link: found none, expected one, for outputs.q of type mavlink/msg/ATTITUDE"),
+        ({"link": {**content["link"], "url": "serial"}}, "link.url: found 'serial'"),
+        ({"link": {**content["link"], "rates": {"ATTITUD": 40.0}}}, r"link\.rates\.ATTITUD: found a message"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            ChannelMap.validate_mapping(content | changes, "map")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves its socket open
+def test_address_that_cannot_be_opened_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match=r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"):
+        Link(LinkConfig(url="udpin:192.0.2.1:14550"))  # an address of documentation, RFC 5737
