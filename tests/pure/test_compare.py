@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from tests.closed_loop import error
 from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
@@ -18,16 +19,18 @@ from control_laws.catalogue import LAWS, Gains, initial_gains
 from flight_analysis.closed_loop.margins import margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.gain_selection import section_yaml
 from flight_analysis.design.requirement import REQUIREMENT, least_fraction
 from flight_analysis.metrics import error_metrics
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, law_comparison, registered_laws, tuned_gains, tuning
+from flight_campaign import fleet, law_comparison, registered_laws, tuned_controller, tuned_gains, tuning
 from flight_campaign.fleet import FleetResult
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
+from rise_di_controller.control_law import Measurements
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.margins import Margins
 
@@ -381,3 +384,31 @@ def test_law_that_measures_more_than_y_has_no_margins() -> None:
     without = {name for name, law in LAWS.items() if law.measurements == "y" and not has_margins(law)}
     assert without == {"rise_implicit", "twisting"}
     assert not has_margins(LAWS["indi"])
+
+
+@pytest.mark.parametrize("name", tuned_controller.REGISTERED)
+def test_written_controller_is_the_law_that_was_tuned(name: str, short: Benchmark) -> None:
+    result = tuned_gains.load(tuned_gains.TUNED / "osprey_servo.yaml")[name]["gust_turbulence"]
+    controller = tuned_controller.tuned_controller(name, result, short)
+    text = section_yaml(controller, short.scenario.aircraft.load()[0], None, "by a test", {})
+    read = AnyLaw.validate_mapping(yaml.safe_load(text)["/**/controller"]["ros__parameters"], "controller")
+    assert (read.feedforward is None) == (LAWS[name].feedforward == "none")
+    law, params = read.tuned_law()
+    of_catalogue, sets = LAWS[name].control_law(short.model), LAWS[name].params(tuning.as_gains(result), short.model)
+    generator, dt = np.random.default_rng(1), np.float64(short.model.period)
+    y = np.cumsum(0.002 * generator.standard_normal((60, 4)), axis=0)
+    zero, none = np.zeros(4), np.zeros((4, 1))
+    state = law.engage(Measurements(y[0], zero, zero, zero, zero), params)
+    wide = of_catalogue.engage(Measurements(y[0][:, None], none, none, none, none), sets)
+    u, found = zero, none
+    for sample in y[1:]:
+        state, u = law.step(state, Measurements(sample, zero, zero, zero, u), dt, params)
+        wide, found = of_catalogue.step(wide, Measurements(sample[:, None], none, none, none, found), dt, sets)
+    np.testing.assert_allclose(u, found[:, 0], rtol=2e-4, atol=1e-7)  # a file has six digits
+
+
+def test_law_that_no_scenario_flies_is_not_written(tmp_path: Path) -> None:
+    for laws, words in (("indi", "found the law indi, expected one of rise,"), ("pi,l1", "found 2 laws, 1 tunings")):
+        result = CliRunner().invoke(app, ["compare", "osprey_servo", "--laws", laws, "--write", str(tmp_path / "gains.yaml")])
+        assert words in str(result.exception)
+    assert not list(tmp_path.iterdir())

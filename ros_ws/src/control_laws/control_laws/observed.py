@@ -36,17 +36,16 @@ def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: fl
     return ObserverParams(of_law, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
 
 
-def aircraft_design(gains: dict[str, FloatArray], model: NominalModel) -> ObserverDesign:
+def aircraft_design(gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None) -> ObserverDesign:
     """Designs with the aircraft's model from effort, drift (m, N), gust, wind_time (G, N) and loose (1, N) or (n, N)."""
     weights = Weights(*(gains[name].T for name in Weights._fields))
-    return aircraft_observer(model, unnamed(model), weights)
+    return aircraft_observer(model, names or unnamed(model), weights)
 
 
-def extended_state_design(gains: dict[str, FloatArray], model: NominalModel) -> ObserverDesign:
+def extended_state_design(gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None) -> ObserverDesign:
     """Designs from Omega and lags alone: effort, drift, rate_drift and decay, shapes (m, N)."""
-    return extended_state_observer(
-        model, unnamed(model), ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
-    )
+    weights = ExtendedStateWeights(*(gains[name].T for name in ExtendedStateWeights._fields))
+    return extended_state_observer(model, names or unnamed(model), weights)
 
 
 def unnamed(model: NominalModel) -> Names:

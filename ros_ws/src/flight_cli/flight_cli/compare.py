@@ -16,15 +16,19 @@ from rich.table import Table
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS, Law
+from flight_analysis.closed_loop.margins import loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.gain_selection import section_yaml
 from flight_analysis.report.summary import display_units, finite_or_null
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import law_comparison, registered_laws, tuned_gains
+from flight_campaign import law_comparison, registered_laws, tuned_controller, tuned_gains
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
+from flight_campaign.law_margins import has_margins
+from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import Benchmark
-from flight_cli.output import COUNT_COLUMNS, new_table, parse_numbers, progress_bar, write_text
+from flight_cli.output import COUNT_COLUMNS, LICENCE, new_table, parse_numbers, progress_bar, write_text
 from flight_core.parameters import require
 from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig
@@ -75,6 +79,10 @@ def compare(
         int, typer.Option(min=0, help="Seed of the turbulence, unlike that of the tuning.")
     ] = law_comparison.TURBULENCE_SEED,
     gains: Annotated[Path | None, typer.Option(help="File of tuned gains; by default the one of the stack.")] = None,
+    write: Annotated[
+        Path | None,
+        typer.Option(help="File for the gains of one law as a section of a scenario, which flies with the score shown."),
+    ] = None,
     to_json: Annotated[Path | None, typer.Option("--json", help="File to write the figures to, SI.")] = None,
 ) -> None:
     """Fly RISE-DI and further laws side by side: same aircraft, reference, winds, noise, limits, uncertainty, tuning.
@@ -83,13 +91,10 @@ def compare(
     """
     names = list(LAWS) if laws is None else laws.split(",")
     aims = tuning.split(",")
-    for aim in aims:
-        require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
-    levels = parse_numbers(uncertainty)
-    fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
-    require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
-    tuning_seed = gain_tuning.TUNING_TURBULENCE_SEED
-    require(turbulence_seed != tuning_seed, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
+    levels, tuning_seed = parse_numbers(uncertainty), gain_tuning.TUNING_TURBULENCE_SEED
+    _check_options(aims, levels, uncertainty, turbulence_seed)
+    if write is not None:
+        _require_one_law(names, aims)
     chosen, command = find_scenario(scenario), f"rise-di compare {scenario} --tune"
     if wind is not None:
         chosen = chosen.vary(aircraft={"uncertainty": chosen.aircraft.uncertainty.model_dump() | {"wind": wind}})
@@ -128,10 +133,38 @@ def compare(
     if lacking and not tune:
         missing = ", ".join(f"{name} ({aim})" for name, aim in lacking)
         console.print(f"without tuned gains (--tune finds them): {missing}")
+    if write is not None:
+        _write(write, names[0], aims[0], tuned[names[0]][aims[0]], benchmark)
+        console.print(f"controller: {write}")
     if to_json is not None:
         rows = [_as_json(result, entries[result.law], chosen) for result in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}
         write_text("--json", to_json, json.dumps(figures | {"turbulence_seed": turbulence_seed, "laws": rows}, indent=1) + "\n")
+
+
+def _check_options(aims: Sequence[str], levels: Sequence[float], uncertainty: str, turbulence_seed: int) -> None:
+    for aim in aims:
+        require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
+    fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
+    require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
+    other = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
+    require(other, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
+
+
+def _require_one_law(names: Sequence[str], aims: Sequence[str]) -> None:
+    single = len(names) == 1 and len(aims) == 1
+    require(single, "--write", f"{len(names)} laws, {len(aims)} tunings", "one of each: --laws pi --tuning margins")
+    tuned_controller.require_registered(names[0])
+
+
+def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Benchmark) -> None:
+    """Write the gains of a law as a section of a scenario."""
+    controller = tuned_controller.tuned_controller(name, result, benchmark)
+    airframe, _ = benchmark.scenario.aircraft.load()
+    origin = f"by rise-di compare: law {name}, tuned on {aim} in {benchmark.scenario.name}"
+    margins = loop_assessment(scenario_loop(benchmark.scenario, controller)) if has_margins(LAWS[name]) else None
+    comments = {"delay": "s, beyond sampling: topics have none in the benchmark"}
+    write_text("--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments))
 
 
 def _tune(

@@ -19,7 +19,7 @@ from flight_analysis.design.trade import trade
 from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
-from flight_cli.output import new_table, options, parse_numbers, print_json, write_text
+from flight_cli.output import LICENCE, new_table, options, parse_numbers, print_json, write_text
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from rise_di.gain_design import check_gains, select_gains
@@ -37,7 +37,6 @@ MEANINGS = {
 }
 """Terms of the table and their meaning."""
 Assessment = GainAssessment[Any]
-HEADER = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
 
 
 def gains(
@@ -126,7 +125,7 @@ def gains(
             answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
-                write_text("--write", write, HEADER + gain_selection.as_yaml(selection, theorem=theorem))
+                write_text("--write", write, LICENCE + gain_selection.as_yaml(selection, theorem=theorem))
     found = next(iter(answers.values())).study
     if as_json:
         print_json(_as_json(found, answers, seed))

@@ -35,6 +35,7 @@ from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError
 
 ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
+LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"  # of a written file
 LATEST = Path("runs/latest")  # the run of a command that is given none
 
 

@@ -686,17 +686,25 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
             "omega": "abs(Omega_ii) in scaled inputs",
             "input_scale": unscaled,
         }
+    origin = "by Theorem 1" if theorem else "beside an observer" if controller.observer else "by the engineering procedure"
+    return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
+
+
+def section_yaml(
+    controller: ControllerConfig, airframe: Airframe, margins: LoopMargins | None, origin: str, comments: Mapping[str, str]
+) -> str:
+    """A controller as the section `/**/controller` of a scenario file; the description of a parameter without a comment."""
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward", "observer"}).items()
     ]
     return CONTROLLER_YAML.render(
-        airframe=study.airframe.name,
-        origin="by Theorem 1" if theorem else "beside an observer" if controller.observer else "by the engineering procedure",
-        delay_margin=assessed.delay_margin,
-        margins=margins_sentence(controller, assessed.margins),
+        airframe=airframe.name,
+        origin=origin,
+        delay_margin=None if margins is None else margins.delay,
+        margins=margins_sentence(controller, margins),
         parameters=parameters,
-        sections=_sections(controller, study.airframe),
+        sections=_sections(controller, airframe),
     )
 
 
@@ -718,7 +726,7 @@ def _shown_response(responses: FloatArray) -> str:
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
 
 
-def _sections(controller: RiseDiConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
+def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
     """The sections feedforward and observer where there are any: a comment, and each parameter in flow style."""
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
