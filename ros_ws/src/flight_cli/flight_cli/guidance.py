@@ -33,28 +33,19 @@ def _ask(namespace: str, request: "Callable[[GuidanceClient], str]", done: str) 
     print(done)
 
 
-@guidance.command()
-def hold(namespace: Namespace = "") -> None:
-    """Hold the heading, the altitude and the airspeed of now."""
-    _ask(namespace, lambda client: client.call("hold"), "holds heading, altitude and airspeed")
+def _command(service: str, help_text: str, done: str) -> None:
+    """Add a command that calls a service of guidance."""
+
+    def call(namespace: Namespace = "") -> None:
+        _ask(namespace, lambda client: client.call(service), done)
+
+    guidance.command(service, help=help_text)(call)
 
 
-@guidance.command()
-def skip(namespace: Namespace = "") -> None:
-    """Leave the waypoint ahead out and fly to the next waypoint."""
-    _ask(namespace, lambda client: client.call("skip"), "skips the waypoint ahead")
-
-
-@guidance.command()
-def resume(namespace: Namespace = "") -> None:
-    """Fly the last leg of the route again, from the nearest point."""
-    _ask(namespace, lambda client: client.call("resume"), "resumes the last leg")
-
-
-@guidance.command()
-def home(namespace: Namespace = "") -> None:
-    """Fly home and orbit there."""
-    _ask(namespace, lambda client: client.call("home"), "flies home")
+_command("hold", "Hold the heading, the altitude and the airspeed of now.", "holds heading, altitude and airspeed")
+_command("skip", "Leave the waypoint ahead out and fly to the next waypoint.", "skips the waypoint ahead")
+_command("resume", "Fly the last leg of the route again, from the nearest point.", "resumes the last leg")
+_command("home", "Fly home and orbit there.", "flies home")
 
 
 @guidance.command()
