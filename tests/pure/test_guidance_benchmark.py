@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from benchmarks import guidance as benchmark
+from benchmarks import routes
 from benchmarks.evidence_data import Row
 from benchmarks.guidance_grid import Point
 
@@ -74,3 +75,16 @@ def test_rows_of_evidence() -> None:
         Row("altitude 300 m, airspeed 30 m/s", "ok"),
         Row("altitude 300 m, airspeed 36 m/s", "lost: diverged at t = 3.00 s"),
     ]
+
+
+def test_route_that_wind_forbids_is_refused_and_helix_is_flown_longer() -> None:
+    refused = routes.fly("osprey_servo", "wind 1.2 V", routes.CASES["wind 1.2 V"])
+    assert refused.result.startswith("refused: guidance.route[0].V: found 25 m/s in a wind of 30 m/s")
+    section = benchmark.aircraft_of("osprey_servo").guidance
+    assert section is not None
+    level, climbing = (
+        routes.duration(section.plan(routes.of_radii((0, 0), (5, 0), altitudes=(0.0, up))(144.0)), section)
+        for up in (0.0, 250.0)
+    )
+    # The climb on the circle round the first waypoint, and the circle once more for the exit.
+    assert climbing - level > 250.0 / section.climb_limits()[0]

@@ -297,6 +297,8 @@ def test_steep_leg_begins_with_circle_that_is_left_at_altitude() -> None:
     assert circle.end is not None
     course = path.end_course(circle)
     assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 300.0)["leg"] == 0.0
+    beyond = (circle.end[0] + 25.0 * math.cos(course), circle.end[1] + 25.0 * math.sin(course))
+    assert flown.at(*beyond, course, 396.0)["leg"] == 0.0  # too late to leave: another turn
     assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 396.0)["leg"] == 1.0
 
 

@@ -30,6 +30,9 @@ from flight_guidance.wind import Wind, wind_estimate, wind_of
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
 
+EXIT = 0.5
+"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another turn."""
+
 LEVEL = 5.0
 """m. Largest distance from the altitude at which an aircraft leaves a loiter."""
 
@@ -515,7 +518,7 @@ def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, rou
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
         state = _loitering(state, leg, leg.loiter, pose, dt)
-        ends = _has_loitered(state, pose, route) and _leaves(leg, route.near(state.leg), pose, position)
+        ends = _has_loitered(state, pose, route) and _leaves(leg, EXIT * _over_ground(pose)[1], pose, position)
         return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
@@ -542,9 +545,9 @@ def _has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route)
     return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
 
 
-def _leaves(leg: Leg, near: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Whether an aircraft at a position leaves the circle of a loiter for the next leg."""
-    return leg.end is not None and bool(path.joined(leg.end, path.end_course(leg), near, position, _over_ground(pose)[0]))
+def _leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
+    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that flies the course there."""
+    return leg.end is not None and bool(path.joined(leg.end, path.end_course(leg), reach, position, _over_ground(pose)[0]))
 
 
 def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
@@ -614,7 +617,9 @@ def _bank(
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
     entered: Callable[[Point], Any] = partial(path.entered, leg, following)
     if route is not None and following is not None and path.is_orbit(leg) and _has_loitered(state, pose, route):
-        entered = partial(_leaves, leg, route.near(state.leg), pose)
+        near = route.near(state.leg)
+        late = _leaves(leg, near, pose, position) and not _leaves(leg, EXIT * over_ground[1], pose, position)
+        entered = partial(path.entered, leg, following) if late else partial(_leaves, leg, near, pose)
     wanted = follow(error, entry, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(leg, position)
 

@@ -1,0 +1,192 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Routes by rule from where they are hard to begin, in wind, steep, and crossing themselves: flown, missed or refused.
+
+    .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix] > routes.csv
+
+A row a flight in one process: the result, the largest cross-track error on the legs in seconds of flight at V0 and its limit,
+the largest error of the altitude. A leg that the aircraft joins counts from one radius beyond the start on, within which the
+start counts as reached; a circle counts from where the aircraft is on it. A refusal is a result, with the sentence. The wind
+is known as `guidance.wind`. No number is tuned to an aircraft. Exit status 1: an error beyond its limit, a missed leg, or an
+aircraft lost.
+"""
+
+import argparse
+import csv
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from benchmarks.guidance import AIRCRAFT, OTHERS, aircraft_of, turbulence
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.guided import flown_legs
+from flight_bringup.scenarios import with_route
+from flight_core.outcome import COMPLETED
+from flight_core.parameters import ParameterError
+from flight_core.tape import Tape
+from flight_guidance import path
+from flight_guidance.modes import Lateral
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.path import Arc, Line, Route
+from flight_guidance.route_file import Waypoint
+
+CALM_LIMIT, LIMIT = 0.35, 0.5
+"""s of flight at V0: what guidance claims in calm air, and in wind or turbulence."""
+
+SETTLE = 20.0
+"""s on the last orbit, and beside a joining way longer than the straight one."""
+
+
+class Case(NamedTuple):
+    """A route, by the least radius in m, and the air. The aircraft starts at the origin and heads north."""
+
+    waypoints: Callable[[float], list[Waypoint]]
+    wind: float = 0.0  # to the east, of V0
+    turbulent: bool = False
+
+
+class Row(NamedTuple):
+    """The result of a flight."""
+
+    aircraft: str
+    case: str
+    result: str  # "flown", "missed ...", "lost ...", or "refused: ..."
+    xtrack: float  # s
+    limit: float  # s
+    altitude: float  # m, on the legs
+
+
+def of_radii(*places: tuple[float, float], altitudes: tuple[float, ...] = ()) -> Callable[[float], list[Waypoint]]:
+    """A route of places in radii to the north and to the east, and altitudes over that of the start in m."""
+
+    def waypoints(radius: float) -> list[Waypoint]:
+        heights = altitudes or (0.0,) * len(places)
+        return [Waypoint(north * radius, east * radius, up) for (north, east), up in zip(places, heights, strict=True)]
+
+    return waypoints
+
+
+def far(radius: float) -> list[Waypoint]:
+    """A line 20 km to the side."""
+    return [Waypoint(0.0, 20e3, 0.0), Waypoint(6.0 * radius, 20e3, 0.0)]
+
+
+def steep(_: float) -> list[Waypoint]:
+    """1000 m up within 500 m."""
+    return [Waypoint(1000.0, 0.0, 0.0), Waypoint(1500.0, 0.0, 1000.0)]
+
+
+EIGHT = of_radii((0, 0), (3, 0), (6, 3), (9, 3), (9, 0), (6, 0), (3, 3), (0, 3))
+BOX = of_radii((0, 0), (5, 0), (5, 5), (0, 5))
+CASES: Mapping[str, Case] = {
+    "behind": Case(of_radii((-4, 0), (-9, 0), (-9, 5))),
+    "across": Case(of_radii((3, 7), (3, 13))),
+    "20 km away": Case(far),
+    "eight": Case(EIGHT),
+    "eight, turbulence, wind 0.3 V": Case(EIGHT, 0.3, turbulent=True),
+    "helix": Case(of_radii((3, 0), (8, 0), (14, 0), altitudes=(0, 120, 120))),
+    "1000 m in 500 m": Case(steep),
+    "wind 0.6 V": Case(BOX, 0.6),
+    "wind 1.2 V": Case(BOX, 1.2),
+}
+
+
+def duration(route: Route, section: GuidanceConfig) -> float:
+    """Time to fly a route from the origin with the wind from ahead, s."""
+    climb, sink = section.climb_limits()
+    slowest, start = section.speed - section.wind, route.start(0)[0]
+    length = math.hypot(*start) + 4.0 * math.pi * route.radius  # at most two turns to join the first leg
+    time = SETTLE
+    for k, leg in enumerate(route.legs):
+        if isinstance(leg, Line):
+            length += path.length(leg)
+        elif path.is_orbit(leg):
+            length += 2.0 * math.pi * route.radius * (leg.end is not None)
+            change = route.altitude[k] - route.from_altitude[k]
+            time += 1.2 * abs(change) / (climb if change > 0.0 else sink)
+        else:
+            length += math.pi * route.radius
+    return time + length / slowest
+
+
+def fly(name: str, title: str, case: Case) -> Row:
+    """The result of a flight."""
+    scenario, limit = aircraft_of(name), LIMIT if case.wind or case.turbulent else CALM_LIMIT
+    try:
+        varied = planned(scenario, name, case)
+    except ParameterError as refusal:
+        return Row(name, title, f"refused: {refusal}", 0.0, limit, 0.0)
+    tape = simulate(varied)
+    if tape.outcome != COMPLETED:
+        return Row(name, title, f"lost: {tape.outcome}", math.inf, limit, math.inf)
+    if varied.guidance is None:
+        raise ValueError(f"{name} has no guidance")
+    route = varied.guidance.plan(varied.guidance.waypoints())
+    result, flown = "flown", flown_legs(tape)
+    missed = [leg for leg in flown if leg.result == "missed"]
+    if missed:
+        result = f"missed leg {missed[0].leg} by {missed[0].missed:.0f} m"
+    elif flown[-1].leg < len(route.legs) - 1:
+        result = f"missed: on leg {flown[-1].leg} of {len(route.legs) - 1} at the end"
+    xtrack, altitude = errors(tape, route)
+    return Row(name, title, result, round(xtrack / varied.guidance.speed, 3), limit, round(altitude, 2))
+
+
+def planned(scenario: Scenario, name: str, case: Case) -> Scenario:
+    """The scenario of a case. Raises ParameterError where the route is refused."""
+    if scenario.guidance is None:
+        raise ValueError(f"{name} has no guidance")
+    wind, ground = case.wind * scenario.guidance.speed, scenario.aircraft.altitude or 0.0
+    section = scenario.guidance.model_copy(update={"wind": wind})
+    waypoints = [
+        point._replace(altitude=point.altitude + ground) for point in case.waypoints(math.ceil(section.least_radius()))
+    ]
+    aircraft: dict[str, Any] = {"wind": [0.0, wind]}
+    if case.turbulent:
+        aircraft["turbulence"] = turbulence(scenario, 1)
+    varied = with_route(scenario.vary(aircraft=aircraft, guidance={"wind": wind}), waypoints)
+    return varied.vary(flight={"duration": float(math.ceil(duration(section.plan(waypoints), section)))})
+
+
+def errors(tape: Tape, route: Route) -> tuple[float, float]:
+    """Largest cross-track error and error of the altitude on the legs before the last orbit, m."""
+    log = tape["guidance"]
+    circles = [k for k, leg in enumerate(route.legs) if isinstance(leg, Arc) and leg.loiter]
+    on_leg = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0) & (log["leg"] < len(route.legs) - 1)
+    on_circle = np.isin(log["leg"], circles)
+    on_leg &= ~on_circle | (log["loitered"] > 0.0)
+    for k in np.flatnonzero((log["joining"][:-1] != 0.0) & (log["joining"][1:] == 0.0)) + 1:
+        from_start = np.hypot(log["pose.north"] - log["pose.north"][k], log["pose.east"] - log["pose.east"][k])
+        on_leg[k:] &= (log["leg"][k:] != log["leg"][k]) | (from_start[k:] > route.radius)
+    off = np.abs(log["pose.altitude"] - log["target.altitude"])
+    return float(np.abs(log["xtrack"][on_leg]).max(initial=0.0)), float(off[on_leg & ~on_circle].max(initial=0.0))
+
+
+def rows(names: list[str], titles: list[str]) -> Iterator[Row]:
+    """The rows of aircraft and cases."""
+    for name in names:
+        for title in titles:
+            yield fly(name, title, CASES[title])
+
+
+def main() -> int:
+    """Fly and print the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", choices=[*AIRCRAFT, *OTHERS], default=[*AIRCRAFT], help="aircraft")
+    parser.add_argument("--cases", nargs="*", choices=[*CASES], default=[*CASES], help="routes")
+    chosen = parser.parse_args()
+    writer, failed = csv.writer(sys.stdout), False
+    writer.writerow(Row._fields)
+    for row in rows(chosen.only, chosen.cases):
+        writer.writerow(row)
+        sys.stdout.flush()
+        failed |= row.xtrack > row.limit or row.result.startswith(("missed", "lost"))
+    return int(failed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
