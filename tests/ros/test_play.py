@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from rclpy.node import Node
+from rclpy.serialization import serialize_message
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer
 
 from flight_core.rates import NANOSECONDS
+from flight_log.message_definitions import definition
 from flight_log.playback import read_playback
 from flight_log.tape_reader import read_run
 from flight_ros.messages import stamp_of, to_message
@@ -95,6 +98,34 @@ def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start, peer_no
     assert "Traceback" not in process.output
     stamps = [stamp_of(message) for message in receiving.received["y"]]
     assert stamps == sorted(stamps)  # also from one pass to the next
+
+
+def test_topics_that_cannot_be_sent_are_skipped_with_one_warning(start: Start, tmp_path: Path, peer_node: Peer) -> None:
+    """A type that is not installed, a name that no topic of ROS may have, and JSON, beside a y."""
+    y, log = serialize_message(to_message(1, ("q",), np.zeros(1), "peer")), tmp_path / "mixed.mcap"
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        for topic, kind, encoding in (
+            ("/y", "sensor_msgs/msg/JointState", "cdr"),
+            ("/strange", "nowhere_msgs/msg/Thing", "cdr"),
+            ("/no name", "sensor_msgs/msg/JointState", "cdr"),
+            ("/json", "sensor_msgs/msg/JointState", "json"),
+        ):
+            schema = writer.register_schema(kind, "ros2msg", definition("sensor_msgs/msg/JointState").text.encode())
+            channel = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channel, 1, y, 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    receiving = Receiver(peer_node.node, Y)
+    process = start("flight_cli.cli", "play", str(log), "--stamps", "recorded").succeed()
+    receiving.until(Y, 1)
+    (warning,) = [line for line in process.lines if line.startswith("warning:")]
+    assert "without CDR, or of a message type that is not installed" in warning
+    assert [topic for topic in ("/strange", "/no name", "/json", "/y ") if topic in warning] == [
+        "/strange",
+        "/no name",
+        "/json",
+    ]
 
 
 def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:

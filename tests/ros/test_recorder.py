@@ -3,6 +3,8 @@
 """The recorder: recorded topics, QoS, missing topics, lost messages, a full disk."""
 
 import re
+import socket
+import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -159,6 +161,38 @@ def test_topic_that_stops_while_others_go_on_named(recorder: Recorder, peer_node
     assert re.fullmatch(r"/y: the recorder received nothing for [\d.]+ s, to the end", log.tape.notes[-1])
     texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/rosout"]
     assert any(named.encode() in text for text in texts)
+
+
+def forge_gap(domain: int, writer: bytes) -> None:
+    """Send a GAP of a writer to all participants of this host: its readers take 100,000 samples as irrelevant.
+
+    DDSI-RTPS 2.3: header 8.3.3, GAP 9.4.5.5 with the sequence numbers from 1 on, ports 9.6.1.1.
+    """
+    numbers = struct.pack("<iIiII", 0, 1, 0, 100_000, 0)  # the first, the base of the set, and an empty set
+    body = b"\0\0\0\0" + writer[12:16] + numbers
+    packet = b"RTPS\x02\x03\x01\x0f" + writer[:12] + struct.pack("<BBH", 0x08, 0x01, len(body)) + body
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for participant in range(12):
+            sender.sendto(packet, ("127.0.0.1", 7400 + 250 * domain + 11 + 2 * participant))
+
+
+def test_forged_end_of_topic_named(recorder: Recorder, peer_node: Peer, domain: int, tmp_path: Path) -> None:
+    """One packet ends the recording of a topic for good, while its publisher goes on."""
+    process = recorder("run").wait_for("ready")
+
+    def send() -> None:
+        for topic in ("y", "y_m", "truth"):
+            peer_node.publish(topic, to_message(time.time_ns(), OUTPUTS, np.zeros(4), f"/{topic}#1"))
+
+    peer_node.until(lambda: recorded(peer_node, "/truth") > 100, each=send)
+    (writer,) = peer_node.node.get_publishers_info_by_topic("/truth")
+    forge_gap(domain, bytes(writer.endpoint_gid))
+    begin = time.monotonic()
+    peer_node.until(lambda: "/truth: no message for 1 s while others go on" in process.output, each=send)
+    assert time.monotonic() - begin < 3.0  # 1.1 s, and what a busy host needs
+    process.interrupt().succeed()
+    notes = read_run(tmp_path / "run").tape.notes
+    assert any(re.fullmatch(r"/truth: the recorder received nothing for [\d.]+ s, to the end", note) for note in notes)
 
 
 def test_topic_whose_type_is_not_installed_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
