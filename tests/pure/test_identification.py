@@ -316,7 +316,7 @@ def rise_di(*arguments: str) -> Result:
     ("airframe", "sentence"),
     [
         ("osprey", "airframe: found 'osprey', expected an aircraft of JSBSim, jsbsim:NAME"),
-        ("jsbsim:f61", "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim: and another of 737, "),
+        ("jsbsim:f61", "airframe: found 'jsbsim:f61', expected jsbsim:f16 perhaps, or jsbsim:PATH "),
     ],
 )
 def test_airframe_that_is_none_of_jsbsim_refused_with_one_sentence(

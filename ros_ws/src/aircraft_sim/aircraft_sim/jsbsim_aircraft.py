@@ -7,10 +7,14 @@ STATES alone map between the two, with units and signs.
 """
 
 import difflib
+import io
+import os
+import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
+from xml.etree import ElementTree
 
 from aircraft_sim.airframe import Unit
 from aircraft_sim.disturbance import Gusts
@@ -20,6 +24,8 @@ from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
+ROOT_VARIABLE = "JSBSIM_ROOT"  # environment: a folder with aircraft, engine and systems in place of the package's
+SUFFIX, MODEL_ELEMENT = ".xml", "fdm_config"  # of the file of a model
 
 
 class Command(NamedTuple):
@@ -77,7 +83,7 @@ RESIDUALS: Mapping[str, float] = {
 class FlightCondition(NamedTuple):
     """An aircraft of JSBSim in a flight condition: level, straight, gear up, engines running, heading north, no wind."""
 
-    name: str  # of the aircraft, without PREFIX
+    name: str  # of the aircraft, without PREFIX, or the absolute path of its model
     speed: float  # true airspeed, m/s
     altitude: float  # above sea level, m
     step_ns: int  # of the integration
@@ -108,24 +114,98 @@ class WindModel(NamedTuple):
 @cache
 def aircraft_names() -> tuple[str, ...]:
     """Names of the aircraft of JSBSim. Raises ParameterError where JSBSim is not installed."""
+    return tuple(sorted(path.parent.name for path in (root() / "aircraft").glob("*/*.xml") if path.stem == path.parent.name))
+
+
+def root() -> Path:
+    """The folder with JSBSim's folders aircraft, engine and systems: $JSBSIM_ROOT, or that of the package jsbsim.
+
+    Raises ParameterError where JSBSim is not installed, and for a $JSBSIM_ROOT that is no such folder.
+    """
     try:
         import jsbsim  # noqa: PLC0415 - other aircraft fly without it
     except ModuleNotFoundError:
         raise ParameterError("airframe: found no Python package jsbsim, expected it for an aircraft of JSBSim") from None
-
-    library = Path(jsbsim.get_default_root_dir()) / "aircraft"
-    return tuple(sorted(path.parent.name for path in library.glob("*/*.xml") if path.stem == path.parent.name))
+    chosen = os.environ.get(ROOT_VARIABLE)
+    if not chosen:
+        return Path(jsbsim.get_default_root_dir())
+    folder = Path(chosen).expanduser().absolute()
+    parts = ("aircraft", "engine")
+    require(all((folder / part).is_dir() for part in parts), ROOT_VARIABLE, chosen, f"a folder with {' and '.join(parts)}")
+    return folder
 
 
 def require_aircraft(airframe: str) -> str:
-    """Name of the aircraft in "jsbsim:NAME". Raises ParameterError with the known names, the closest first."""
+    """Name of the aircraft in "jsbsim:NAME", or the absolute path of the model in "jsbsim:PATH".
+
+    PATH is the XML file of a model, or its folder; its text has a "/" or ends with ".xml". Raises ParameterError, for a name
+    with the closest known name, for a path with what is there.
+    """
     name = airframe.removeprefix(PREFIX)
+    if "/" in name or name.endswith(SUFFIX):
+        return str(_model_file(Path(name).expanduser().absolute(), airframe))
     near = difflib.get_close_matches(name, aircraft_names(), n=1, cutoff=0.4)
-    listed = ", ".join(aircraft_names())
-    require(
-        name in aircraft_names(),
-        "airframe",
-        f"{airframe!r}",
-        f"{PREFIX}{near[0]} perhaps, or {PREFIX} and another of {listed}" if near else f"{PREFIX} and one of {listed}",
-    )
+    own = f"{PREFIX}PATH with a /, the XML file or the folder of your own"
+    near = [f"./{name}"] if Path(name).is_dir() else near
+    guess = f"{PREFIX}{near[0]} perhaps" if near else f"a name in {root() / 'aircraft'}"
+    require(name in aircraft_names(), "airframe", f"{airframe!r}", f"{guess}, or {own}")
     return name
+
+
+def root_of(model: Path) -> Path:
+    """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package.
+
+    JSBSim looks for the files of a model beside the model first.
+    """
+    own = model.parents[min(2, len(model.parents) - 1)]
+    of_tree = not os.environ.get(ROOT_VARIABLE) and model.parents[1].name == "aircraft" and (own / "engine").is_dir()
+    return own if of_tree else root()
+
+
+def _model_file(path: Path, airframe: str) -> Path:
+    """The XML file of a model, from its path or that of its folder. Raises ParameterError."""
+    expected = "the XML file of an aircraft of JSBSim (fdm_config), or its folder"
+    if not path.is_dir():
+        require(path.is_file(), "airframe", f"{airframe!r}, where no file is", expected)
+        element = _first_element(path)
+        require(element == MODEL_ELEMENT, "airframe", f"{airframe!r}, a file with {element or 'no XML'}", expected)
+        return path
+    named = path / f"{path.name}{SUFFIX}"
+    models = (
+        [named]
+        if named.is_file()
+        else sorted(file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT)
+    )
+    found = ", ".join(model.name for model in models) or "no model"
+    require(len(models) == 1, "airframe", f"{airframe!r}, a folder with {found}", f"a folder with one model, or {expected}")
+    return models[0]
+
+
+def _first_element(path: Path) -> str:
+    """Name of the first element of an XML file; "" for a file that is not XML."""
+    try:
+        _, element = next(ElementTree.iterparse(path, events=("start",)))  # noqa: S314 - no entity is in a first element
+        return str(element.tag)
+    except (ElementTree.ParseError, OSError, StopIteration, UnicodeError):
+        return ""
+
+
+def model_archive(model: Path) -> bytes:
+    """A zip file with a model of the user's own and the files it names, as a root of JSBSim: the same bytes for the same files.
+
+    aircraft/NAME/ has the XML files of the model's folder, engine/ and systems/ those of the root that the model names.
+    Unpacked, jsbsim:FOLDER/aircraft/NAME flies.
+    """
+    members = {
+        f"aircraft/{model.stem}/{path.relative_to(model.parent)}": path for path in sorted(model.parent.rglob(f"*{SUFFIX}"))
+    }
+    elements = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim has loaded the file
+    named = {Path(name).stem for element in elements if (name := element.get("file"))}
+    for folder in ("engine", "systems"):
+        of_root = (path for path in sorted((root_of(model) / folder).glob(f"*{SUFFIX}")) if path.stem in named)
+        members |= {f"{folder}/{path.name}": path for path in of_root}
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, path in members.items():
+            archive.writestr(zipfile.ZipInfo(name), path.read_bytes(), zipfile.ZIP_DEFLATED)
+    return content.getvalue()

@@ -60,7 +60,9 @@ class JsbsimModel:
         self._heading, self._height, self._contact = (
             self._node(path) for path in (jsbsim_trim.HEADING, jsbsim_trim.HEIGHT, jsbsim_trim.CONTACT)
         )
-        self._engines = [self._node(jsbsim_trim.running_property(i)) for i in range(engines)]
+        # the number and the flag of the engines that can stop: an electric engine has no flag
+        running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
+        self._engines = {number: node for number, node in running.items() if node.get_double_value()}
         self._actuator_model, self._wind_model = actuator_model, wind_model
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
@@ -107,7 +109,7 @@ class JsbsimModel:
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
             raise FlightEnded(f"{self.condition.title} hit the ground {now}")
-        if stopped := [str(i + 1) for i, node in enumerate(self._engines) if not node.get_double_value()]:
+        if stopped := [str(number) for number, node in self._engines.items() if not node.get_double_value()]:
             raise FlightEnded(f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}")
 
     def y(self) -> FloatArray:

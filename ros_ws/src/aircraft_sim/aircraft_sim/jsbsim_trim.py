@@ -6,12 +6,13 @@ import os
 import re
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 
 import jsbsim
 import numpy as np
 
 from aircraft_sim import isolated
-from aircraft_sim.jsbsim_aircraft import INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim
+from aircraft_sim.jsbsim_aircraft import INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim, root, root_of
 from flight_core.outcome import FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.units import FOOT
@@ -156,8 +157,13 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 
 def running_property(engine: int) -> str:
-    """The property with the value 1 while an engine runs."""
+    """The property with the value 1 while an engine runs. An electric engine of JSBSim never has this value."""
     return f"propulsion/engine[{engine}]/set-running"
+
+
+def thrust_property(engine: int) -> str:
+    """The property of the thrust of an engine, lbf."""
+    return f"propulsion/engine[{engine}]/thrust-lbs"
 
 
 def command_paths(command: Command, engines: int) -> list[str]:
@@ -198,11 +204,15 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
 def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     log = _Log()
     jsbsim.set_logger(log)  # of this thread
-    fdm = jsbsim.FGFDMExec(None)
+    model = Path(condition.name)
+    own = model.is_absolute()
+    fdm = jsbsim.FGFDMExec(str(root_of(model) if own else root()))
     fdm.set_debug_level(0)
+    if own:
+        fdm.set_aircraft_path(str(model.parent))
     fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
     try:
-        loaded = fdm.load_model(condition.name)
+        loaded = fdm.load_model(model.stem, not own)  # a model of JSBSim is in a folder of its name
     except jsbsim.BaseError as error:
         raise FlightEnded(f"{condition.title} cannot be loaded: {error_text(error)}") from None
     if not loaded:
@@ -231,8 +241,8 @@ def _properties(engines: int) -> list[str]:
     trims = [command.trim_property for command in INPUTS.values() if command.trim_property is not None]
     states = [quantity.property for quantity in STATES.values()]
     residuals = [f"accelerations/{name}" for name in RESIDUALS]
-    running = [running_property(i) for i in range(engines)]
-    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *FROZEN]
+    engine = [path(i) for path in (running_property, thrust_property) for i in range(engines)]
+    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *engine, *FROZEN]
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
@@ -291,7 +301,8 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec) -> bool:
 
 def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
     """Why the solver's result is no trim, as a sentence."""
-    stopped = [str(i + 1) for i in range(engine_count(fdm)) if not fdm[running_property(i)]]
+    engines = range(engine_count(fdm))
+    stopped = [str(i + 1) for i in engines if not fdm[running_property(i)] and fdm[thrust_property(i)] <= 0.0]
     if stopped:
         return f"engine {', '.join(stopped)} cannot be started"
     linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)

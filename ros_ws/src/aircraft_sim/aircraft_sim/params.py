@@ -156,7 +156,7 @@ class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
     airframe: str = Field(
-        description="the name of an airframe of the library, the path of an airframe file, or jsbsim:NAME for one of JSBSim's"
+        description="the name of an airframe of the library, the path of its file, or of JSBSim jsbsim:NAME or jsbsim:PATH"
     )
     speed: Positive | None = Field(default=None, description="of an aircraft of JSBSim: the true airspeed of its trim, m/s")
     altitude: NonNegative | None = Field(
@@ -334,7 +334,7 @@ class AircraftConfig(NodeConfig):
         """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""
         if self.speed is None or self.altitude is None:
             raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
-        return FlightCondition(self.airframe.removeprefix(PREFIX), self.speed, self.altitude, self.step_ns)
+        return FlightCondition(require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns)
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on every axis."""

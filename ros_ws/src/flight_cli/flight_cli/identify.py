@@ -51,7 +51,9 @@ LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is r
 
 
 def identify(
-    aircraft: Annotated[str | None, typer.Argument(help="jsbsim:NAME, an aircraft of JSBSim, without --log.")] = None,
+    aircraft: Annotated[
+        str | None, typer.Argument(help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim, without --log.")
+    ] = None,
     speed: Annotated[float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")] = None,
     altitude: Annotated[float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")] = None,
     output: Annotated[
@@ -165,11 +167,11 @@ def _identify_by_steps(
     needed: Requirement,
     accept: bool,
 ) -> None:
-    require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME")
+    require(airframe.startswith(PREFIX), "airframe", f"{airframe!r}", f"an aircraft of JSBSim, {PREFIX}NAME or {PREFIX}PATH")
     name = require_aircraft(airframe)
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
     require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
-    path = output or Path(f"jsbsim_{name}.yaml")
+    path = output or Path(f"jsbsim_{Path(name).stem}.yaml")
     require(output is not None or not path.exists(), "--output", f"none, and {path} exists", "a file to write over, or another")
     require(path.suffix == ".yaml", "--output", path, "a name that ends in .yaml, as scenario files do")
     require(path.parent.is_dir(), "--output", path, "a file in a folder that exists")

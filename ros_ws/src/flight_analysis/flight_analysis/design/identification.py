@@ -445,7 +445,7 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 
 /**/aircraft:
   ros__parameters:
-    airframe: {{ condition.title }}
+    airframe: {{ condition.title if "/" not in condition.title else '"' ~ condition.title ~ '"' }}
     speed: {{ condition.speed | flow }}  # m/s, true airspeed in trim
     altitude: {{ condition.altitude | flow }}  # m, above sea level
     rate: {{ rate | flow }}                # Hz, y and truth

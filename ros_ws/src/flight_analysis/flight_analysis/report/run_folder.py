@@ -11,6 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from aircraft_sim.jsbsim_aircraft import model_archive
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
 from flight_analysis.report.account import Account, account, flown
@@ -30,7 +31,7 @@ from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import PARAMETERS, RecordedRun, read_run
 
 SUMMARY, REPORT = "summary.json", "report.html"
-AIRFRAME, PROVENANCE = "airframe.yaml", "provenance.yaml"  # attachments of the log
+AIRFRAME, AIRCRAFT, PROVENANCE = "airframe.yaml", "aircraft.zip", "provenance.yaml"  # attachments of the log
 
 
 class FlightResult(NamedTuple):
@@ -57,18 +58,21 @@ def attachments_for(
 ) -> LogAttachments:
     """The attachments of the log of a flight, written into the folder of the run where they are not files yet.
 
-    These are the scenario, the airframe, every parameter after validation, `further` files, and the provenance.
+    These are the scenario, the airframe or the user's own model of JSBSim, every parameter after validation, `further` files,
+    and the provenance.
     `overrides` are parameters of the scenario's nodes by the node's name; None for a flight without nodes. Raises
     ParameterError where a file cannot be written.
     """
     attached = [_write(run / PARAMETERS, scenario_yaml(scenario, overrides)), *further]
     if not scenario.aircraft.is_jsbsim:
         attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.sampled_airframe())))
+    elif (model := Path(scenario.aircraft.flight_condition().name)).is_absolute():
+        attached.append(_write(run / AIRCRAFT, model_archive(model)))
     notes = _write(run / PROVENANCE, dump_yaml(provenance(), flow=False))
     return LogAttachments(scenario.path, tuple(attached), notes)
 
 
-def _write(path: Path, text: str) -> Path:
+def _write(path: Path, text: str | bytes) -> Path:
     with writing("", path, "a folder and a disk that can"):
         write_file(path, text)
     return path

@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models of JSBSim of the user's own: found by path, with engines beside them or in a root, electric engines too."""
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jsbsim
+import numpy as np
+import pytest
+from tests.builders import aircraft_parameters
+
+from aircraft_sim.actuators import Actuators
+from aircraft_sim.disturbance import AXES, Gusts
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    PREFIX,
+    FlightCondition,
+    WindModel,
+    aircraft_names,
+    model_archive,
+    require_aircraft,
+    root,
+)
+from aircraft_sim.jsbsim_model import JsbsimModel
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from rise_di import Scenario, fly
+
+pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
+
+PACKAGE = Path(jsbsim.get_default_root_dir())
+CESSNA = (PACKAGE / "aircraft" / "c172p" / "c172p.xml").read_text(encoding="utf-8")
+STEP_NS = 5_000_000
+SECTION: dict[str, Any] = {"speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
+
+
+def write_model(folder: Path, engine: str, name: str = "plane.xml") -> Path:
+    """A c172p with an engine of the package, whose file is copied beside the model."""
+    (folder / "Engines").mkdir(parents=True)
+    (folder / "Engines" / "own_engine.xml").write_bytes((PACKAGE / "engine" / f"{engine}.xml").read_bytes())
+    (folder / name).write_text(CESSNA.replace("eng_io320", "own_engine"), encoding="utf-8")
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def electric(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The model of a c172p with an electric engine; its name is not that of its folder."""
+    return write_model(tmp_path_factory.mktemp("my planes"), "electric147kW")
+
+
+def throttle_step(airframe: str) -> FloatArray:
+    """V, deviation from trim, m/s, every step of two seconds at 0.1 more throttle."""
+    none = np.zeros(len(AXES))
+    condition = FlightCondition(require_aircraft(airframe), 46.3, 1219.2, STEP_NS)
+    model = JsbsimModel(condition, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
+    u, V = np.array([0.1 * (name == "throttle") for name in INPUTS]), []
+    for k in range(400):
+        model.advance(k * STEP_NS, u, STEP_NS)
+        V.append(model.y()[1])
+    return np.array(V)
+
+
+def test_electric_aircraft_of_own_trims_and_answers_throttle(electric: Path) -> None:
+    V = throttle_step(f"{PREFIX}{electric}")
+    # 0.1 of 147 kW at 46.3 m/s and 1100 kg is 0.29 m/s^2; the propeller loses a part
+    assert 0.1 < V[-1] < 0.6
+    assert np.all(np.diff(V[100:]) > 0.0)
+
+
+def test_folder_names_its_only_model(electric: Path) -> None:
+    assert require_aircraft(f"{PREFIX}{electric.parent}") == str(electric)
+
+
+def test_relative_path_is_that_of_working_folder(electric: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(electric.parent)
+    assert require_aircraft(f"{PREFIX}plane.xml") == str(electric)
+
+
+def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
+    c172p = find_scenario("jsbsim_c172p")
+    own = Scenario.from_parts(
+        "own",
+        flight={"duration": 1.0},
+        aircraft=c172p.aircraft.model_dump() | {"airframe": f"{PREFIX}{electric}"},
+        reference_model=c172p.reference_model,
+        controller=c172p.controller,
+    )
+    flight = fly(own, tmp_path / "runs")
+    with zipfile.ZipFile(flight.mcap.parent / "aircraft.zip") as archive:
+        archive.extractall(tmp_path / "elsewhere")
+    copy = tmp_path / "elsewhere" / "aircraft" / "plane"
+    assert np.array_equal(throttle_step(f"{PREFIX}{copy}"), throttle_step(f"{PREFIX}{electric}"))
+    assert (tmp_path / "elsewhere" / "engine" / "prop_75in2f.xml").is_file()  # of the package, which the model names
+
+
+def test_archive_has_same_bytes_for_same_files(electric: Path) -> None:
+    first = model_archive(electric)
+    assert model_archive(electric) == first
+    assert zipfile.ZipFile(io.BytesIO(first)).testzip() is None
+
+
+def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tree = tmp_path / "root"
+    model = write_model(tree / "aircraft" / "mine", "electric147kW", "mine.xml")
+    (tree / "engine").mkdir()
+    (model.parent / "Engines" / "own_engine.xml").rename(tree / "engine" / "own_engine.xml")
+    (tree / "engine" / "prop_75in2f.xml").write_bytes((PACKAGE / "engine" / "prop_75in2f.xml").read_bytes())
+    expected = throttle_step(f"{PREFIX}{model}")  # the root is that of the path
+    monkeypatch.setenv("JSBSIM_ROOT", str(tree))
+    aircraft_names.cache_clear()
+    try:
+        assert aircraft_names() == ("mine",)
+        assert np.array_equal(throttle_step(f"{PREFIX}mine"), expected)
+        monkeypatch.setenv("JSBSIM_ROOT", str(tmp_path))
+        with pytest.raises(ParameterError, match=r"^JSBSIM_ROOT: found .*, expected a folder with aircraft and engine$"):
+            root()
+    finally:
+        aircraft_names.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [
+        ("nowhere.xml", "found 'jsbsim:nowhere.xml', where no file is, expected the XML file of an aircraft of JSBSim"),
+        ("./empty", "found 'jsbsim:./empty', a folder with no model, expected a folder with one model"),
+        ("./two", "found 'jsbsim:./two', a folder with a.xml, b.xml, expected a folder with one model"),
+        ("empty", "found 'jsbsim:empty', expected jsbsim:./empty perhaps"),
+        ("engine.xml", "found 'jsbsim:engine.xml', a file with piston_engine, expected the XML file of an aircraft"),
+        ("text.xml", "found 'jsbsim:text.xml', a file with no XML, expected the XML file of an aircraft"),
+        ("c172q", r"found 'jsbsim:c172q', expected jsbsim:c172\w perhaps, or jsbsim:PATH with a /"),
+        ("zzz", "found 'jsbsim:zzz', expected a name in .*/aircraft, or jsbsim:PATH with a /"),
+    ],
+)
+def test_wrong_path_refused_with_what_is_there(
+    path: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("empty", "two"):
+        (tmp_path / folder).mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "two" / f"{name}.xml").write_text('<?xml version="1.0"?><fdm_config/>', encoding="utf-8")
+    (tmp_path / "engine.xml").write_bytes((PACKAGE / "engine" / "eng_io320.xml").read_bytes())
+    (tmp_path / "text.xml").write_text("x,y\n1,2\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
+        aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
+    assert len(str(refused.value)) < 300  # no list of all names
