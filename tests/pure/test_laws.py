@@ -278,10 +278,12 @@ def test_layout_shows_integrals_that_law_has(name: str, groups: set[str]) -> Non
 
 
 def test_only_gains_change_in_flight() -> None:
-    """Neither the law nor the observer changes in flight."""
+    """Neither the law nor its channels change in flight, and the models of RISE-DI alone, which can be learned."""
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
     for name in (*NAMES, *OBSERVED):
-        assert not controller(name).tunable() & {"law", "observer", "feedforward", "outputs", "D", "rate"}
+        assert not controller(name).tunable() & {"law", "outputs", "D", "rate", "learn"}
+        models = {"feedforward", "observer"} if controller(name).law == "rise_di" else set()
+        assert controller(name).tunable() & {"feedforward", "observer"} == models
 
 
 @EVERY_LAW

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from flight_analysis.closed_loop.learning import Event, Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
@@ -26,6 +27,7 @@ from flight_core.environment import require_ros_environment
 from flight_core.files import writing
 from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
 from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
@@ -194,36 +196,58 @@ def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "F
     return COMPLETED
 
 
-def fly_in_process(scenario: Scenario, run: Path, progress: Progress) -> str:
-    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome."""
+def fly_in_process(
+    scenario: Scenario,
+    run: Path,
+    progress: Progress,
+    learn: Learn | None = None,
+    announce: Callable[[str], None] = lambda line: None,
+) -> str:
+    """Fly in one process without ROS, as fast as the machine allows, and write the bag into `run`. Returns the outcome.
+
+    `learn` makes the learner of a scenario that learns. What it does goes to `announce` and to log/learner.log, a line each.
+    """
     interrupt = _DeferredInterrupt()
 
     def record(signals: Mapping[str, Signal]) -> None:
         with interrupt.deferred():
             writer.write(signals)
 
+    def learned(event: Event) -> None:
+        line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {'flies ' if event.change else ''}{event.sentence}"
+        with interrupt.deferred():
+            if event.change:
+                writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)
+            (run / "log").mkdir(exist_ok=True)
+            with (run / "log" / "learner.log").open("a", encoding="utf-8") as log:
+                log.write(f"{line}\n")
+        announce(line)
+
     with writing("", run, EXPECTED), TapeWriter(run, attachments_for(scenario, run)) as writer, handle_signals(interrupt):
-        outcome = fly(scenario, record, lambda t: progress(t, "in one process"))
+        outcome = fly(scenario, record, lambda t: progress(t, "in one process"), learn=learn, announce=learned)
         with interrupt.deferred():
             writer.add_outcome(outcome)
     return outcome
 
 
 def fly_and_report(
-    scenario: FilePath | Scenario, runs: FilePath = "runs", progress: Callable[[float], None] | None = None
+    scenario: FilePath | Scenario,
+    runs: FilePath = "runs",
+    progress: Callable[[float], None] | None = None,
+    learn: Learn | None = None,
 ) -> FlightResult:
     """Fly a scenario in one process, its log and report in a new folder of `runs`, as `rise-di fly --in-process` does.
 
-    `progress` is called with the flight time once per simulated second. A scenario that differs from its file is written beside
-    the log. The log holds the outcome of a flight that ended early. Raises ParameterError where nothing can be written, and
-    for a flight that ended before its first sample.
+    `progress` is called with the flight time once per simulated second, `learn` is as for `simulate`. A scenario that differs
+    from its file is written beside the log. The log holds the outcome of a flight that ended early. Raises ParameterError where
+    nothing can be written, and for a flight that ended before its first sample.
     """
     require(progress is None or callable(progress), "progress", progress, "a function of the flight time in s")
     chosen = find_scenario(scenario)
     run = new_run(chosen, as_path(runs, "runs", "the path of a folder"))
     if not _is_its_file(chosen):
         chosen = written(chosen, run / f"{chosen.name}.yaml")
-    outcome = fly_in_process(chosen, run, lambda t, _: None if progress is None else progress(t))
+    outcome = fly_in_process(chosen, run, lambda t, _: None if progress is None else progress(t), learn)
     return write_report(run, outcome)
 
 

@@ -64,6 +64,8 @@ def build_course(scenario: Scenario) -> Course:
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
+    fixed = getattr(controller, "learn", None) is None
+    require(fixed, "controller.learn", "a section", "none: a campaign does not learn, rise-di fly --in-process does")
     airframe, plant = aircraft.load()[0], aircraft.plant()
     tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
     ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")
@@ -102,7 +104,7 @@ def build_course(scenario: Scenario) -> Course:
         y_m,
         y_m[used],
         y_m_dot[used],
-        _feedforward(controller.nominal(), phase, dt, y_m[used]),
+        _feedforward(controller.guard().nominal, phase, dt, y_m[used]),
         error[:, order],
         over_step.reshape(ticks, -1),
         now,

@@ -121,7 +121,7 @@ def require_mission(scenario: Scenario) -> GuidanceConfig:
         expected = "a route, whose cross-track error is the score of a campaign of missions"
         raise ParameterError(f"guidance.route: found none, expected {expected}")
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices, which a campaign varies")
-    without_feedforward = scenario.controller.nominal() is None
+    without_feedforward = scenario.controller.guard().nominal is None
     require(without_feedforward, "controller.feedforward", "a model", "none where guidance commands the reference")
     require(not guidance.program, "guidance.program", ", ".join(guidance.program), "a route alone in a campaign of missions")
     require(not reference.live.bounds, "reference_model.live.bounds", "bounds", "none in a campaign of missions")

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, require_euler
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
@@ -85,6 +86,7 @@ def fly(
     _require_flyable(chosen, autopilot, in_process=in_process)
     for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
         print(f"warning: {sentence}", file=sys.stderr)
+    learn = None if getattr(chosen.controller, "learn", None) is None else _learner(chosen, in_process=in_process)
     run = new_run(chosen, runs)
     if files is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
@@ -94,7 +96,7 @@ def fly(
         print(*context.with_resource(watched(run)), sep="\n", file=sys.stderr)
     with flight_progress(chosen.flight.duration, quiet=as_json) as (progress, announce):
         if in_process:
-            outcome = fly_in_process(chosen, run, progress)
+            outcome = fly_in_process(chosen, run, progress, learn, announce)
         else:
             outcome = fly_over_topics(
                 chosen,
@@ -149,3 +151,10 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
 
         require_signs(autopilot.channel_map, scenario)
         require_limits(autopilot, scenario)
+
+
+def _learner(scenario: Scenario, *, in_process: bool) -> Learn | None:
+    from rise_di.learning import learner  # noqa: PLC0415 - loads SciPy, which few flights need
+
+    require(in_process, "controller.learn", "a flight over topics", "--in-process: the learner runs there alone")
+    return learner(scenario)

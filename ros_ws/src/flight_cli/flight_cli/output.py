@@ -105,7 +105,7 @@ def flight_progress(duration: float, *, quiet: bool) -> Iterator[tuple[Callable[
         def progress(t: float, shown: str) -> None:
             bar.update(task, completed=t, clock=f"t = {t:5.1f} of {duration:g} s", shown=shown)
 
-        yield progress, lambda line: bar.console.print(line, highlight=False, soft_wrap=True)
+        yield progress, lambda line: bar.console.print(line, highlight=False, soft_wrap=True, markup=False)
 
 
 def grouped_table(title: str, first: str, columns: Sequence[Column], rows: Iterable[Sequence[str]]) -> Table:

@@ -4,7 +4,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,8 +83,9 @@ class Recording(NamedTuple):
 class Tape:
     """A flight: signals by topic name.
 
-    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. `scenario` is the scenario that `simulate`
-    flew, None on the tape of a log. Of a log: `recording` by topic, and `duration`, s, of a whole flight where the log has it.
+    `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of `simulate`: `scenario`, and
+    `changes` of the controller's parameters in flight. Of a log: `recording` by topic, and `duration`, s, of a whole flight
+    where the log has it.
     """
 
     signals: Mapping[str, Signal]
@@ -94,6 +95,7 @@ class Tape:
     scenario: object = None
     recording: Mapping[str, Recording] = field(default_factory=dict)
     duration: float | None = None
+    changes: tuple[Mapping[str, Any], ...] = ()
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""

@@ -8,6 +8,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from mcap.records import Channel, Message, Schema
 from rosbags.serde.errors import SerdeError
 
@@ -89,6 +90,27 @@ def parameter_changes(run: Path, node: str, known: Mapping[str, object]) -> list
         if values:
             events.append((event.stamp.sec * NANOSECONDS + event.stamp.nanosec, values))
     return [values for _, values in sorted(events, key=itemgetter(0))]
+
+
+def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> bytes:
+    """A message of PARAMETER_EVENTS with changes by dotted name, the inverse of `parameter_changes`; None deletes one."""
+    store = typestore()
+    types = {name: store.types[f"rcl_interfaces/msg/{name}"] for name in ("ParameterEvent", "Parameter", "ParameterValue")}
+    texts, empty = (bool, int, float, str), np.zeros(0)
+
+    def parameter(name: str, value: Any) -> Any:
+        array = isinstance(value, (list, tuple))
+        kind = 0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
+        of_kind: dict[int, Any] = {1: False, 2: 0, 3: 0.0, 4: "", 5: empty.astype(np.uint8), 6: empty.astype(bool)}
+        of_kind |= {7: empty.astype(np.int64), 8: empty, 9: []}
+        if kind:
+            of_kind[kind] = np.array(value, dtype=of_kind[kind].dtype) if 6 <= kind < 9 else value
+        return types["Parameter"](name, types["ParameterValue"](kind, *of_kind.values()))
+
+    kept, deleted = ([parameter(*item) for item in changes.items() if (item[1] is None) == gone] for gone in (False, True))
+    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
+    event = types["ParameterEvent"](stamp, node, [], kept, deleted)
+    return bytes(store.serialize_cdr(event, PARAMETER_EVENT))
 
 
 def parameter_value(message: Any) -> Any:

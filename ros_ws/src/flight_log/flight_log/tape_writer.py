@@ -4,7 +4,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_log.bag import OUTCOME, BagChannel, BagWriter, LogAttachments
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
+from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_event
 
 EXPECTED = "a folder and a disk that can"
 
@@ -64,6 +65,13 @@ class TapeWriter:
         due = {topic: signal.stamp_ns <= newest_ns - DELAY_NS for topic, signal in joined.items()}
         self._waiting = {topic: signal.where(~due[topic]) for topic, signal in joined.items()}
         self._write({topic: signal.where(due[topic]) for topic, signal in joined.items()})
+
+    def write_changes(self, stamp_ns: int, node: str, changes: Mapping[str, Any]) -> None:
+        """Write a change of parameters of a node in flight, as the node itself publishes it."""
+        if PARAMETER_EVENTS not in self._channels:
+            self._channels[PARAMETER_EVENTS] = self._bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
+        channel = self._channels[PARAMETER_EVENTS]
+        self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, parameter_event(stamp_ns, node, changes))
 
     def add_outcome(self, outcome: str) -> None:
         """Store the outcome of the flight in the log."""

@@ -64,6 +64,7 @@ __all__ = [
     "gains_yaml",
     "law_schema",
     "laws",
+    "learner",
     "limited_integral",
     "load_airframe",
     "margins",
@@ -108,6 +109,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.flight_env import FlightEnv
     from rise_di.gain_design import check_gains, select_gains
+    from rise_di.learning import learner
     from rise_di.own_airframe import NewAirframe, new_airframe
     from rise_di.own_loop import Loop, as_control, fly_plant
     from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
@@ -145,6 +147,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.flight_env": ("FlightEnv",),
         "rise_di.gain_design": ("check_gains", "select_gains"),
+        "rise_di.learning": ("learner",),
         "rise_di.own_airframe": ("NewAirframe", "new_airframe"),
         "rise_di.own_loop": ("Loop", "as_control", "fly_plant"),
         "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),

@@ -7,11 +7,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
-from rise_di_controller import guard, internals
+from rise_di_controller import divergence, guard, internals
 from rise_di_controller.params import ControllerConfig, as_controller
 
 
@@ -40,6 +42,9 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
+        self._first, self._first_law = parameters, True
+        zero = np.zeros(len(parameters.outputs))
+        self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
         self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
@@ -78,8 +83,17 @@ class Controller:
             parameters.law,
             "the law and the observer that fly: these change at a restart",
         )
-        self._state = guard.retune(self._state, self._law, law)
-        self._law, self._guard, self._digest = law, parameters.guard(), digest
+        limits = parameters.guard()
+        self._state = guard.retune(self._state, self._law, law, (self._guard.nominal, limits.nominal))
+        self._law, self._guard, self._digest = law, limits, digest
+        self._first_law = self._has_first_model(parameters)
+
+    def fallback(self) -> ControllerConfig | None:
+        """The parameters of the start where a law with a model that was learned in flight diverges; else None."""
+        return None if self._first_law or not divergence.diverges(self._errors, self._least) else self._first
+
+    def _has_first_model(self, parameters: ControllerConfig) -> bool:
+        return (parameters.observer, parameters.feedforward) == (self._first.observer, self._first.feedforward)
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """Buffer a sample of y, shape (m,), in the law's order.
@@ -106,6 +120,7 @@ class Controller:
         if inputs is None:
             return None
         self._number += self.has_internals
+        self._errors = divergence.step(self._errors, inputs.y - inputs.y_m, inputs.dt, first_law=self._first_law)
         age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard.limits, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)

@@ -58,6 +58,12 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     return FeedforwardState(product(nominal.C.T, y_m), zeros, zero, zero, zeros)
 
 
+def restarted(state: FeedforwardState | None, y_m: Array, nominal: Nominal) -> FeedforwardState:
+    """State for a new model: the first two ticks add nothing, and states that are no outputs go on, if there are any."""
+    initial = initial_state(y_m, nominal)
+    return initial if state is None or state.x.shape != initial.x.shape else initial._replace(x=state.x)
+
+
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:
     """Input for the motion y_m_dot of the outputs of the nominal model: Omega^-1 (y_m_dot - C (A x + f(x))), shape (m,)."""
     drift = product(nominal.A, x) + product(nominal.gravity, sines(x, nominal))

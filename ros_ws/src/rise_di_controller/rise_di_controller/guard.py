@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_core.arithmetic import product
 from flight_core.failsafe import failsafe_scale
 from flight_core.modes import Mode
 from flight_core.rates import seconds
@@ -20,7 +21,8 @@ from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import feedforward, observer
 from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
-from rise_di_controller.observer import ObserverParams, ObserverState
+from rise_di_controller.law import LawState, shifted
+from rise_di_controller.observer import History, ObserverParams, ObserverState
 from rise_di_controller.saturation import Limits, saturate
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
@@ -41,6 +43,7 @@ class GuardParams(NamedTuple):
     deactivation_holds: bool  # whether u is held when deactivated; otherwise u ramps to trim
     limits: Limits
     nominal: Nominal | None = None  # None: no feedforward
+    history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
 
 
 # The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full: with half of the ticks
@@ -65,6 +68,7 @@ class ControllerState(NamedTuple):
     feedforward: FeedforwardState | None = None
     hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
     ramp_ns: int = 0
+    history: History = ()  # of the observer
 
 
 class TickInputs(NamedTuple):
@@ -153,6 +157,7 @@ def tick(
             u_free=state.u,
             u_ff=zero,
             feedforward=None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal),
+            history=(),
         )
         return engaged, TickInputs(y.stamp_ns, y.value, reference, offset, 0.0)
     if y.stamp_ns <= state.y.stamp_ns:
@@ -160,7 +165,8 @@ def tick(
     nominal = seconds(guard.period_ns)
     dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
     law_state, u_trim, u_ff, ff_state = state.law, state.u_trim, state.u_ff, state.feedforward
-    if (missed := round(dt / nominal) - 1) > 0:
+    missed = max(round(dt / nominal) - 1, 0)
+    if missed:
         held = Measurements(state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u)
         for _ in range(missed):
             law_state = control_law.missed(law_state, held, params)
@@ -175,28 +181,59 @@ def tick(
     u = saturate(u_free, state.u, dt, guard.limits)
     if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
         after, u_free, u = control_law.limited(law_state, measured, dt, params, guard.limits)
+    if guard.history:
+        lost = ((None, state.u - state.u_trim - state.u_ff),) * missed
+        history = (*state.history, *lost, (y.value - reference, u - state.u_trim - u_ff))[-guard.history :]
+        state = state._replace(history=history)
     state = state._replace(law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
 
 
-def retune(state: ControllerState, old: TunedLaw, new: TunedLaw) -> ControllerState:
+def retune(
+    state: ControllerState,
+    old: TunedLaw,
+    new: TunedLaw,
+    nominal: tuple[Nominal | None, Nominal | None] = (None, None),
+) -> ControllerState:
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
     An observer with the same matrices continues. An observer with new matrices starts again from the present error: u_o becomes
-    part of u_trim, and then fades in from 0.
+    part of u_trim, and then fades in from 0. Beside RISE-DI and with a history of the last ticks it flies on at once: z is that
+    of the new filter over these ticks, and Pi absorbs the change of u_o. A feedforward with a new model starts again: u_ff
+    becomes part of u_trim. Arguments: `nominal`, the models of the old and the new feedforward.
     """
     if state.law is None or state.y is None or state.y_m is None:
         return state
     law = new.control_law.retune(state.law, old.params, new.params)
-    if isinstance(law, ObserverState) and not _same_model(old.params, new.params):
+    changed = isinstance(law, ObserverState) and _is_replaced(old.params, new.params)
+    if changed and isinstance(law.law, LawState) and state.history:
+        z = observer.estimates_after(state.history, new.params)
+        u_o = np.clip(-product(new.params.F, z), new.params.limits.lower, new.params.limits.upper)
+        inner = shifted(law.law, law.u_o - u_o, new.params.law)
+        law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
+    elif changed and not _same_model(old.params, new.params):
         z = observer.initial_estimates(state.y.value - state.y_m, new.params)
         state = state._replace(u_trim=state.u_trim + law.u_o)
         law = law._replace(z=z, u_o=np.zeros_like(law.u_o), sigma=np.zeros_like(law.sigma))
+    if not _same_nominal(*nominal):
+        restarted = None if nominal[1] is None else feedforward.restarted(state.feedforward, state.y_m, nominal[1])
+        state = state._replace(u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=restarted)
     return state._replace(law=law)
+
+
+def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
+    """Whether the model of the observer changes, or the observer is added or removed."""
+    return not _same_model(old, new) or bool(np.any(old.limits.upper) != np.any(new.limits.upper))
 
 
 def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
     return all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("Phi", "Gamma", "H", "L", "F"))
+
+
+def _same_nominal(old: Nominal | None, new: Nominal | None) -> bool:
+    if old is None or new is None:
+        return old is new
+    return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))
 
 
 def _failsafe(

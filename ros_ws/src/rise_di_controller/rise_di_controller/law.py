@@ -160,6 +160,11 @@ def retune(state: LawState, old: LawParams, new: LawParams) -> LawState:
     return state._replace(Pi=Pi)
 
 
+def shifted(state: LawState, u: Array, params: LawParams) -> LawState:
+    """State whose u of equation (20) is higher by u, (m,): Pi+ = Pi - D u / input_scale."""
+    return state._replace(Pi=state.Pi - params.D * u / params.input_scale)
+
+
 def _control_law(sign: Sign) -> ControlLaw:
     def with_sign(params: LawParams) -> LawParams:
         return params if params.sign is sign else params._replace(sign=sign)

@@ -72,6 +72,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """Reset the law. The parameters were validated when they were set."""
         self._controller.restart()  # keeps u, so that a node that is configured again transfers without a bump
         self.get_logger().info(self.parameters.summary())
+        if getattr(self.parameters, "learn", None) is not None:
+            self.get_logger().warning("learn: no learner runs beside this node: the models stay as loaded")
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -31,6 +31,10 @@ class ObserverParams(NamedTuple):
     fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
 
 
+History = tuple[tuple[Array | None, Array], ...]
+"""e, (m,), and u - u_trim, (m,), of the last ticks; None for e of a tick without a y."""
+
+
 class ObserverState(NamedTuple):
     """State of the extended law and of the observer between two ticks."""
 
@@ -48,6 +52,21 @@ def predict(z: Array, u: Array, params: ObserverParams) -> Array:
 def initial_estimates(e: Array, params: ObserverParams) -> Array:
     """Estimates at engagement: H'e, the outputs at the errors and the rest 0."""
     return product(params.H.swapaxes(0, 1), e)
+
+
+def estimates_after(history: History, params: ObserverParams) -> Array:
+    """Estimates of the filter over the last ticks, predicted for the next tick.
+
+        z = z + L (e - H z),  z = Phi z + Gamma (u - u_trim)        from H'e of the first tick with a y
+
+    u_trim includes the feedforward of the tick. A tick without a y has no correction. `history` is not empty.
+    """
+    first = next(e for e, _ in history if e is not None)
+    z = initial_estimates(first, params)
+    for e, u in history:
+        corrected = z if e is None else z + product(params.L, e - product(params.H, z))
+        z = predict(corrected, u, params)
+    return z
 
 
 def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -> ObserverState:

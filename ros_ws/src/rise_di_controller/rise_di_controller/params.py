@@ -86,7 +86,9 @@ class ObserverConfig(Config):
     Gamma: Numbers = Field(description="effect of u, held over the period, a row an estimate, the columns as controller.inputs")
     L: Numbers = Field(description="correction by the errors of the outputs, a row an estimate")
     F: Numbers = Field(description="u_o = -F z, a row an input, a column an estimate")
-    part: Annotated[float, Field(gt=0, le=1)] = Field(default=0.6, description="bound of u_o as a part of the limits of u")
+    part: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.6, description="bound of u_o as a part of the limits of u; 0: the law alone, without u_o and u_ff"
+    )
     within: Positive = Field(default=0.1, description="least time in which u_o goes from 0 to its bound, s")
     fade: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=1.0, description="time in which u_o fades in after engagement, s"
@@ -256,6 +258,10 @@ class ControllerConfig(NodeConfig):
         estimates = () if self.observer is None else self.observer.states
         return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates)
 
+    def history_ticks(self) -> int:
+        """Ticks of the last y and u from which an observer that is replaced in flight starts."""
+        return 0
+
     def nominal(self) -> Nominal | None:
         """The arrays of the feedforward, None where there is none."""
         return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
@@ -284,7 +290,8 @@ class ControllerConfig(NodeConfig):
                 np.array(self.upper or unlimited),
                 np.array(self.slew or unlimited),
             ),
-            nominal=self.nominal(),
+            history=self.history_ticks(),
+            nominal=None if self.observer is not None and self.observer.part == 0.0 else self.nominal(),
         )
 
 

@@ -3,7 +3,7 @@
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.schedule import ScheduleParams, with_schedule
+
+HISTORY = 5.0  # s, over which a new observer runs before it flies: its disturbances then hold what the law held
 
 
 class ScheduleConfig(Config):
@@ -26,6 +28,24 @@ class ScheduleConfig(Config):
         airspeed = np.array([float(name == "V") for name in outputs])
         params = ScheduleParams(law.params, np.float64(self.speed), airspeed, np.float64(self.time))
         return TunedLaw(with_schedule(law.control_law), params)
+
+
+class LearnConfig(Config):
+    """Learning in the air, an extension of the paper: A and B are identified in flight, and the observer is designed again."""
+
+    window: Annotated[float, Field(ge=6, le=600)] = Field(default=30.0, description="length of the record of y and u, s")
+    updates: Positives = Field(
+        default=(10.0, 15.0, 20.0, 30.0, 60.0), description="flight times of the first identifications, s; then one a window"
+    )
+    latency: Annotated[float, Field(ge=0, le=60)] = Field(
+        default=4.0, description="from the end of a window until the controller takes the model, s: identification and design"
+    )
+
+    def is_due(self, t: float) -> bool:
+        """Whether an identification begins at a flight time, s, a whole number of ticks."""
+        last = self.updates[-1]
+        beyond = (t - last) % self.window
+        return t in self.updates or (t > last and min(beyond, self.window - beyond) < 1e-6)
 
 
 class RiseDiConfig(ControllerConfig):
@@ -47,6 +67,15 @@ class RiseDiConfig(ControllerConfig):
         default=None, description="an extension of the paper: input_scale follows the dynamic pressure; off where absent"
     )
 
+    learn: LearnConfig | None = Field(
+        default=None, description="an extension of the paper: A and B are identified in flight; off where absent"
+    )
+
+    @classmethod
+    def tunable(cls) -> frozenset[str]:
+        """Also the models: a learner replaces them."""
+        return (super().tunable() | {"input_scale", "feedforward", "observer"}) - {"learn"}
+
     def check_law(self) -> None:
         """A value per channel; k_d has no value for the last. A schedule needs V, and no model of the trim besides."""
         require_length("k_d", self.k_d, self.outputs[:-1])
@@ -58,11 +87,19 @@ class RiseDiConfig(ControllerConfig):
             require("V" in self.outputs, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them")
             alone = self.feedforward is None and self.observer is None
             require(alone, "schedule", "a feedforward or an observer beside it", "neither: their model holds at the trim speed")
+        if self.learn is not None:
+            require(self.observer is not None, "learn", "no observer", "one, with part 0 if it does not fly yet")
+            rising = list(self.learn.updates) == sorted(set(self.learn.updates))
+            require(rising, "learn.updates", self.learn.updates, "rising times")
 
     def tuned_law(self) -> TunedLaw:
         """The law with parameters, extended by the observer or the schedule, if any."""
         law = super().tuned_law()
         return law if self.schedule is None else self.schedule.extended(law, self.outputs)
+
+    def history_ticks(self) -> int:
+        """HISTORY where the models are learned."""
+        return 0 if self.learn is None else round(HISTORY * self.rate)
 
     def control_law(self) -> ControlLaw:
         """RISE-DI with the sampled sign."""

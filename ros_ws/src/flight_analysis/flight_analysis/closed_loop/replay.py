@@ -205,7 +205,7 @@ def _recorded(
     if isinstance(run, Tape):
         scenario = run.scenario
         own = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
-        return run, as_controller(own, "parameters"), changes or ()
+        return run, as_controller(own, "parameters"), run.changes if changes is None else changes
     own = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
     if changes is None and run.path is not None:
         changes = parameter_changes(run.path, f"{run.namespace}/controller", type(own).model_fields)
@@ -249,10 +249,10 @@ class _ParametersInForce:
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
-            before = self.law
+            law, nominal = self.law, self.limits.nominal
             self._apply(step)
             if state is not None:
-                state = guard.retune(state, before, self.law)
+                state = guard.retune(state, law, self.law, (nominal, self.limits.nominal))
         return state
 
 

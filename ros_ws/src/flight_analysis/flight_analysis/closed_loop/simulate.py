@@ -9,6 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from aircraft_sim.simulator import Simulator
+from flight_analysis.closed_loop.learning import Event, Learn, LearningLoop
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_euler
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
@@ -21,6 +22,7 @@ from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
 from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 Record = Callable[[Mapping[str, Signal]], None]
 """Takes the samples of a part of a flight, by topic."""
@@ -51,6 +53,8 @@ def simulate(
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
     control: Callable[[ControllerConfig], Controller] = Controller,
+    learn: Learn | None = None,
+    announce: Callable[[Event], None] = lambda event: None,
 ) -> Tape:
     """Fly a scenario and return the tape; `outcome` of the tape has the reason of an early end. The rest is as `fly` says.
 
@@ -60,13 +64,20 @@ def simulate(
     change = 'a function of the flight time; scenario.vary(flight={"duration": ...}) changes the duration'
     require(progress is None or callable(progress), "progress", progress, change)
     parts: list[Mapping[str, Signal]] = []
-    outcome = fly(scenario, parts.append, progress, guide, control)
+    events: list[Event] = []
+
+    def take(event: Event) -> None:
+        events.append(event)
+        announce(event)
+
+    outcome = fly(scenario, parts.append, progress, guide, control, learn, take)
     signals = {}
     for topic, last in parts[-1].items():
         samples = [part[topic] for part in parts if topic in part]
         stamp_ns = np.concatenate([signal.stamp_ns for signal in samples])
         signals[topic] = Signal(stamp_ns, last.names, np.concatenate([signal.values for signal in samples]))
-    return Tape(signals, outcome=outcome, scenario=scenario)
+    changes = tuple(event.change for event in events if event.change)
+    return Tape(signals, outcome=outcome, scenario=scenario, changes=changes)
 
 
 def fly(  # noqa: PLR0912, PLR0915 - a part a node
@@ -75,20 +86,24 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     progress: Callable[[float], None] | None = None,
     guide: Callable[[GuidanceConfig], Guidance] = Guidance,
     control: Callable[[ControllerConfig], Controller] = Controller,
+    learn: Learn | None = None,
+    announce: Callable[[Event], None] = lambda event: None,
 ) -> str:
     """Fly a scenario and return the outcome. `record` takes the samples once per simulated second and at the end.
 
     `progress` is called with the flight time after `record`. `guide` makes the guidance of a scenario with guidance;
-    the default receives the true pose. `control` makes the controller.
+    the default receives the true pose. `control` makes the controller. `learn` makes the learner of a scenario that learns, and
+    `announce` takes what it does. Raises ParameterError for such a scenario without `learn`.
 
-    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, u of the controller. The aircraft
-    holds u until the next u. A lost sample of y is not recorded; a delayed sample keeps the stamp. A flight that diverges
-    or is interrupted (Ctrl-C) ends early.
+    Order at an instant: y of the aircraft, y_m of the reference model, u_m of guidance, proposals of the learner, u of the
+    controller. The aircraft holds u until the next u. A lost sample of y is not recorded; a delayed sample keeps the stamp. A
+    flight that diverges or is interrupted (Ctrl-C) ends early.
     """
     require_euler(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     reference, controller = Reference(scenario.reference_model), control(scenario.controller)
     guidance = None if scenario.guidance is None else guide(scenario.guidance)
+    learning = _learning(scenario.controller, learn, announce)
     signals = {
         "y": _SignalBuilder(tuple(scenario.aircraft.channels().outputs)),
         "y_m": _SignalBuilder(scenario.reference_model.outputs),
@@ -133,10 +148,15 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
                 m = len(scenario.reference_model.outputs)
                 with suppress(ChannelError):
                     reference.take(t_ns, guided.u_m[:m], guided.u_m[m:])  # acts from the next step on: y_m of t is given
-            if t_ns % controller.period_ns == 0 and (output := controller.tick(t_ns)) is not None:
-                u = select(aircraft.inputs, inputs, output.u)
-                signals["u"].add(output.stamp_ns, output.u)
-                signals["internals"].add(output.stamp_ns, output.internals)
+            if t_ns % controller.period_ns == 0:
+                if learning is not None:
+                    learning.before_tick(controller, t_ns)
+                if (output := controller.tick(t_ns)) is not None:
+                    u = select(aircraft.inputs, inputs, output.u)
+                    signals["u"].add(output.stamp_ns, output.u)
+                    signals["internals"].add(output.stamp_ns, output.internals)
+                if learning is not None:
+                    learning.after_tick(output, t_ns)
             if t_ns % NANOSECONDS == 0:
                 record({topic: builder.take() for topic, builder in signals.items()})
                 if progress is not None:
@@ -149,3 +169,11 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
         outcome = f"ended at t = {seconds(t_ns):.2f} s: {error}"
     record({topic: builder.take() for topic, builder in signals.items()})
     return outcome
+
+
+def _learning(controller: ControllerConfig, learn: Learn | None, announce: Callable[[Event], None]) -> LearningLoop | None:
+    if not isinstance(controller, RiseDiConfig) or controller.learn is None:
+        return None
+    require(learn is not None, "controller.learn", "a flight without a learner", "one: learn=rise_di.learner(scenario)")
+    assert learn is not None  # noqa: S101 - for the type checker
+    return LearningLoop(controller, learn, announce)
