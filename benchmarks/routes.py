@@ -5,8 +5,8 @@
     .venv/bin/python -m benchmarks.routes [--only osprey_servo c172p 737 f16] [--cases behind helix] > routes.csv
 
 A row a flight in one process: the result, the largest cross-track error on the legs in seconds of flight at V0 and its limit,
-the largest error of the altitude. A leg that the aircraft joins counts from one radius beyond the start on, within which the
-start counts as reached; a circle counts from where the aircraft is on it. A refusal is a result, with the sentence. The wind
+the largest error of the altitude. A leg or a circle that the aircraft joins, and the leg of the start,
+count from one radius beyond on, within which the start counts as reached. A refusal is a result, with the sentence. The wind
 is known as `guidance.wind`. No number is tuned to an aircraft. Exit status 1: an error beyond its limit, a missed leg, or an
 aircraft lost.
 """
@@ -88,6 +88,7 @@ CASES: Mapping[str, Case] = {
     "20 km away": Case(far),
     "eight": Case(EIGHT),
     "eight, turbulence, wind 0.3 V": Case(EIGHT, 0.3, turbulent=True),
+    "back and forth": Case(of_radii((0, 0), (6, 0), (0, 1), (-4, -3))),
     "helix": Case(of_radii((3, 0), (8, 0), (14, 0), altitudes=(0, 120, 120))),
     "1000 m in 500 m": Case(steep),
     "wind 0.6 V": Case(BOX, 0.6),
@@ -159,7 +160,8 @@ def errors(tape: Tape, route: Route) -> tuple[float, float]:
     on_leg = (log["mode.lateral"] == Lateral.ROUTE) & (log["joining"] == 0.0) & (log["leg"] < len(route.legs) - 1)
     on_circle = np.isin(log["leg"], circles)
     on_leg &= ~on_circle | (log["loitered"] > 0.0)
-    for k in np.flatnonzero((log["joining"][:-1] != 0.0) & (log["joining"][1:] == 0.0)) + 1:
+    begins = (log["joining"] != 0.0) | (on_circle & (log["loitered"] == 0.0))
+    for k in [0, *(np.flatnonzero(begins[:-1] & ~begins[1:]) + 1)]:
         from_start = np.hypot(log["pose.north"] - log["pose.north"][k], log["pose.east"] - log["pose.east"][k])
         on_leg[k:] &= (log["leg"][k:] != log["leg"][k]) | (from_start[k:] > route.radius)
     off = np.abs(log["pose.altitude"] - log["target.altitude"])

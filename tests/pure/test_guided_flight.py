@@ -552,8 +552,8 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
     section = load_scenario(scenario.path).guidance
     assert section is not None
     assert section.waypoints() == (Waypoint(0, 0, 0, 25.0), Waypoint(800, 0, 10, 26.5), Waypoint(800, 900, 10, 26.5))
-    with pytest.raises(ParameterError, match=r"route\[1\]: found a turn of -?[0-9]+ deg, expected at most 150"):
-        with_route(ROUTE, [Waypoint(0.0, 0.0, 0.0), Waypoint(900.0, 0.0, 0.0), Waypoint(0.0, 0.0, 0.0)])
+    with pytest.raises(ParameterError, match=r"guidance\.route: found 1 waypoints, expected two or more"):
+        with_route(ROUTE, [Waypoint(0.0, 0.0, 0.0)])
     with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):
         simulate(ROUTE.vary(aircraft={"kinematics": "linear"}))
     with pytest.raises(ParameterError, match="kinematics: found 'linear' beside guidance"):

@@ -183,6 +183,16 @@ def test_first_waypoint_has_to_be_reached() -> None:
     assert log["target.altitude"] == pytest.approx(150.0, abs=0.1)  # at the begin of the slope
 
 
+def test_leg_after_sharp_corner_is_joined() -> None:
+    """A turn of 174 deg has no fillet: the aircraft passes the waypoint, and a circle leads it onto the leg back."""
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0))
+    assert flown.at(990.0, 3.0)["leg"] == 0.0
+    log = flown.at(1001.0, 3.0)
+    assert (log["leg"], log["missed"], abs(log["joining"])) == (1.0, 0.0, 1.0)
+    back = math.atan2(160.0, -1600.0)
+    assert flown.at(1000.0 + 5.0 * math.cos(back), 5.0 * math.sin(back), back)["joining"] == 0.0
+
+
 def test_leg_passed_far_away_is_missed() -> None:
     flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0))
     assert flown.at(990.0, 600.0)["leg"] == 0.0

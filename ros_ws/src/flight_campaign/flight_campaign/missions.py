@@ -347,7 +347,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         missed = ends & (jnp.hypot(position[0] - leg.end[0], position[1] - leg.end[1]) > leg.near)
         number = jnp.where(ends, state.leg + 1, state.leg)
         still = jnp.where(joins_leg & ~onto(leg, position), state.joining, 0.0)
-        return fly(before, number, jnp.where(missed, joins(at(number)), still), missed)
+        return fly(before, number, jnp.where(ends, joins(at(number)), still), missed)
 
     return jax.lax.switch(action, (lambda: state, begin, step))
 

@@ -178,11 +178,16 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
             points = [path.along(leg.start, leg.end, k / count) for k in range(count + 1)]
         north, east = np.array(points).T
         inside = clearance(fence.zones, north, east)
+        if path.turns_back(leg, next(iter(route.legs[number + 1 :]), None)):
+            inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
         where = f"{abs(inside[worst]):.0f} m {'inside' if inside[worst] >= 0.0 else 'outside'} of the fence"
         found = f"leg {number}, {where} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
         require(bool(inside[worst] >= margin), "route", found, f"at least {margin:.0f} m inside")
 
+
+TURN_BACK = 3.0
+"""Radii within which an aircraft joins the next leg after a corner without a fillet; the osprey took 2.0."""
 
 POINT_DISTANCE = 0.05
 """Distance of the points of a line at which the fence is checked, in radii of the fillets."""

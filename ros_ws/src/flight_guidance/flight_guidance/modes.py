@@ -522,10 +522,8 @@ def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, rou
         return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
     if leg.end is None or not path.passed(leg, position):
         return state, 0.0
-    distance = math.dist(leg.end, position)
-    if distance > near:
-        return _joining(state, state.leg + 1, 0.0, pose, route), distance
-    return _on_leg(state, state.leg + 1, route), 0.0
+    distance = math.dist(leg.end, position)  # after a sharp corner, too, the next leg is joined
+    return _joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
 
 
 def _loitering(state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float) -> GuidanceState:

@@ -16,7 +16,7 @@ from flight_guidance.lateral import PathError
 Point = tuple[Scalar, Scalar]  # north, east, m
 
 SHARPEST = math.radians(150.0)
-"""Largest change of course at a waypoint: beyond it the fillet cuts the corner by more than 2.8 radii."""
+"""Largest turn of a fillet, which cuts the corner by 2.8 radii. A sharper corner is passed, and the next leg joined."""
 
 JOINED = math.radians(30.0)
 """Largest difference between the course flown and that of a leg where an aircraft leaves the joining circle for the leg."""
@@ -261,6 +261,13 @@ def distance_from(legs: Sequence[Leg], point: Point) -> float:
     return min(distances)
 
 
+def turns_back(leg: Leg, following: Leg | None) -> bool:
+    """Whether a corner between two lines is beyond SHARPEST."""
+    if not isinstance(leg, Line) or not isinstance(following, Line):
+        return False
+    return abs(math.remainder(end_course(following) - end_course(leg), 2.0 * math.pi)) > SHARPEST
+
+
 def leads(legs: Sequence[Leg]) -> list[int]:
     """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to the next waypoint."""
     numbers, at = [], 0
@@ -283,11 +290,12 @@ def route(
 ) -> tuple[Leg, ...]:
     """Legs through waypoints with fillets of a radius in the corners, m, then an orbit round the last waypoint, clockwise.
 
-    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint. At a waypoint of `loiters`, by the number, a
-    clockwise circle round the waypoint takes the place of the fillet. Lines touch circles and the orbit; a line too short for a
+    A corner of the turn tau begins and ends radius tan(tau / 2) from the waypoint; one beyond SHARPEST has no fillet. At a
+    waypoint of `loiters`, by the number, a clockwise circle round the waypoint takes the place of the fillet. Lines touch
+    circles and the orbit; a line too short for a
     tangent leads to the waypoint. Raises ParameterError for fewer than two waypoints, a radius below `least`
-    (`lateral.least_radius`), a corner beyond SHARPEST, and a waypoint within the circle of a loiter; ShortLegError for a leg
-    too short for the fillets. Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
+    (`lateral.least_radius`), and a waypoint within the circle of a loiter; ShortLegError for a leg too short for the fillets.
+    Source: R. W. Beard, T. W. McLain, Small Unmanned Aircraft (2012), algorithm 8.
     """
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
@@ -331,11 +339,9 @@ def _between_circles(waypoints: Sequence[Point], radius: float, first: int, *, l
 def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg]:
     """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number of the first waypoint."""
     turns = [0.0]
-    for k, (before, at, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False), first + 1):
+    for before, at, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):
         turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
-        actual, expected = f"a turn of {math.degrees(turn):.0f} deg", f"at most {math.degrees(SHARPEST):.0f} deg either way"
-        require(abs(turn) <= SHARPEST, f"route[{k}]", actual, expected)
-        turns.append(turn)
+        turns.append(turn if abs(turn) <= SHARPEST else 0.0)
     turns.append(0.0)
     cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
     legs: list[Leg] = []
