@@ -78,6 +78,7 @@ TOPICS = (
             "campaign-missions": "uncertain aircraft on a route",
             "cluster": "a campaign on a cluster of dask with faults",
             "compare": "other laws on the same aircraft and course",
+            "margins": "the cost of a phase margin under five laws",
         },
         "[Experiments](experiments.md#other-laws) describes laws, scores and costs. "
         "All laws have the same aircraft, winds and tuning.",

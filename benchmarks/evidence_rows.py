@@ -209,6 +209,21 @@ def compare(result: Any) -> Iterator[Row]:
         yield row(f"{law}: cost of the worst seed of the tuning less the least", of["spread"])
 
 
+def margins(result: Any) -> Iterator[Row]:
+    """Of benchmarks/margins.py: by law and phase margin asked, the margin found, scores, and shares of lost aircraft."""
+    for name in ("aircraft", "seed"):
+        yield row(name, result[name])
+    for of in result["rows"]:
+        asked = "as it ships" if of["asked"] == "-" else f"{of['asked']} deg asked"
+        law = f"{of['law']}, {asked}"
+        yield row(f"{law}: phase margin", of["found"], "deg")
+        for level, score in of["score"].items():
+            spread = f"+-{100 * float(level):g} %"
+            for kind in ("mean", "worst"):
+                yield row(f"{law}: score, {spread}, {kind}", _score(score[kind]))
+            yield row(f"{law}: lost, {spread}, u late by 20 ms", 100.0 * of["lost_late"][level], "%")
+
+
 def _score(value: float | None) -> float | str:
     return "diverged" if value is None else value
 

@@ -53,6 +53,13 @@ LAW |= {"score": {"gust": 1.61, "turbulence": 2.61}}
 LAW |= {"levels": [LEVEL], "late": [{"delay": 0.02, "lost": 0.26}], "slew": {"elevator": 0.077}, "cost": 7.25, "spread": 0.5}
 COMPARED = {"aircraft": 200, "seed": 1, "wind": "air_relative", "turbulence_seed": 3}
 PI = LAW | {"law": "pi", "levels": [LEVEL | {"gust": UNCERTAIN | {"mean": None}}]}
+TRADED = {
+    "law": "pi",
+    "asked": "45",
+    "found": 45.6,
+    "score": {"0.5": {"mean": 1.75, "worst": 2.48}},
+    "lost_late": {"0.5": 0.26},
+}
 FIGURE = {"mean": 1.31, "q50": 1.21, "q95": 2.31, "q99": 2.71, "worst": 3.01, "deviation": 0.1}
 COVERAGE = {"status": 0, "covered": 1234, "number_of_executed_units": 98765, "peak_rss_mb": 321}
 CAMPAIGN: dict[str, Any] = {"whole": 120_000.0, "flown": 150_000.0, "memory_early": 900.0, "memory": 905.0, "aircraft": 10_000}
@@ -98,6 +105,7 @@ RESULTS: dict[str, Any] = {
     "campaign-fleet": {"cases": [FLEET]},
     "cluster": {"faults": "worker killed", "workers": 4, "aircraft": 2000, "chunks": 40, "same": 39},
     "compare": COMPARED | {"laws": [LAW, PI]},
+    "margins": {"aircraft": 200, "seed": 1, "rows": [TRADED]},
     "view": VIEW,
     "replay": {"osprey_gust": {"outcome": "completed", "ticks": 6001, "checked": 6001, "equal": True}},
 }
@@ -256,6 +264,8 @@ def leaves(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
         ("compare", Row("rise, tuned on gust: score, gust, +-30 %, worst", "2.48")),
         ("compare", Row("pi, tuned on gust: score, gust, +-30 %, mean", "diverged")),
         ("compare", Row("rise, tuned on gust: lost, +-30 %, u late by 20 ms", "26", "%")),
+        ("margins", Row("pi, 45 deg asked: phase margin", "45.6", "deg")),
+        ("margins", Row("pi, 45 deg asked: lost, +-50 %, u late by 20 ms", "26", "%")),
         ("view", Row("log of 1 h: read whole after the start of rise-di watch", "5", "s", goal="<= 3")),
         ("view", Row("flight 2, with a client: late p99", "1.23", "ms")),
         ("view", Row("with a client: late p99, median of the differences", "0.05", "ms", goal="<= 0.1")),
