@@ -3,6 +3,7 @@
 """The account of a flight: every command says what a log lacks, and no figure stands for more than was recorded."""
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -152,6 +153,16 @@ def test_outcome_survives_lost_summary(whole: Path, tmp_path: Path) -> None:
         if not kept:
             (run / SUMMARY).unlink()
         assert write_report(run).flight.summary["outcome"] == expected
+
+
+def test_truncated_log_without_planned_end_is_incomplete(tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.5})
+    mcap = write_run(simulate(scenario), tmp_path / "run", LogAttachments(scenario.path))
+    mcap.write_bytes(mcap.read_bytes()[: mcap.stat().st_size // 2])
+    outcome = read_flight(mcap).summary["outcome"]
+    assert re.search(
+        r"^unknown: .*, log incomplete: .*_0.mcap is truncated: read up to its last complete chunk, t = [\d.]+ s$", outcome
+    )
 
 
 def test_outcome_that_launch_left_is_kept(tmp_path: Path) -> None:

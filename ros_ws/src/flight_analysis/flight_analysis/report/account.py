@@ -153,7 +153,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         if topic.expected is not None and topic.unsent > (1.0 - WHOLE) * topic.expected
     ]
     legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
-    return Account(end, topics, (*_lost_parts(tape.notes), *lacks), _too_busy(busy), unguided, tuple(legs))
+    parts = _lost_parts(tape.notes, planned=planned_ns is not None)
+    return Account(end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs))
 
 
 RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
@@ -163,8 +164,10 @@ def _too_busy(parts: Sequence[str]) -> str:
     return f"this host is too busy: {', '.join(parts)}; see docs/faults.md" if parts else ""
 
 
-def _lost_parts(notes: Iterable[str]) -> list[str]:
-    return [note.partition(";")[0] for note in notes if "and missing; the log is a part" in note]
+def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
+    """Parts of a bag that are missing. A truncated end counts where no planned end does."""
+    kinds = ["and missing; the log is a part", *([] if planned else [" is truncated: "])]
+    return [note.partition(";")[0] for note in notes if any(kind in note for kind in kinds)]
 
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:

@@ -28,7 +28,7 @@ from flight_log.bag import OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.tape_reader import PARAMETERS, RecordedRun, read_run
+from flight_log.tape_reader import AIRCRAFT_TOPICS, PARAMETERS, RecordedRun, read_run
 
 SUMMARY, REPORT = "summary.json", "report.html"
 AIRFRAME, AIRCRAFT, PROVENANCE = "airframe.yaml", "aircraft.zip", "provenance.yaml"  # attachments of the log
@@ -110,7 +110,9 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
 
 
 def log_account(recorded: RecordedRun) -> Account | None:
-    """What a log lacks; None for a log without a scenario that can be read."""
+    """What a log lacks; None for a log without a flight, and without a scenario that can be read."""
+    if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
+        return None
     try:
         scenario = parse_recorded_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
     except ParameterError:
