@@ -28,6 +28,7 @@ from flight_cli.output import show_flight
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import path
+from flight_guidance.fence import Fence, Zone
 from flight_guidance.guidance import names
 from flight_guidance.modes import Lateral, Mode, Vertical
 from flight_guidance.path import Arc, Line, Route
@@ -146,7 +147,7 @@ def curve(figure: Figure, name: str, row: int) -> FloatArray:
 def test_ground_track_has_equal_axes_and_arrows_of_wind() -> None:
     figure = drawn(guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED))
     assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
-    assert [trace.name for trace in figure.data] == ["flown", "wind, the longest arrow 5 m/s"]
+    assert [trace.name for trace in figure.data] == ["flown", "start and end", "wind, the longest arrow 5 m/s"]
     arrows = figure.layout.annotations
     assert len(arrows) == guided_figures.WIND_ARROWS
     assert (arrows[0].ax, arrows[0].ay) == pytest.approx((-guided_figures.ARROW_PIXELS, 0.0), abs=1e-9)  # points to the east
@@ -218,6 +219,20 @@ def test_comparison_draws_all_ground_tracks_over_route(flight: RecordedFlight, t
     tracks = {"one": (flight.tape, "#000000"), "two": (flight.tape, "#111111")}
     figure = drawn(guided_figures.tracks_figure(tracks, routes))
     assert [trace.name for trace in figure.data] == ["route", "one", "two"]
+
+
+def test_report_opens_with_track_of_numbered_legs_and_fence(flight: RecordedFlight, tmp_path: Path) -> None:
+    write_page(tmp_path / "page.html", [flight])
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert page.index("<h2>Ground track</h2>") < page.index("<table>")
+    fence = Fence((Zone((0.0, 900.0, 900.0), (0.0, 0.0, 900.0)), Zone((400.0,), (200.0,), 50.0, exclude=True)), (300.0, 100.0))
+    routes = guided_figures.flown_routes(flight.scenario, flight.tape)
+    traces = {trace.name: trace for trace in drawn(guided_figures.track_figure(flight.tape, routes, 25.0, fence)).data}
+    assert list(traces["legs"].text) == ["0", "2", "4", "6", "7"]  # the fillets are 1, 3, 5
+    assert (traces["start and end"].y[0], traces["start and end"].x[0]) == pytest.approx((0.0, 0.0), abs=1.0)
+    assert np.asarray(traces["fence"].y).tolist() == [0.0, 900.0, 900.0, 0.0]
+    assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == pytest.approx(np.full(73, 50.0))
+    assert (traces["home"].y[0], traces["home"].x[0]) == (300.0, 100.0)
 
 
 def test_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:

@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,8 +26,9 @@ from flight_analysis.report.summary import QUANTITY_UNITS
 from flight_core.modes import Mode as ControllerMode
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_guidance.fence import Fence
 from flight_guidance.modes import Lateral, Mode, Vertical
-from flight_guidance.path import Route, route_outline
+from flight_guidance.path import Line, Point, Route, along, is_orbit, route_outline
 from flight_guidance.wind import wind_of
 
 TRACK_POINTS = 2400
@@ -71,11 +73,51 @@ def flown_routes(scenario: Scenario, tape: Tape) -> list[Route]:
     return [route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown]
 
 
-def track_figure(tape: Tape, routes: Sequence[Route], speed: float) -> Figure:
-    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s."""
+def track_figure(tape: Tape, routes: Sequence[Route], speed: float, fence: Fence | None = None) -> Figure:
+    """Ground track over the routes with their fillets, equal axes, and arrows of the wind. `speed`: trim speed V0, m/s.
+
+    With the numbers of lines and circles, the start, the end, and the fence with home.
+    """
     figure = tracks_figure({"flown": (tape, PLANT)}, routes)
+    pose = tape["guidance"].group("pose")
+    ends = {"x": pose["east"][[0, -1]], "y": pose["north"][[0, -1]], "text": ["start", "end"], "name": "start and end"}
+    _add_labels(figure, ends | {"marker": {"color": PLANT, "size": 9, "symbol": ["circle-open", "square"]}})
+    for route in routes:
+        _add_numbers(figure, route)
+    if fence is not None:
+        _add_fence(figure, fence)
     _add_wind(figure, tape, speed)
     return set_layout(figure, labels=16)
+
+
+def _add_labels(figure: Figure, trace: dict[str, Any]) -> None:
+    labels = {"type": "scatter", "mode": "markers+text", "textposition": "top center", "hoverinfo": "skip", "showlegend": False}
+    figure.add(labels | trace)
+
+
+def _add_numbers(figure: Figure, route: Route) -> None:
+    """The number of a leg at the middle of a line, and at the centre of a circle."""
+    places: dict[int, Point] = {}
+    for number, leg in enumerate(route.legs):
+        if isinstance(leg, Line):
+            places[number] = along(leg.start, leg.end, 0.5)
+        elif is_orbit(leg):
+            places[number] = leg.centre
+    north, east = (np.array(values) for values in zip(*places.values(), strict=True))
+    _add_labels(figure, {"x": east, "y": north, "text": [f"{number}" for number in places], "mode": "text", "name": "legs"})
+
+
+def _add_fence(figure: Figure, fence: Fence) -> None:
+    for zone in fence.zones:
+        turn = np.linspace(0.0, 2.0 * math.pi, 73)
+        north, east = np.array([*zone.north, zone.north[0]]), np.array([*zone.east, zone.east[0]])
+        if zone.radius:
+            north, east = zone.north[0] + zone.radius * np.cos(turn), zone.east[0] + zone.radius * np.sin(turn)
+        line = {"color": END_STOP, "width": 2.0, "dash": "dot" if zone.exclude else "solid"}
+        name = "keep out" if zone.exclude else "fence"
+        figure.add({"type": "scatter", "x": east, "y": north, "mode": "lines", "name": name, "line": line, "hoverinfo": "skip"})
+    home = {"x": [fence.home[1]], "y": [fence.home[0]], "text": ["home"], "name": "home"}
+    _add_labels(figure, home | {"marker": {"color": END_STOP, "size": 9, "symbol": "diamond"}})
 
 
 def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route]) -> Figure:

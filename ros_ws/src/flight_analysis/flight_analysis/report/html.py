@@ -59,6 +59,7 @@ class Section(NamedTuple):
     hint: str
     figure: Figure | None
     over_time: bool = True  # all figures over time are zoomed together
+    opens: bool = False  # whether the section stands before the tables
 
 
 class Page(NamedTuple):
@@ -191,13 +192,16 @@ def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) ->
     if flight.summary["guidance"] is None:
         return []
     speed, bounds = flight.scenario.aircraft.channels().speed, guided_figures.bounds_of(flight.scenario)
+    guidance = flight.scenario.guidance
     routes, context = guided_figures.flown_routes(flight.scenario, flight.tape), guided_figures.guided_context(context)
     return [
         Section(
             "Ground track",
-            "Arrows: mean wind over a part of the flight, from the velocities over ground and through the air.",
-            guided_figures.track_figure(flight.tape, routes, speed),
+            "North is up. Numbers: legs of the route. Arrows: mean wind over a part of the flight, from the velocities over"
+            " ground and through the air.",
+            guided_figures.track_figure(flight.tape, routes, speed, None if guidance is None else guidance.fence_zones()),
             over_time=False,
+            opens=True,
         ),
         Section(
             "Altitude and airspeed over their commands",
