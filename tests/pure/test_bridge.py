@@ -19,7 +19,7 @@ from flight_bringup.fly import _follow_real_time, _interrupt
 from flight_bringup.processes import handle_signals
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
-from flight_core.vectors import ChannelError, StampedVector
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
 
 pytestmark = pytest.mark.package("autopilot_bridge")
 
@@ -48,8 +48,8 @@ def receive_u(bridge: Bridge, t: float, u: float = 0.0, sender: str = "controlle
 
 
 def unlimited(name: str) -> ChannelMap:
-    """A map of the library without its envelope, which needs the pose."""
-    return load_map(name).model_copy(update={"envelope": {}})
+    """A map of the library without its limits of the pose."""
+    return load_map(name).model_copy(update={"envelope": {}, "engage_if": {}})
 
 
 def new_bridge(channel_map: ChannelMap = CHANNEL_MAP, *, dry_run: bool = False) -> Bridge:
@@ -594,6 +594,44 @@ def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float,
     assert bridge.step(at(0.03)) is Phase.RELEASE
     lower, upper = ENVELOPE[name]
     assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
+
+
+def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:
+    content = CHANNEL_MAP.model_dump() | {"envelope": {"climb": [-8.0, 8.0]}, "engage_if": {"climb": [-2.0, 2.0]}}
+    bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
+    receive_u(bridge, 0.0)
+    receive_outputs(bridge, 0.0, (*OUTPUTS, "climb"), raw=2.1)
+    assert bridge.engage(at(0.0)) == "climb is 2.1, outside engage_if [-2, 2]"
+    receive_outputs(bridge, 0.01, ("climb",), raw=1.9)
+    assert bridge.engage(at(0.01)) == ""
+    receive_outputs(bridge, 0.02, ("climb",), raw=7.9)
+    assert bridge.step(at(0.02)) is Phase.ENGAGED
+    receive_outputs(bridge, 0.03, ("climb",), raw=-8.4)  # the sink of ArduPlane with a jammed elevator
+    assert bridge.step(at(0.03)) is Phase.RELEASE
+    assert bridge.reason == "climb is -8.4, outside the envelope [-8, 8]"
+
+
+def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not() -> None:
+    content = CHANNEL_MAP.model_dump()
+    for name in ("elevator", "aileron", "rudder"):
+        content["inputs"][name]["at_limit"] = 0.1
+    bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
+    assert bridge.engage(at(0.0)) == ""
+    lower, upper = (np.array([content["inputs"][name][key] for name in content["inputs"]]) for key in ("lower", "upper"))
+
+    def fly(t: float, u: FloatArray) -> Phase:
+        receive_outputs(bridge, t)
+        receive_u(bridge, t)
+        bridge.take_u(StampedVector(at(t), u, "controller"), at(t))
+        return bridge.step(at(t))
+
+    aileron_inside = np.array([0.0, 1.0, 0.99, 0.0])
+    assert fly(0.01, upper) is Phase.ENGAGED
+    assert fly(0.10, upper * aileron_inside) is Phase.ENGAGED  # the time begins again
+    assert fly(0.11, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.ENGAGED
+    assert fly(0.20, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.ENGAGED
+    assert fly(0.21, lower * [0.0, 1.0, 1.2, 0.0]) is Phase.RELEASE
+    assert bridge.reason == "aileron is at its limit for 0.1 s, p does not answer"
 
 
 def test_envelope_whose_channel_is_stale_releases_channels() -> None:

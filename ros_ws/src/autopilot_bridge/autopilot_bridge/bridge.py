@@ -74,6 +74,7 @@ class Bridge:
         self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
         self._blind = False  # whether the engagement goes on without the transmitter
+        self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
         self._watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
         rows = channel_map.inputs.values()
@@ -139,14 +140,26 @@ class Bridge:
         row = self._rows[name]
         return _staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
-    def _outside(self) -> str:
-        """The channels that are outside the envelope, as a sentence; empty where none is. All of them were received."""
-        values = ((name, self._value(name), limits) for name, limits in self.channel_map.envelope.items())
+    def _outside(self, section: str = "envelope") -> str:
+        """The channels that are outside the limits of a section of the map, as a sentence. All of them were received."""
+        what = "the envelope" if section == "envelope" else section
+        values = ((name, self._value(name), limits) for name, limits in getattr(self.channel_map, section).items())
         return "; ".join(
-            f"{name} is {value:.3g}, outside the envelope [{lower:g}, {upper:g}]"
+            f"{name} is {value:.3g}, outside {what} [{lower:g}, {upper:g}]"
             for name, value, (lower, upper) in values
             if not lower <= value <= upper
         )
+
+    def _does_not_answer(self, now_ns: int) -> str:
+        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the aircraft does not follow."""
+        sentences = []
+        for name, u, lower, upper in zip(self.inputs, self._u, self._lower, self._upper, strict=True):
+            row = self.channel_map.inputs[name]
+            if row.at_limit is None or lower < u < upper:
+                self._limit_ns.pop(name, None)
+            elif now_ns - self._limit_ns.setdefault(name, now_ns) >= nanoseconds(row.at_limit):
+                sentences.append(f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not answer")
+        return "; ".join(sentences)
 
     def _unmet(self, now_ns: int, *, awaited: bool) -> str:
         """The conditions that do not hold, as a sentence; those that an engagement awaits, or the others."""
@@ -230,6 +243,7 @@ class Bridge:
             lambda _: "" if self._blind or self._watches_transmitter or self.channel_map.max_engaged else UNBOUNDED,
             self._missing,
             lambda _: self._outside(),
+            lambda _: self._outside("engage_if"),
             lambda _: self._away_from_trim(),
             lambda _: "; ".join(filter(None, map(self._beyond_range, self.channel_map.trims))),
         )
@@ -241,8 +255,9 @@ class Bridge:
         return f"pilot override active: {', '.join(active)}" if active else ""
 
     def _missing(self, now_ns: int) -> str:
-        """What is stale of y, of the envelope, of the trims' sources and of u, as a sentence."""
-        sources = {key: stale for key in map(trim_key, self.channel_map.trims) if (stale := self._staleness(key, now_ns))}
+        """What is stale of y, of envelope and engage_if, of the trims' sources and of u, as a sentence."""
+        keys = (*map(trim_key, self.channel_map.trims), *self.channel_map.engage_if)
+        sources = {key: stale for key in keys if (stale := self._staleness(key, now_ns))}
         return "; ".join(filter(None, (_sentence(self.stale(now_ns) | sources), self._u_timeout(now_ns))))
 
     def _away_from_trim(self) -> str:
@@ -308,9 +323,9 @@ class Bridge:
     def step(self, now_ns: int) -> Phase:
         """Phase at an instant.
 
-        A stale y or u, a value outside the envelope, a lost condition, a conflicting publisher or `max_engaged` ends an
-        engagement. The phases ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL also with a lost condition or a
-        conflicting publisher.
+        A stale y or u, a value outside the envelope, an input that stays at its limit, a lost condition, a conflicting
+        publisher or `max_engaged` ends an engagement. The phases ENGAGING, NEUTRAL and RELEASE end after their times, NEUTRAL
+        also with a lost condition or a conflicting publisher.
         """
         if self.phase is Phase.ENGAGING:
             self._continue_engagement(now_ns)
@@ -318,7 +333,8 @@ class Bridge:
             self.disengage(lost, now_ns)
         elif self.phase is Phase.ENGAGED:
             measured = _sentence(self.stale(now_ns))
-            if ended := "; ".join(filter(None, (self._lost(now_ns), measured))) or self._outside():
+            reasons = "; ".join(filter(None, (self._lost(now_ns), measured))) or self._outside()
+            if ended := reasons or self._does_not_answer(now_ns):
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
                 self.reason = timeout
@@ -416,6 +432,7 @@ class Bridge:
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase, self._phase_ns = phase, now_ns
         if phase is Phase.ENGAGED:
+            self._limit_ns = {}
             self._begin_time(now_ns)
             self.reason = self._lacks(now_ns)
         elif phase in {Phase.RELEASE, Phase.DISENGAGED}:

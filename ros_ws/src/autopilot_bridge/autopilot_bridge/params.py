@@ -114,6 +114,9 @@ class InputRow(MovingRow):
     upper: NonNegative = Field(description="the upper limit of u around trim, SI")
     range: Range = Field(description="the lowest and the highest raw value of the field")
     neutral: float | Literal["trim"] = Field(description="failsafe: the raw value that is sent when u has timed out, or trim")
+    at_limit: Positive | None = Field(
+        default=None, description="how long u may stay at one of its limits while engaged, s: then the bridge disengages"
+    )
     release: Raw | None = Field(
         description="the raw value that returns the channel to the autopilot, for example NaN; null where nothing is sent"
     )
@@ -238,6 +241,9 @@ class ChannelMap(Config):
     envelope: dict[str, Limits] = Field(
         default={}, description="limits of channels of the pose or of y: the bridge disengages beyond them"
     )
+    engage_if: dict[str, Limits] = Field(
+        default={}, description="limits of channels of the pose or of y at an engagement alone: outside it is refused"
+    )
     inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
     trims: dict[str, MeasuredRow] = Field(
         default={}, description="sources of the raw values of inputs in trim, by input: captured at each engagement"
@@ -276,9 +282,10 @@ class ChannelMap(Config):
         for name in self.outputs:
             require(name not in self.pose, f"outputs.{name}", "a channel of the pose too", "a name of its own")
         watched = [*self.pose, *self.outputs]
-        for name, (lower, upper) in self.envelope.items():
-            require(name in watched, f"envelope.{name}", "a channel", f"one of the pose or of y: {', '.join(watched)}")
-            require(lower < upper, f"envelope.{name}", [lower, upper], "the lower end before the upper one")
+        for section, limits in (("envelope", self.envelope), ("engage_if", self.engage_if)):
+            for name, (lower, upper) in limits.items():
+                require(name in watched, f"{section}.{name}", "a channel", f"one of the pose or of y: {', '.join(watched)}")
+                require(lower < upper, f"{section}.{name}", [lower, upper], "the lower end before the upper one")
         for name, override in self.overrides.items():
             thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
             found = " and ".join(thresholds) or "no threshold"
