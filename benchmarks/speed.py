@@ -320,6 +320,8 @@ def flight_rows(seconds: float, folder: Path) -> Iterator[Row]:
         FlightMonitor(scenario.controller.outputs, lockstep=True) as monitor,  # without a subscription to internals
         FlightProcesses(scenario, run, monitor, lockstep=False, one_process=False) as flight,
     ):
+        if reason := flight.begin():
+            raise RuntimeError(reason)
         time.sleep(max(flight.start_time - time.time(), 0.0) + WARM_UP)
         processes = flight.processes
         for process, figures in zip(processes, _use([process.popen.pid for process in processes], seconds), strict=True):

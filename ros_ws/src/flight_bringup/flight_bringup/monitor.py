@@ -41,7 +41,7 @@ class FlightMonitor(Client):
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process
-        self._publish_start = None if lockstep else self._node.create_publisher(START.type, START.name, STATE).publish
+        self._publish_start = self._node.create_publisher(START.type, START.name, STATE).publish
         self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
@@ -55,8 +55,7 @@ class FlightMonitor(Client):
 
     def start(self, start_time: float) -> None:
         """Give the nodes the system time of t = 0, s."""
-        if self._publish_start is not None:
-            self._publish_start(instant(nanoseconds(start_time)))
+        self._publish_start(instant(nanoseconds(start_time)))
 
     def is_flying(self, node: str, pid: int) -> bool:
         """Whether the aircraft has taken a u."""
