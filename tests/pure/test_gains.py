@@ -467,6 +467,7 @@ def test_command_names_conditions_that_scenario_fails() -> None:
     assert result.exit_code == 1
     assert "beta above slew of q: found 14.7, expected at least 22.8" in result.stdout
     assert "beta in units of y / s^2" in " ".join(result.stdout.split())
+    assert "theta, phi integrate the outputs (osprey)" in result.stdout  # as docs/theory.md and `airframes` say
 
 
 def test_command_shows_sign_of_each_channel() -> None:
@@ -546,8 +547,9 @@ def test_the_command_lists_the_airframes() -> None:
     assert listed["f16_lateral"]["for_D_I"] == "flip aileron, rudder"
     assert (listed["osprey"]["controllable"], listed["osprey"]["integrated"]) == (True, ["theta", "phi"])
     printed = rise_di("airframes").stdout
-    assert "Outside the theorem: none" in printed
-    assert "marginal: phi, theta integrate the outputs and need an outer loop" in printed
+    assert "Without D, controllability or stable zeros: none" in printed
+    assert "Zeros at the origin are outside Assumption 3" in printed
+    assert "phi, theta integrate the outputs" in printed
     assert "controllable" in printed
     assert printed.count("aerosonde_first_edition_lateral ") == 3  # on one line in each table
 

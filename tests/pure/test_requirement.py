@@ -3,6 +3,8 @@
 """Margins as a requirement: gains whose measured margins meet it, checked by python-control, and what a margin costs."""
 
 import math
+import re
+from functools import cache
 from pathlib import Path
 
 import control
@@ -55,6 +57,7 @@ def integrators() -> Airframe:
     )
 
 
+@cache
 def selected(phase_margin: float) -> RiseDiConfig:
     whole = find_scenario("osprey_servo").reference_model.model_dump(exclude_none=True)
     commands = {
@@ -180,8 +183,12 @@ def rise_di(*arguments: str) -> Result:
 
 def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
-    result = rise_di("osprey", "--samples", "2", "--phase-margin", "50", "--write", str(path))
+    page = tmp_path / "loop.html"
+    result = rise_di("osprey", "--samples", "2", "--phase-margin", "50", "--write", str(path), "--page", str(page))
     assert result.exit_code == 0, result.output
+    assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(
+        re.findall(r">([^<>]+)<", page.read_text())
+    )
     assert "Trade" in result.stdout
     text = path.read_text(encoding="utf-8")
     assert "# Phase margins elevator " in text
@@ -203,5 +210,5 @@ def test_gains_without_the_margins_are_not_written(tmp_path: Path, monkeypatch: 
     assert str(result.exception).startswith("--write: ")
     assert str(result.exception).endswith("; --accept writes them all the same")
     assert not path.exists()
-    assert rise_di("osprey", *slow, "--accept", "--write", str(path)).exit_code == 0
+    assert rise_di("osprey", *slow, "--accept", "--json", "--write", str(path)).exit_code == 0
     assert path.exists()

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library
+from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
 from flight_cli.output import new_table, print_json
 
 
@@ -50,11 +50,12 @@ def airframes(
         roots.add_row(airframe.name, _format_roots(airframe.poles), _format_roots(airframe.zeros), minors)
     console.print(roots)
     outside = [airframe.name for airframe in facts if not airframe.in_theorem]
-    console.print(f"Outside the theorem: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).", soft_wrap=True)
-    integrated = list(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
-    if integrated:
-        verbs = "integrates the outputs and needs" if len(integrated) == 1 else "integrate the outputs and need"
-        console.print(f"marginal: {', '.join(integrated)} {verbs} an outer loop.", soft_wrap=True)
+    console.print(
+        f"Without D, controllability or stable zeros: {', '.join(outside) or 'none'}. Coupling is max abs(U - I).",
+        soft_wrap=True,
+    )
+    if marginal := marginal_sentence(facts):
+        console.print(marginal, soft_wrap=True)
 
 
 def _table(title: str, *headings: str) -> Table:

@@ -11,15 +11,19 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from flight_analysis.closed_loop.margins import linear_loop
 from flight_analysis.design import gain_selection
+from flight_analysis.design.airframe_properties import airframe_facts, marginal_sentence
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_analysis.design.gain_selection import GainAssessment, Selection, Study
 from flight_analysis.design.requirement import PHASE_MARGIN
 from flight_analysis.design.trade import trade
+from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import LICENCE, new_table, options, parse_numbers, print_json, write_text
+from flight_core.files import writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from rise_di.gain_design import check_gains, select_gains
@@ -79,6 +83,10 @@ def gains(
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
     ] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option(help="HTML file for the margins with Bode and Nyquist plots: of the engineering gains, or with --check."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every condition on both.
@@ -127,6 +135,8 @@ def gains(
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
                 write_text("--write", write, LICENCE + gain_selection.as_yaml(selection, theorem=theorem))
     found = next(iter(answers.values())).study
+    if page is not None:
+        _write_page(page, [*answers.values()][-1])
     if as_json:
         print_json(_as_json(found, answers, seed))
     else:
@@ -139,6 +149,14 @@ def gains(
             console.print(f"gains: {write}")
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def _write_page(path: Path, answer: Assessment) -> None:
+    """The margins of a gain set on a page. Raises ParameterError for the literal sign, which has no linear loop."""
+    study = answer.study
+    loop = linear_loop(answer.controller, study.airframe, study.A, study.B)
+    with writing("--page", path, "a page that can"):
+        write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
 def _require_margins(found: Assessment, accept: bool) -> None:
@@ -197,6 +215,8 @@ def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> Non
         for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
             table.add_row(_condition_name(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
         console.print(table)
+    if first.theorem and (marginal := marginal_sentence([airframe_facts(found.airframe)])):
+        console.print(marginal, highlight=False, soft_wrap=True)
     estimate = "" if first.bounds is None else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
     console.print(f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True)
     for word, meaning in MEANINGS.items() if first.bounds is not None else ():

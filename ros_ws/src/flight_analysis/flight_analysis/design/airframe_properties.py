@@ -6,6 +6,7 @@ Assumption 2 (f is C1, f and f_dot bounded) has no check here: the file's schema
 have bounded rates for bounded angular rates.
 """
 
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ class ZeroDynamics(StrEnum):
     """Location of the invariant zeros, the criterion of Assumption 3."""
 
     STABLE = "stable"  # all in the open left half plane
-    MARGINAL = "marginal"  # some on the imaginary axis: angles that integrate the rates; an outer loop has to bound them
+    MARGINAL = "marginal"  # some on the imaginary axis, outside too: angles that integrate the rates need an outer loop
     UNSTABLE = "unstable"  # one in the right half plane: outside the theorem
 
 
@@ -143,6 +144,17 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     H = np.eye(n)[:, np.sort(pivots[m:])]
     inverse = np.asarray(np.linalg.inv(np.vstack([C, H.T])))
     return inverse[:, :m], inverse[:, m:], H
+
+
+def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
+    """Which zeros on the imaginary axis Assumption 3 does not cover; "" for none."""
+    states = list(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
+    names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
+    if not names:
+        return ""
+    integrate = f": {', '.join(states)} integrate{'s' if len(states) == 1 else ''} the outputs" if states else ""
+    where = f"{integrate} ({', '.join(names)})"
+    return f"Zeros at the origin are outside Assumption 3, an outer loop has to bound their states{where}."
 
 
 def zero_dynamics(zeros: ComplexArray) -> ZeroDynamics:

@@ -80,6 +80,12 @@ def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
     write_file(path, page_html(page))
 
 
+def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
+    """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
+    table = margins.margin_table(loop_assessment(loop))
+    write_file(path, page_html(Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore())))
+
+
 def _flight_page(flight: RecordedFlight) -> Page:
     units, gusts = display_units(flight.scenario), flight.scenario.gust_windows()
     context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(flight)
