@@ -42,7 +42,7 @@ from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.modes import TARGETS as MODE_TARGETS
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.route_file import ENDINGS, Origin, read_route_file
+from flight_guidance.route_file import ENDINGS, Origin, read_fence_file, read_route_file
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records
 from flight_log.named_vectors import decoder, tables
 from flight_log.playback import read_playback
@@ -160,11 +160,12 @@ def message(data: bytes, folder: Path) -> None:
 
 
 def route(data: bytes, folder: Path) -> None:
-    """A route file, by each reader."""
+    """A route or fence file, by each reader."""
     for ending in ENDINGS:
         path = folder / f"route{ending}"
         path.write_bytes(data)
         rejected(lambda path=path: read_route_file(path, Origin(47.4, 8.5), 30.0, 5.0))  # type: ignore[misc]  # bound in the loop
+        rejected(lambda path=path: read_fence_file(path, Origin(47.4, 8.5), 30.0))  # type: ignore[misc]  # likewise
 
 
 def targets(data: bytes, folder: Path) -> None:
@@ -375,6 +376,7 @@ _ROUTES = [
     b'{"type": "LineString", "coordinates": [[8.5, 47.4, 500], [8.51, 47.4, 510.5]]}',
     b'{"features": [{"properties": {"V": 25}, "geometry": {"type": "Point", "coordinates": [8.5, 47.4, 500]}}]}',
     b"<kml><Point><altitudeMode>absolute</altitudeMode><coordinates>8.5,47.4,500</coordinates></Point></kml>",
+    b'{"fileType": "Plan", "geoFence": {"polygons": [{"polygon": [[47.4, 8.5], [47.41, 8.5], [47.4, 8.51]]}]}}',
 ]
 
 _HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nCookie: rise_di_PORT=a-token\r\n\r\n"

@@ -414,13 +414,13 @@ def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
 def _plan_fence(tree: Any, key: str) -> FencePlaces:
     fence = _member(tree, "geoFence")
     zones = []
-    for zone in _member(fence, "polygons") or ():
+    for zone in _entries(fence, "polygons", key):
         corners = [_lat_lon(corner) for corner in _listed(_member(zone, "polygon"), key)]
         zones.append(Area(corners, None, not _member(zone, "inclusion")))
-    for zone in _member(fence, "circles") or ():
+    for zone in _entries(fence, "circles", key):
         circle = _member(zone, "circle")
         zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not _member(zone, "inclusion")))
-    rally = [_lat_lon(point, Above.HOME) for point in _member(_member(tree, "rallyPoints"), "points") or ()]
+    rally = [_lat_lon(point, Above.HOME) for point in _entries(_member(tree, "rallyPoints"), "points", key)]
     return FencePlaces(zones, rally, _home(_member(_member(tree, "mission"), "plannedHomePosition")))
 
 
@@ -428,10 +428,10 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
     """Polygons, whose holes are excluded, and Points with the property `radius`; the property `exclude` excludes a zone."""
     _require_wgs84(tree, key)
     zones: list[Area] = []
-    for feature in _member(tree, "features") or [tree]:
+    for feature in _entries(tree, "features", key) or [tree]:
         node, properties = _member(feature, "geometry") or feature, _member(feature, "properties")
         kind, coordinates = _member(node, "type"), _listed(_member(node, "coordinates"), key)
-        require(kind in {"Polygon", "MultiPolygon", "Point"}, key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
+        require(kind in ("Polygon", "MultiPolygon", "Point"), key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
         exclude, radius = bool(_member(properties, "exclude")), _member(properties, "radius")
         if kind == "Point":
             require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
@@ -467,6 +467,13 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
 
 
 FENCE_IN, FENCE_OUT, CIRCLE_IN, CIRCLE_OUT, RALLY = 5001, 5002, 5003, 5004, 5100  # MAV_CMD
+
+
+def _entries(tree: Any, name: str, key: str) -> list[Any]:
+    """A member of a JSON object that is a list; empty where absent."""
+    value = _member(tree, name)
+    require(value is None or isinstance(value, list), key, f"{name}: {short_repr(value)}", "a list")
+    return list(value or ())
 
 
 def _listed(value: Any, key: str) -> list[Any]:
