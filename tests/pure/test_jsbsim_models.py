@@ -25,7 +25,9 @@ from aircraft_sim.jsbsim_aircraft import (
     root,
 )
 from aircraft_sim.jsbsim_model import JsbsimModel
+from aircraft_sim.jsbsim_trim import trim_solution
 from flight_bringup.scenarios import find_scenario
+from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di import Scenario, fly
@@ -148,3 +150,11 @@ def test_wrong_path_refused_with_what_is_there(
     with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
         aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
     assert len(str(refused.value)) < 300  # no list of all names
+
+
+def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Path) -> None:
+    model = tmp_path / "lone.xml"
+    model.write_bytes(electric.read_bytes())
+    condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
+    with pytest.raises(FlightEnded, match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$"):
+        trim_solution(condition)

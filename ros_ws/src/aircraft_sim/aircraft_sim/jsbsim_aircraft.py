@@ -10,7 +10,7 @@ import difflib
 import io
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -199,8 +199,7 @@ def model_archive(model: Path) -> bytes:
     members = {
         f"aircraft/{model.stem}/{path.relative_to(model.parent)}": path for path in sorted(model.parent.rglob(f"*{SUFFIX}"))
     }
-    elements = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim has loaded the file
-    named = {Path(name).stem for element in elements if (name := element.get("file"))}
+    named = {Path(name).stem for name in _named_files(model)}
     for folder in ("engine", "systems"):
         of_root = (path for path in sorted((root_of(model) / folder).glob(f"*{SUFFIX}")) if path.stem in named)
         members |= {f"{folder}/{path.name}": path for path in of_root}
@@ -209,3 +208,17 @@ def model_archive(model: Path) -> bytes:
         for name, path in members.items():
             archive.writestr(zipfile.ZipInfo(name), path.read_bytes(), zipfile.ZIP_DEFLATED)
     return content.getvalue()
+
+
+def missing_engines(model: Path) -> str:
+    """A sentence on engines and thrusters that a model names and that are in no folder of JSBSim; "" where all are there."""
+    folders = model.parent / "Engines", root_of(model) / "engine"
+    names = sorted({Path(name).stem for name in _named_files(model, ("engine", "thruster"))})
+    missing = [name for name in names if not any((folder / f"{name}{SUFFIX}").is_file() for folder in folders)]
+    return f"no {SUFFIX} of {', '.join(missing)} is in {folders[0]} or {folders[1]}" if missing else ""
+
+
+def _named_files(model: Path, elements: Collection[str] = ()) -> list[str]:
+    """The files that a model names, in these elements or in all."""
+    every = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim reads the file too
+    return [name for element in every if (name := element.get("file")) and (not elements or element.tag in elements)]

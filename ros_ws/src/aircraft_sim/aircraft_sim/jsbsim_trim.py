@@ -12,7 +12,17 @@ import jsbsim
 import numpy as np
 
 from aircraft_sim import isolated
-from aircraft_sim.jsbsim_aircraft import INPUTS, RESIDUALS, STATES, Command, FlightCondition, Trim, root, root_of
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    RESIDUALS,
+    STATES,
+    Command,
+    FlightCondition,
+    Trim,
+    missing_engines,
+    root,
+    root_of,
+)
 from flight_core.outcome import FlightEnded
 from flight_core.rates import nanoseconds, seconds
 from flight_core.units import FOOT
@@ -211,6 +221,8 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     if own:
         fdm.set_aircraft_path(str(model.parent))
     fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
+    if own and (problem := missing_engines(model)):
+        raise FlightEnded(f"{condition.title} cannot be loaded: {problem}")
     try:
         loaded = fdm.load_model(model.stem, not own)  # a model of JSBSim is in a folder of its name
     except jsbsim.BaseError as error:
