@@ -24,6 +24,7 @@ from flight_analysis.design.bridge_identification import (
     Channels,
     channel_models,
     channel_pairs,
+    cut_short,
     experiment,
     flying_scenario,
     join,
@@ -41,6 +42,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_log.engagements import Engagement
 from flight_log.tape_writer import write_run
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
@@ -252,6 +254,21 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
     assert model is not None
     assert model.usable
     np.testing.assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
+
+
+@pytest.mark.parametrize(("zero", "usable"), [(20.0, True), (41.4, False), (-1.0, False)])
+def test_model_with_a_zero_that_no_feedforward_can_fly_gives_way_to_the_step_response(zero: float, usable: bool) -> None:
+    model = ChannelModel(
+        0.03, 0.007, 214.0, 30.0, 788.0, zero * 214.0, np.zeros((6, 6)), 0.15
+    )  # q of PX4's airplane, zero 41.4
+    assert model.usable is usable
+
+
+def test_experiment_that_the_bridge_cut_short_names_the_release() -> None:
+    release = Engagement(5_000_000_000, 17_000_000_000, "theta is 0.51, outside the envelope [-0.5, 0.5]")
+    expected = "the bridge released after 12 of 52 s: theta is 0.51, outside the envelope [-0.5, 0.5]"
+    assert cut_short([release], 52.0) == expected
+    assert cut_short([release, release._replace(stop_ns=None)], 52.0) == ""
 
 
 def test_noise_far_above_response_leaves_no_model() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from autopilot_bridge.params import ChannelMap, load_map
+from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.bridge_identification import (
@@ -19,6 +20,7 @@ from flight_analysis.design.bridge_identification import (
     Flyable,
     channel_models,
     channel_pairs,
+    cut_short,
     experiment,
     flying_scenario,
     join,
@@ -27,7 +29,7 @@ from flight_analysis.design.bridge_identification import (
     require_envelope,
 )
 from flight_analysis.design.log_import import COMMANDS, median_trims
-from flight_analysis.design.open_loop_fit import ChannelModel
+from flight_analysis.design.open_loop_fit import FASTEST_ZERO, ChannelModel
 from flight_analysis.design.requirement import Requirement
 from flight_analysis.design.response_identification import Response, identify_response
 from flight_analysis.design.sign_check import OPEN_LOOP
@@ -38,6 +40,7 @@ from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import flight_progress, new_table, print_json
 from flight_core.files import display_path, write_file, writing
 from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_log.tape_reader import read_run
 
@@ -60,15 +63,11 @@ def identify_behind_bridge(
     if log is None:
         require_envelope(channel_map)
     run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
-    tape, spans = _engaged(run)
-    pairing, _ = channel_pairs(channel_map)
-    is_imported = COMMANDS in tape
-    trims = median_trims(tape[COMMANDS]) if is_imported else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
-    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
-    _show_response(console, channel_map.name, response, trims)
-    models = channel_models(channel_map, tape, spans, speed)
-    _show_models(console, response, models)
-    found = join(channel_map, response, models)
+    tape, spans, ended = _engaged(run)
+    try:
+        trims, response, found = _identified(console, channel_map, tape, spans, speed)
+    except ParameterError as error:
+        raise ParameterError("; ".join(filter(None, (str(error), ended)))) from None
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()), needed)
     require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --accept beside --bridge")
@@ -82,6 +81,20 @@ def identify_behind_bridge(
     _show_gains(console, found, response, flyable)
     scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
     console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
+
+
+def _identified(
+    console: Console, channel_map: ChannelMap, tape: Tape, spans: list[tuple[int, int]], speed: float
+) -> tuple[dict[str, float], Response, Channels]:
+    """Trims, step responses and channels of an experiment, shown. Raises ParameterError for a channel that is not certain."""
+    pairing, _ = channel_pairs(channel_map)
+    is_imported = COMMANDS in tape
+    trims = median_trims(tape[COMMANDS]) if is_imported else measured_trims(channel_map, tape["bridge/would_send"], spans[0][0])
+    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs, engaged=spans)
+    _show_response(console, channel_map.name, response, trims, sum(stop - start for start, stop in spans) / NANOSECONDS)
+    models = channel_models(channel_map, tape, spans, speed)
+    _show_models(console, response, models)
+    return trims, response, join(channel_map, response, models)
 
 
 def _excite(console: Console, channel_map: ChannelMap, map_name: str, speed: float, folder: Path, amplitude: float) -> Path:
@@ -136,9 +149,10 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
     )
 
 
-def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
-    """The tape of an experiment and its engaged spans, ns; all of a flight that `rise-di import` took from another log.
+def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]], str]:
+    """The tape of an experiment, its engaged spans, ns, and a sentence on how the bridge cut it short, empty for a whole one.
 
+    The span of a flight that `rise-di import` took from another log is all of it.
     Raises ParameterError for a log without an engagement, and for a flight under feedback: its u follows y.
     """
     recorded = read_run(run)
@@ -146,14 +160,16 @@ def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]]]:
     tape, flown = recorded.tape, recorded.engagements
     if COMMANDS in tape:
         recorded.require("y", "u")
-        return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))]
-    law = "not recorded" if recorded.scenario is None else recorded_parameters(recorded.scenario).law
+        return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], ""
+    parameters = None if recorded.scenario is None else recorded_parameters(recorded.scenario)
+    law = "not recorded" if parameters is None else parameters.law
     require(law == OPEN_LOOP, f"{run}: law", law, f"{OPEN_LOOP}: the log of an experiment, or of rise-di import")
     for topic in ("y", "u", "bridge/would_send"):
         require(topic in tape, str(run), f"no {topic}", "a log of a flight with a bridge")
     if not flown:
         raise ParameterError(f"{run}: found no engagement, expected a flight in which the bridge was engaged")
-    return tape, [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
+    spans = [(engagement.start_ns, engagement.stop_ns or int(tape["u"].stamp_ns[-1])) for engagement in flown]
+    return tape, spans, cut_short(flown, parameters.duration) if isinstance(parameters, ExcitationConfig) else ""
 
 
 def _digits(value: float, digits: int) -> str:
@@ -161,10 +177,11 @@ def _digits(value: float, digits: int) -> str:
     return f"{float(f'{value:.{digits}g}'):g}"
 
 
-def _show_response(console: Console, name_of_map: str, response: Response, trims: dict[str, float]) -> None:
+def _show_response(console: Console, name_of_map: str, response: Response, trims: dict[str, float], engaged: float) -> None:
     headings = ("input", "trim", "moves", "Omega", "+-", "lag", "+-", "delay", "+-")
     table = new_table(
-        f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s of log; SI, standard errors",
+        f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s without gaps of {engaged:.0f} s engaged;"
+        " SI, standard errors",
         headings,
         left=("input", "moves"),
     )
@@ -196,8 +213,9 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
     without = [name for name, model in zip(response.outputs, models, strict=True) if model is None or not model.usable]
     if without:
         console.print(
-            f"{', '.join(without)}: no certain model, so that the law has {without[0]}_dot = Omega u from the step response:"
-            " no damping in its feedforward, and the integral by bandwidth alone.",
+            f"{', '.join(without)}: no certain model without a zero above {FASTEST_ZERO:g} 1/s, so that the law has"
+            f" {without[0]}_dot = Omega u from the step response: no damping in its feedforward, and the integral by bandwidth"
+            " alone.",
             highlight=False,
             soft_wrap=True,
         )

@@ -6,6 +6,7 @@ The experiment excites the inputs in turn, open loop. `identify_response` estima
 airframe of the scenarios is y_dot = Omega u: nothing further is known of the aircraft.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -32,6 +33,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_log.engagements import Engagement
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop
@@ -128,6 +130,21 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
         scenario_text(heading, airframe_file, wait + controller.duration, none, controller.model_dump(exclude_defaults=True)),
         controller,
     )
+
+
+WHOLE = 0.95  # of the planned duration: reports of the engagement are late by less than the rest
+
+
+def cut_short(flown: Sequence[Engagement], duration: float) -> str:
+    """When and why the bridge released before the end of an experiment, as a sentence; empty for a whole one.
+
+    Arguments: the engagements of the log; the planned duration, s.
+    """
+    lengths = [math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS for part in flown]
+    engaged = max(lengths)
+    if engaged > WHOLE * duration:
+        return ""
+    return f"the bridge released after {engaged:.0f} of {duration:.0f} s: {flown[lengths.index(engaged)].reason}"
 
 
 def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float) -> list[ChannelModel | None]:

@@ -30,6 +30,7 @@ BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
 MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
 LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
 MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel
+FASTEST_ZERO = 25.0  # 1/s: a feedforward of 100 Hz follows no faster one (rise_di_controller.params, _check_nominal)
 MIN_GAIN = 0.85  # of the misfit, by which a second order has to lower it: noise alone does not in 10 s
 # Delay s, lag s, damping 1/s, stiffness 1/s^2, zero 1/s: a slow response to slow servos, a short-period or Dutch roll mode of a
 # transport and that of a model aircraft
@@ -67,9 +68,10 @@ class ChannelModel(NamedTuple):
 
     @property
     def usable(self) -> bool:
-        """Whether gain and phase of the loop are certain, and the zero is stable: noise may be as large as y."""
+        """Whether gain and phase of the loop are certain, and a feedforward can fly the zero: noise may be as large as y."""
         gain, phase = self.at_loop_frequency()
-        return gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY and self.slow * self.Omega >= 0.0
+        is_certain = gain.is_certain and phase.deviation <= 1.0 / MIN_CERTAINTY
+        return is_certain and 0.0 <= self.slow / self.Omega <= FASTEST_ZERO
 
     def at_loop_frequency(self) -> tuple[Estimate, Estimate]:
         """abs(y / u), and the phase lag of y behind u, rad, at LOOP_FREQUENCY.
