@@ -104,8 +104,8 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
     u, t = tape["u"].values, tape.time("u")
     step = np.abs(np.diff(u, axis=0))
     at = int(np.searchsorted(t, SWITCH))
-    # in turbulence u moves in each tick, and the new gains act on noise of the same size
-    assert (step[at - 1] <= 2.0 * step[at - 200 : at - 1].max(axis=0)).all()
+    # in turbulence u moves in each tick, and u_o goes to -F z within `observer.within`, 0.1 s: 31 mrad or 3 % a tick
+    assert (step[at - 1] <= step[at - 200 : at - 1].max(axis=0) + 0.032).all()
     assert len(lines) == 1
     assert "B[p, aileron]" in lines[0]
     assert (run / "log" / "learner.log").read_text(encoding="utf-8").splitlines() == lines
@@ -157,8 +157,8 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     taken, back = tape.changes
     assert taken["observer.part"] == 1.0
     assert vary(vary(start, taken), back) == start
-    # V diverges first. The law alone has 0.11 m/s in this turbulence.
-    assert error(tape, 6.0, 8.0)[1] > 0.3
+    assert (error(tape, 6.0, 8.0) > 2.0 * error(tape, 3.0, 6.0)).any()
+    # the law alone has up to 0.11 m/s in this turbulence
     assert (error(tape, 10.0, 12.0) < 0.15).all()
     assert replay(tape).equal()
 

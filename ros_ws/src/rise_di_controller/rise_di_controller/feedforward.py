@@ -58,10 +58,15 @@ def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     return FeedforwardState(product(nominal.C.T, y_m), zeros, zero, zero, zeros)
 
 
-def restarted(state: FeedforwardState | None, y_m: Array, nominal: Nominal) -> FeedforwardState:
-    """State for a new model: the first two ticks add nothing, and states that are no outputs go on, if there are any."""
-    initial = initial_state(y_m, nominal)
-    return initial if state is None or state.x.shape != initial.x.shape else initial._replace(x=state.x)
+def continued(state: FeedforwardState | None, y_m: Array, y_m_dot: Array, dt: Array, nominal: Nominal) -> FeedforwardState:
+    """State for a new model in the same motion: x and u_0 stay, where there are any, and u is that of the new model.
+
+    u_ff goes on at u - u_0. Arguments: y_m_dot and dt of the last tick.
+    """
+    start = initial_state(y_m, nominal)
+    if state is not None and state.x.shape == start.x.shape:
+        start = start._replace(x=state.x, u_0=state.u_0)
+    return start._replace(u=ideal(start.x, y_m_dot, nominal), dt=dt, ticks=start.ticks + 2.0)
 
 
 def ideal(x: Array, y_m_dot: Array, nominal: Nominal) -> Array:

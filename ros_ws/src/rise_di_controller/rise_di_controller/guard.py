@@ -13,16 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_core.arithmetic import product
 from flight_core.failsafe import failsafe_scale
 from flight_core.modes import Mode
 from flight_core.rates import seconds
-from flight_core.vectors import FloatArray, StampedVector
+from flight_core.vectors import Array, FloatArray, StampedVector
 from rise_di_controller import feedforward, observer
 from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
-from rise_di_controller.observer import History, ObserverParams, ObserverState
+from rise_di_controller.observer import ObserverParams, ObserverState, PastTick
 from rise_di_controller.saturation import Limits, saturate
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
@@ -68,7 +67,7 @@ class ControllerState(NamedTuple):
     feedforward: FeedforwardState | None = None
     hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
     ramp_ns: int = 0
-    history: History = ()  # of the observer
+    history: tuple[PastTick, ...] = ()
 
 
 class TickInputs(NamedTuple):
@@ -182,9 +181,9 @@ def tick(
     if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
         after, u_free, u = control_law.limited(law_state, measured, dt, params, guard.limits)
     if guard.history:
-        lost = ((None, state.u - state.u_trim - state.u_ff),) * missed
-        history = (*state.history, *lost, (y.value - reference, u - state.u_trim - u_ff))[-guard.history :]
-        state = state._replace(history=history)
+        lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal)),) * missed
+        last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt))
+        state = state._replace(history=(*state.history, *lost, last)[-guard.history :])
     state = state._replace(law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
 
@@ -197,28 +196,51 @@ def retune(
 ) -> ControllerState:
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
-    An observer with the same matrices continues. An observer with new matrices starts again from the present error: u_o becomes
-    part of u_trim, and then fades in from 0. Beside RISE-DI and with a history of the last ticks it flies on at once: z is that
-    of the new filter over these ticks, and Pi absorbs the change of u_o. A feedforward with a new model starts again: u_ff
-    becomes part of u_trim. Arguments: `nominal`, the models of the old and the new feedforward.
+    An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
+    the same motion: z is that of the new filter over these ticks, the mean of u becomes trim, and u_o holds the rest.
+    Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Arguments:
+    `nominal`, the models of the old and the new feedforward.
     """
-    if state.law is None or state.y is None or state.y_m is None:
+    y, y_m = state.y, state.y_m
+    if state.law is None or y is None or y_m is None:
         return state
     law = new.control_law.retune(state.law, old.params, new.params)
-    changed = isinstance(law, ObserverState) and _is_replaced(old.params, new.params)
-    if changed and isinstance(law.law, LawState) and state.history:
-        z = observer.estimates_after(state.history, new.params)
-        u_o = np.clip(-product(new.params.F, z), new.params.limits.lower, new.params.limits.upper)
-        inner = shifted(law.law, law.u_o - u_o, new.params.law)
-        law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
-    elif changed and not _same_model(old.params, new.params):
-        z = observer.initial_estimates(state.y.value - state.y_m, new.params)
+    before, after = nominal
+    other_nominal = not _same_nominal(before, after)
+    other_model = isinstance(law, ObserverState) and _is_replaced(old.params, new.params)
+    if len(state.history) > 1 and isinstance(law, ObserverState) and isinstance(law.law, LawState):
+        change: Array = np.zeros_like(state.u)  # of u_ff
+        if other_nominal:
+            state, change = _with_nominal(state, y_m, after)
+        if other_model or other_nominal:
+            # The mean of the law's part is trim. The rest passes to u_o, which goes on to -F z at its own rate.
+            mean = np.mean([past.u for past in state.history], axis=0) - change
+            rest = state.u - state.u_trim - state.u_ff - mean
+            limits = new.params.limits
+            u_o = np.clip(rest, limits.lower, limits.upper)
+            inner = shifted(law.law, rest - u_o - (state.u - state.u_trim - state.u_ff + change - law.u_o), new.params.law)
+            z = observer.estimates_after(state.history, mean + change, new.params)
+            state = state._replace(u_trim=state.u_trim + mean)
+            law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
+        return state._replace(law=law)
+    if other_model and not _same_model(old.params, new.params):
+        z = observer.initial_estimates(y.value - y_m, new.params)
         state = state._replace(u_trim=state.u_trim + law.u_o)
         law = law._replace(z=z, u_o=np.zeros_like(law.u_o), sigma=np.zeros_like(law.sigma))
-    if not _same_nominal(*nominal):
-        restarted = None if nominal[1] is None else feedforward.restarted(state.feedforward, state.y_m, nominal[1])
-        state = state._replace(u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=restarted)
+    if other_nominal:
+        start = None if after is None else feedforward.initial_state(y_m, after)
+        state = state._replace(u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start)
     return state._replace(law=law)
+
+
+def _with_nominal(state: ControllerState, y_m: FloatArray, nominal: Nominal | None) -> tuple[ControllerState, Array]:
+    """The state with the feedforward of another model in the same motion, and the change of u_ff, (m,)."""
+    u_ff, goes_on = np.zeros_like(state.u), None
+    if nominal is not None:
+        earlier, last = state.history[-2], state.history[-1]
+        goes_on = feedforward.continued(state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal)
+        u_ff = goes_on.u - goes_on.u_0
+    return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
 
 
 def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:

@@ -31,8 +31,13 @@ class ObserverParams(NamedTuple):
     fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
 
 
-History = tuple[tuple[Array | None, Array], ...]
-"""e, (m,), and u - u_trim, (m,), of the last ticks; None for e of a tick without a y."""
+class PastTick(NamedTuple):
+    """A tick in the record from which a new observer starts."""
+
+    e: Array | None  # (m,); None for a tick without a y
+    u: Array  # (m,) u less the trim and the feedforward of the tick
+    y_m: Array  # (m,)
+    dt: Array  # () length of the tick, s
 
 
 class ObserverState(NamedTuple):
@@ -54,18 +59,17 @@ def initial_estimates(e: Array, params: ObserverParams) -> Array:
     return product(params.H.swapaxes(0, 1), e)
 
 
-def estimates_after(history: History, params: ObserverParams) -> Array:
+def estimates_after(history: tuple[PastTick, ...], change: Array, params: ObserverParams) -> Array:
     """Estimates of the filter over the last ticks, predicted for the next tick.
 
-        z = z + L (e - H z),  z = Phi z + Gamma (u - u_trim)        from H'e of the first tick with a y
+        z = z + L (e - H z),  z = Phi z + Gamma (u - change)        from H'e of the first tick with a y
 
-    u_trim includes the feedforward of the tick. A tick without a y has no correction. `history` is not empty.
+    A tick without a y has no correction. Arguments: `history` with a y at least; `change` of the feedforward since then, (m,).
     """
-    first = next(e for e, _ in history if e is not None)
-    z = initial_estimates(first, params)
-    for e, u in history:
-        corrected = z if e is None else z + product(params.L, e - product(params.H, z))
-        z = predict(corrected, u, params)
+    z = initial_estimates(next(tick.e for tick in history if tick.e is not None), params)
+    for tick in history:
+        corrected = z if tick.e is None else z + product(params.L, tick.e - product(params.H, z))
+        z = predict(corrected, tick.u - change, params)
     return z
 
 

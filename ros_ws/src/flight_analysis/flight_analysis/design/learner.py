@@ -22,6 +22,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
 
 MAX_WHITENESS = 3.0  # 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft does
+AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
@@ -74,7 +75,7 @@ class Learner:
         if len(self._record) < SHORTEST / self._period:
             return Proposal(None, f"record: found {len(self._record) * self._period:.3g} s, expected {SHORTEST:g} s")
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
-        found = self.identification = identify(self.recording(), self._airframe, self._actuation, channels)
+        found = self.identification = identify(self.recording(), self._airframe, self._actuation, channels, at_bound=AT_BOUND)
         rough = not self._has_model and found.before.whiteness.max() <= MAX_WHITENESS and explains(found)
         refusal = "" if rough else found.refusal or not_white(found)
         if refusal:

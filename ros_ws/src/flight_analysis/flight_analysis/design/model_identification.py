@@ -281,11 +281,13 @@ def identify(
     actuation: Actuation,
     channels: ChannelPairing | None = None,
     progress: Callable[..., None] = lambda **_: None,
+    at_bound: int = 0,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `progress` is called with the steps `completed` of the search, and their largest number `total`.
+    airframe's order; `at_bound` how many entries may lie at their bound; `progress` is called with the steps `completed` of the
+    search, and their largest number `total`.
     """
     recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
     model = filter_model(airframe, actuation, recorded)
@@ -303,7 +305,7 @@ def identify(
     predictions = prediction(first, held_out), prediction(last, held_out)
     identified = with_entries(airframe, entries)
     sentences = (
-        another_airframe(entries, airframe.name),
+        another_airframe(entries, airframe.name, at_bound),
         too_little_excitation(entries, airframe.outputs),
         other_signs(airframe, identified, channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))),
         no_better(*predictions),
@@ -384,9 +386,10 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     )
 
 
-def another_airframe(entries: Iterable[Entry], name: str) -> str:
-    """The entries at the bound of the search."""
-    if at_bound := [entry.name for entry in entries if abs(entry.error) >= MAX_ERROR]:
+def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> str:
+    """The entries at the bound of the search, if more than `allowed`."""
+    at_bound = [entry.name for entry in entries if abs(entry.error) >= MAX_ERROR]
+    if len(at_bound) > allowed:
         return (
             f"airframe {name}: found {', '.join(at_bound)} at the bound of +-{100 * MAX_ERROR:g} %, expected a log of this"
             " airframe, in calm air if its effect of wind is not known"
