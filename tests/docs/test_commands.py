@@ -45,7 +45,8 @@ def make(words: list[str]) -> None:
     folder = REPOSITORY
     if words[:1] == ["-C"]:
         folder, words = folder / words[1], words[2:]
-    targets = re.findall(r"^([\w.-]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    rules = re.findall(r"^([\w. -]+):(?!=)", (folder / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    targets = " ".join(rules).split()
     asked = [word for word in words if "=" not in word]
     assert asked == [] or asked[0] in targets
 

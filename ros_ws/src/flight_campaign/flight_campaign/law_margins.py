@@ -17,8 +17,12 @@ def has_margins(law: Law) -> bool:
 
 
 def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
-    """Margins for N sets of gains, (m, N) or (1, N), shapes (N, m) and (N,): u without delay, as in a benchmark."""
+    """Margins for N sets of gains, (m, N) or (1, N), shapes (N, m) and (N,), without those of all inputs at once.
+
+    u has no delay, as in a benchmark.
+    """
     tuned = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
     plant = LinearPlant(model.A + model.gravity, model.B, model.C)
-    return loop_margins(plant, linear_law(tuned, len(model.lag), model.period, count), Loop(model.lag, 0.0, model.period))
+    of_candidates, loop = linear_law(tuned, len(model.lag), model.period, count), Loop(model.lag, 0.0, model.period)
+    return loop_margins(plant, of_candidates, loop, together=False)

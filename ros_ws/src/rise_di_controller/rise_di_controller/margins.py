@@ -111,7 +111,7 @@ def loop_transfer(plant: LinearPlant, law: LinearLaw, loop: Loop, w: FloatArray)
     return np.asarray(1.0 / np.einsum("...ii->...i", S) - 1.0)
 
 
-def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
+def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bool = True) -> Margins:
     """Margins of an aircraft, or of N: A (N, n, n) and B (N, n, m) of the plant, and one law or a law for each of them.
 
     Crossings of the grid of frequencies are refined to rounding, peaks to 1e-3 of the height. The phase margin is the
@@ -120,7 +120,8 @@ def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
 
         1 / max_w min_D norm(D (S - I/2) D^-1, 2),  D diagonal
 
-    exact for m <= 3 and at most the disk margin for more inputs.
+    exact for m <= 3 and at most the disk margin for more inputs. Without `together` the figures of all inputs at once are NaN,
+    which saves a third of the time.
     """
     shape = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (plant.A, plant.B, law.A)))
     count = int(np.prod(shape))
@@ -133,7 +134,7 @@ def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Margins:
     for k in range(0, count, BATCH):
         of = slice(k, k + BATCH)
         aircraft, its_law = LinearPlant(A[of], B[of], plant.C), LinearLaw(*(matrix[of] for matrix in laws))
-        parts.append(_margins(_schur_form(aircraft, its_law, loop), loop.period))
+        parts.append(_margins(_schur_form(aircraft, its_law, loop), loop.period, together=together))
     return Margins(*(np.concatenate(values).reshape((*shape, *values[0].shape[1:])) for values in zip(*parts, strict=True)))
 
 
@@ -176,7 +177,7 @@ def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
     return np.asarray(np.eye(m) + product.swapaxes(2, 3).reshape(N, -1, m, m)[:, :F])
 
 
-def _margins(form: _SchurForm, period: float) -> Margins:
+def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
     """Margins of the aircraft of a batch."""
     eigenvalues, m = form.eigenvalues, form.R.shape[-1]
     stable = np.max(np.abs(eigenvalues), axis=1) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
@@ -185,8 +186,11 @@ def _margins(form: _SchurForm, period: float) -> Margins:
     near = _around_peaks(S, w)
     every = np.concatenate([S, _balanced(_sensitivity(form, np.exp(1j * near * period)))], axis=1)
     diagonal = np.einsum("NFii->NFi", every)
+    norm = norm_half = np.full(len(every), np.nan)
+    if together:
+        norm, norm_half = _largest_norm(every), _largest_norm(np.asarray(every - np.eye(m) / 2.0))
     with np.errstate(divide="ignore"):
-        disk, disk_all = 1.0 / np.max(np.abs(diagonal - 0.5), axis=1), 1.0 / _largest_norm(np.asarray(every - np.eye(m) / 2.0))
+        disk, disk_all = 1.0 / np.max(np.abs(diagonal - 0.5), axis=1), 1.0 / norm_half
         L = 1.0 / np.einsum("NFii->NFi", S) - 1.0
     phase, crossover = _phase_margins(form, w, L, period)
     decrease, increase = _gain_margins(form, w, L, period)
@@ -199,7 +203,7 @@ def _margins(form: _SchurForm, period: float) -> Margins:
         np.where(each, increase, 1.0),
         np.where(each, np.max(np.abs(diagonal), axis=1), np.inf),
         np.where(each, disk, 0.0),
-        np.where(stable, _largest_norm(every), np.inf),
+        np.where(stable, norm, np.inf),
         np.where(stable, disk_all, 0.0),
         np.array([min([1.0, *_slow_modes(row, period).damping]) for row in eigenvalues]),
     )

@@ -253,7 +253,7 @@ def _within_margin(
     def relaxed(relaxation: FloatArray) -> SelectedObserver:
         controller = _parameters(base, model, gains, design(relaxation), relaxation)
         law = linear_law(controller.tuned_law(), m, model.period)
-        delay, margins = delay_margin(nominal, law, loop), loop_margins(nominal, law, loop_of(controller))
+        delay, margins = delay_margin(nominal, law, loop), loop_margins(nominal, law, loop_of(controller), together=False)
         of_delay = delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
         return SelectedObserver(
             controller, delay, float(margins.phase.min()), min(of_delay, least_fraction(margins, needed)), relaxation
@@ -261,7 +261,7 @@ def _within_margin(
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         law, uncertain = linear_law(controller.tuned_law(), m, model.period), plant._replace(A=plant.A[1:], B=plant.B[1:])
-        return np.asarray(loop_margins(uncertain, law, loop_of(controller)).phase.min(axis=0))
+        return np.asarray(loop_margins(uncertain, law, loop_of(controller), together=False).phase.min(axis=0))
 
     def stepped(channel: int) -> SelectedObserver:
         return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])

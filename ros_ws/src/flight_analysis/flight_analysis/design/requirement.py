@@ -171,7 +171,7 @@ def _nominal_search(
     best: _Reached[Controller] | None = None
     while True:
         candidate = build(slower, lower)
-        margins = loop_margins(candidate.loop.nominal, candidate.loop.law, candidate.loop.loop)
+        margins = loop_margins(candidate.loop.nominal, candidate.loop.law, candidate.loop.loop, together=False)
         fraction = least_fraction(margins, needed)
         if best is None or fraction > best.fraction:
             best = _Reached(candidate, slower, lower, fraction)
@@ -198,4 +198,4 @@ def _worst_phase(loop: LinearLoop) -> float:
     if len(loop.plant.A) == 1:
         return math.inf
     uncertain = loop.plant._replace(A=loop.plant.A[1:], B=loop.plant.B[1:])
-    return float(loop_margins(uncertain, loop.law, loop.loop).phase.min())
+    return float(loop_margins(uncertain, loop.law, loop.loop, together=False).phase.min())
