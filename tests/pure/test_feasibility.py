@@ -158,3 +158,15 @@ def test_what_any_message_may_hold_refused_as_route(waypoints: tuple[Waypoint, .
     with pytest.raises(ParameterError) as refused:
         guidance.plan(waypoints)
     assert str(refused.value).startswith(sentence)
+
+
+def test_route_of_scenario_not_checked_where_file_replaces_it(tmp_path: Path) -> None:
+    """The scenario's own rectangle is too small for fillets in a wind of 18 m/s."""
+    path = tmp_path / "windy.yaml"
+    text = find_scenario("osprey_route").path.read_text(encoding="utf-8")
+    path.write_text(text.replace("    wind: 3.0", "    wind: 18.0"), encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"guidance\.route\["):
+        find_scenario(path)
+    scenario = with_route(find_scenario(path, with_route=False), [Waypoint(0.0, 0.0, 0.0), Waypoint(3000.0, 0.0, 0.0)])
+    assert scenario.guidance is not None
+    assert (scenario.guidance.wind, len(scenario.guidance.waypoints())) == (18.0, 2)

@@ -23,14 +23,16 @@ def scenarios() -> list[str]:
     return names_in(LIBRARY)
 
 
-def find_scenario(name: FilePath | Scenario, duration: float | None = None) -> Scenario:
+def find_scenario(name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True) -> Scenario:
     """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError.
 
-    A Scenario is returned as it is, or with the duration.
+    A Scenario is returned as it is, or with the duration. `with_route` as of `load_scenario`.
     """
-    scenario = (
-        name if isinstance(name, Scenario) else load_scenario(find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute())
-    )
+    if isinstance(name, Scenario):
+        scenario = name
+    else:
+        path = find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute()
+        scenario = load_scenario(path, with_route=with_route)
     return scenario if duration is None else scenario.vary(flight={"duration": duration})
 
 

@@ -69,7 +69,7 @@ def fly(
     Exit status: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a missed leg,
     130 interrupted.
     """
-    chosen = find_scenario(scenario, duration)
+    chosen = find_scenario(scenario, duration, with_route=route is None)
     require(
         not (in_process and (lockstep or one_process)), "--in-process", "a flight over topics, in lockstep", "one of the two"
     )

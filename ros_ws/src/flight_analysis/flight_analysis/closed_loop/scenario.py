@@ -129,10 +129,18 @@ SCHEMAS: dict[str, type[Config]] = {
 OPTIONAL = ("guidance",)
 
 
-def load_scenario(path: FilePath) -> Scenario:
-    """Read and validate a scenario file. Raises ParameterError with a sentence."""
+def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
+    """Read and validate a scenario file. Raises ParameterError with a sentence.
+
+    Without `with_route` the route and the program of guidance are left out before the check, for a flight of another route.
+    """
     path = as_path(path, "scenario", A_SCENARIO)
-    return parse_scenario(read_file(path, str(path), A_SCENARIO), path)
+    content = read_file(path, str(path), A_SCENARIO)
+    if with_route:
+        return parse_scenario(content, path)
+    sections = parse_scenario_sections(content, path)
+    left = {key: value for key, value in sections.get("guidance", {}).items() if key not in {"route", "program"}}
+    return scenario_of(path.stem, path, {**sections, **({"guidance": left} if "guidance" in sections else {})})
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
