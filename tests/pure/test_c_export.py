@@ -300,6 +300,14 @@ def test_wrong_code_is_not_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert "first in tick 1: u[0] is" in (tmp_path / "c" / "proof.txt").read_text(encoding="utf-8")
 
 
+def test_models_that_are_learned_are_refused() -> None:
+    learns = find_scenario("osprey_learn")
+    with pytest.raises(ParameterError, match=r"^controller\.learn: found a section, expected none: C code replaces no model"):
+        exportable(learns.controller)
+    with pytest.raises(ParameterError, match=r"^controller\.observer\.part: found 0\.0, expected more than 0"):
+        exportable(learns.vary(controller={"learn": None}).controller)
+
+
 def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     controller = find_scenario("osprey_servo").controller
     common = {key: value for key, value in controller.model_dump().items() if key in ControllerConfig.model_fields}
