@@ -13,6 +13,7 @@ from tests.maps import MAP_FILES, named_map
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 
+from autopilot_bridge.params import MAVLINK
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.graph import GUIDANCE, ON_START, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
@@ -126,8 +127,11 @@ def test_policy_allows_exactly_those_of_flight_monitor(osprey_gust: Scenario, pe
 def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
     maps = [named_map(name) for name in MAP_FILES]
     used = [row for channel_map in maps for row in channel_map.used_topics()]
-    published = {topic for key, topic, _ in used if key.startswith("messages.")}
-    subscribed = {topic for key, topic, _ in used if not key.startswith("messages.")}
+    sent, received = ([row for row in used if row[0].startswith("messages.") is is_sent] for is_sent in (True, False))
+    # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
+    published = {topic for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")}
+    published |= {in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")}
+    subscribed = {topic for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
     policy = allowed()["bridge"]
     start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}").wait_for("dry run")
     own = discovered(peer_node, ("bridge",))["bridge"]
