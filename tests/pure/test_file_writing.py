@@ -27,6 +27,7 @@ SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
 OWN_WRITERS = {
     "flight_core/flight_core/files.py": "the door",
     "flight_core/flight_core/scheduling.py": "a file of /proc",
+    "flight_bringup/flight_bringup/fly.py": "the growing log of the learner, a new file",
     "flight_bringup/flight_bringup/processes.py": "the growing output of a process, a new file",
     "flight_analysis/flight_analysis/c_export/proof.py": "a program in a temporary folder",
     "flight_log/flight_log/open_log.py": "an unpacked log in a temporary folder",
