@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
-from flight_analysis.report.account import Account, account_of_json
+from flight_analysis.report.account import Account, TopicAccount, account_of_json
 from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
 from flight_analysis.report.summary import taken_over
 from flight_bringup.fly import fly_and_report
@@ -186,6 +186,17 @@ def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
     summary = read_flight(run).summary
     assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
     assert summary["outcome"] == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+
+
+@pytest.mark.parametrize(
+    ("found", "expected", "whole"),
+    [(96, 97, True), (95, 97, False), (990, 1000, True), (989, 1000, False), (1, 2, True), (0, 1, False), (0, 2, False)],
+)
+def test_one_missing_sample_is_no_lack_of_short_topic(found: int, expected: int, whole: bool) -> None:
+    """99 %, or all but one: the last tick of a flight may come after its end."""
+    topic = TopicAccount(expected, found, 0.0, 0.97, 0.01, 0.5, 0, 0, 0.0, 0, 0)
+    assert topic.holds(found) == whole
+    assert (Account(0.97, {"u": topic}, ()).over("u") == "") == whole
 
 
 def test_flight_without_step_of_guidance_is_outcome(tmp_path: Path) -> None:

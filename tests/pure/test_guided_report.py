@@ -208,6 +208,7 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
 def test_fly_names_each_leg(flight: RecordedFlight, capsys: pytest.CaptureFixture[str]) -> None:
     show_flight(Console(), flight)
     assert "legs: 0 not ended\n" in capsys.readouterr().out
+    assert flight.summary["outcome"] == "completed, legs 0 to 6 not flown"  # 7, the orbit, never ends
 
 
 def test_comparison_draws_all_ground_tracks_over_route(flight: RecordedFlight, tmp_path: Path) -> None:

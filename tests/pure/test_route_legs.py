@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from flight_analysis.report.account import account, final_outcome
-from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
+from flight_analysis.report.account import Account, account, final_outcome
+from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results, unflown_legs
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
@@ -21,7 +21,7 @@ from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance import guidance, path
 from flight_guidance.guidance import Guidance
 from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
-from flight_guidance.modes import Lateral, Mode
+from flight_guidance.modes import Lateral, Mode, bits
 from flight_guidance.notices import Notices
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
@@ -356,6 +356,34 @@ def test_summary_says_which_legs_were_flown() -> None:
     outcome = final_outcome(COMPLETED, account(tape, None))
     assert (outcome, exit_status(outcome)) == ("completed, missed leg 1 by 321 m", STATUS_INCOMPLETE)
     assert final_outcome(outcome, account(tape, None)) == outcome
+
+
+def test_flight_that_ends_on_earlier_leg_has_legs_not_flown() -> None:
+    """A box of three lines, two fillets and the orbit: legs 0 to 5."""
+    box = {"north": [0.0, 2000.0, 2000.0, 0.0], "east": [0.0, 0.0, 2000.0, 2000.0], "altitude": [100.0] * 4}
+    section = GuidanceConfig.validate_mapping(SECTION | {"route": box}, "guidance")
+    number = guidance.digest(section.plan(section.waypoints()))
+
+    def unflown(leg: list[float], **channels: ArrayLike) -> list[int]:
+        return list(unflown_legs(log_of(3, leg=leg, route=number, **channels), section))
+
+    assert unflown([0, 1, 2]) == [2, 3, 4]
+    assert unflown([3, 4, 5]) == []
+    left = {"mode__lateral": [Lateral.ROUTE, Lateral.ORBIT, Lateral.ORBIT]}
+    assert unflown([2, 0, 0], **left) == [2, 3, 4]  # by the fence
+    assert unflown([2, 0, 0], **left, given=[0, bits(("north", "east", "radius")), 0]) == []
+    assert list(unflown_legs(log_of(1, route=1.0), section)) == []  # a route that the log does not have
+
+
+@pytest.mark.parametrize(("unflown", "words"), [((3,), "leg 3 not flown"), ((2, 3, 4), "legs 2 to 4 not flown")])
+def test_legs_not_flown_are_in_outcome(unflown: tuple[int, ...], words: str) -> None:
+    missed = FlownLeg(1, 3.0, 3.0, 5.0, "missed", 321.0)
+    flown = Account(9.0, {}, ("u 3 of 9 samples",), legs=(missed,), unflown=unflown)
+    outcome = final_outcome(COMPLETED, flown)
+    assert outcome == f"completed, missed leg 1 by 321 m, {words}, log incomplete: u 3 of 9 samples"
+    assert final_outcome(outcome, flown) == outcome
+    assert exit_status(final_outcome(COMPLETED, flown._replace(lacks=(), legs=()))) == STATUS_INCOMPLETE
+    assert final_outcome("lost contact with guidance", flown) == "lost contact with guidance"
 
 
 def test_flight_carried_back_is_noticed_once() -> None:

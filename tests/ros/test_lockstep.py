@@ -46,9 +46,10 @@ def scenario_file(folder: Path, duration: float, name: str = "osprey_servo", **s
     return recordings.scenario_file(folder / "rough.yaml", find_scenario(name).path, flight={"duration": duration}, **sections)
 
 
-def fly(start: Start, scenario: Path, runs: str, *options: str) -> Path:
+def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0) -> Path:
     """Fly to the end; return the folder of the run."""
-    start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options).succeed()
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options)
+    assert command.end() == status, command.output
     return scenario.parent / runs / "latest"
 
 

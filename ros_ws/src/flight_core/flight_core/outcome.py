@@ -8,10 +8,11 @@ COMPLETED = "completed"
 INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
+NOT_FLOWN = "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
 NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED, STATUS_ENDED_EARLY = 130, 3  # exit statuses of a flight, 0 completed
-STATUS_INCOMPLETE = 4  # completed with an incomplete log or a missed leg
+STATUS_INCOMPLETE = 4  # completed with an incomplete log, or a leg missed or not flown
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
 

@@ -3,20 +3,21 @@
 """The account of a flight: the samples that its log should hold and holds, by topic, and the outcome that follows."""
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.guided import FlownLeg, flown_legs
+from flight_analysis.report.guided import FlownLeg, flown_legs, unflown_legs
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, UNKNOWN
+from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, NOT_FLOWN, UNKNOWN
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
 
-WHOLE = 0.99  # least share of the samples of a topic without a remark
+WHOLE = 0.99  # least share of the samples of a topic without a remark, unless a single one is missing
 SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
@@ -24,6 +25,7 @@ GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 RESTART = 10  # a number of a tick that is less by more
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
+SHORTFALL = re.compile(rf", (?:{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{INCOMPLETE}).*", re.DOTALL)  # of an outcome
 
 
 class TopicAccount(NamedTuple):
@@ -46,6 +48,14 @@ class TopicAccount(NamedTuple):
         """Share of the expected samples, at most 1; None where the number is unknown."""
         return None if self.expected is None else min(self.found / max(self.expected, 1), 1.0)
 
+    def holds(self, count: int) -> bool:
+        """Whether `count` samples are the whole topic, or their expected number is unknown.
+
+        One missing sample is no lack of a short topic: the first or the last instant of a flight may fall on either side of
+        its begin or end.
+        """
+        return self.expected is None or count >= min(WHOLE * self.expected, max(self.expected - 1, 1))
+
 
 class Account(NamedTuple):
     """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for the outcome."""
@@ -56,12 +66,15 @@ class Account(NamedTuple):
     busy: str = ""  # the sentence on a host that left out samples and ticks
     unguided: bool = False  # the controller was engaged, and guidance took no step
     legs: tuple[FlownLeg, ...] = ()  # of the route, in order
+    unflown: tuple[int, ...] = ()  # numbers of the legs that were ahead when the flight ended, in order
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
-        shares = {name: self.topics[name].share for name in topics if name in self.topics}
+        named = {name: self.topics[name] for name in topics if name in self.topics}
         parts = [
-            f"{math.floor(100.0 * share)} % of {name}" for name, share in shares.items() if share is not None and share < WHOLE
+            f"{math.floor(100.0 * topic.share)} % of {name}"
+            for name, topic in named.items()
+            if topic.share is not None and not topic.holds(topic.found)
         ]
         return f"over {', '.join(parts)}" if parts else ""
 
@@ -74,21 +87,29 @@ class Account(NamedTuple):
         topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
         return {
             "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
+            "unflown": list(self.unflown),
         }  # fmt: skip
 
 
 def final_outcome(outcome: str, account: Account) -> str:
-    """The outcome with the missed legs and with what the log lacks: "completed, missed leg 2 by 35 m, log incomplete: ...".
+    """The outcome with the legs missed and not flown, and with what the log lacks.
+
+    As in "completed, missed leg 2 by 35 m, legs 4 to 6 not flown, log incomplete: ...".
 
     An early end stays as it is.
     """
-    base = outcome.partition(f", {INCOMPLETE}")[0].partition(f", {MISSED} leg ")[0]
+    base = SHORTFALL.sub("", outcome)
     if base == COMPLETED and account.unguided:
         return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
     if not base.startswith((COMPLETED, UNKNOWN)):
         return base
-    missed = [f", {MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed]
-    return "".join([base, *missed, *([f", {INCOMPLETE}: {'; '.join(account.lacks)}"] if account.lacks else [])])
+    parts = [base, *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed)]
+    if account.unflown:
+        first, last = account.unflown[0], account.unflown[-1]
+        parts.append(f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}")
+    if account.lacks:
+        parts.append(f"{INCOMPLETE}: {'; '.join(account.lacks)}")
+    return ", ".join(parts)
 
 
 def flown(tape: Tape) -> Tape:
@@ -150,11 +171,13 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
-        if topic.expected is not None and topic.unsent > (1.0 - WHOLE) * topic.expected
+        if topic.expected is not None and not topic.holds(topic.expected - topic.unsent)
     ]
+    section = None if scenario is None else scenario.guidance
     legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
+    unflown = unflown_legs(tape, section) if legs and section is not None else ()
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
-    return Account(end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs))
+    return Account(end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown))
 
 
 RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
@@ -265,7 +288,7 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float) -> str:
         facts.append(f"{topic.unset} samples without a stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
-    missing = topic.expected is not None and topic.found + topic.unsent < WHOLE * topic.expected
+    missing = not topic.holds(topic.found + topic.unsent)
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
@@ -287,4 +310,5 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     keys = TopicAccount._fields
     topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
     legs = tuple(FlownLeg(**leg) for leg in (summary["guidance"] or {}).get("legs", ()))
-    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"], content.get("unguided", False), legs)
+    unguided, unflown = content.get("unguided", False), tuple(content.get("unflown", ()))
+    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"], unguided, legs, unflown)
