@@ -21,7 +21,6 @@ import time
 import urllib.parse
 from collections.abc import Iterator
 from contextlib import contextmanager
-from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
@@ -120,21 +119,19 @@ class Client(threading.Thread):
     def __init__(self, address: str) -> None:
         super().__init__(daemon=True)
         parts = urllib.parse.urlsplit(address)
-        connection = HTTPConnection(parts.netloc)
-        connection.request("GET", f"{parts.path}?{parts.query}")
-        self._cookie = connection.getresponse().headers["Set-Cookie"].partition(";")[0]
-        connection.close()
         self._loop = asyncio.Runner()
-        self._socket = self._loop.run(self._connect(parts.netloc))
+        self._socket = self._loop.run(self._connect(parts.netloc, parts.fragment.removeprefix("token=")))
         self._ended = threading.Event()
         self.asks = True
         self._head: dict[str, Any] = {}
         self._rows: dict[str, int] = {}
         self.bytes = 0
 
-    async def _connect(self, netloc: str) -> WebSocketClientConnection:
-        headers = {"Cookie": self._cookie, "Origin": f"http://{netloc}"}
-        return await websocket_connect(HTTPRequest(f"ws://{netloc}/news/0", headers=headers))
+    async def _connect(self, netloc: str, token: str) -> WebSocketClientConnection:
+        request = HTTPRequest(f"ws://{netloc}/news/0", headers={"Origin": f"http://{netloc}"})
+        opened = await websocket_connect(request)
+        await opened.write_message(token)
+        return opened
 
     def run(self) -> None:
         """Ask until stopped, or until the server ends; not while `asks` is off."""

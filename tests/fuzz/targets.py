@@ -379,11 +379,10 @@ _ROUTES = [
     b'{"fileType": "Plan", "geoFence": {"polygons": [{"polygon": [[47.4, 8.5], [47.41, 8.5], [47.4, 8.51]]}]}}',
 ]
 
-_HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nCookie: rise_di_PORT=a-token\r\n\r\n"
+_HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Page-Token: a-token\r\n\r\n"
 _REQUESTS = [
     _HEAD,
     _HEAD.replace(b"/ ", b"/data/0?epoch=0.0&y=3&state=ended ", 1),
-    _HEAD.replace(b"/ ", b"/?token=a-token ", 1),
     _HEAD.replace(b"GET / ", b"POST /control ").replace(
         b"\r\n\r\n",
         b"\r\nOrigin: http://127.0.0.1:PORT\r\nContent-Type: application/json\r\nX-Control-Key: ABCD-EFGH\r\n"

@@ -353,7 +353,7 @@ def against(*runs: Path) -> Callable[[Callable[[Server], Coroutine[Any, Any, Non
 
 
 async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN, **headers: str) -> HTTPResponse:
-    given = {"Cookie": f"rise_di_{server.port}={token}"} if token else {}
+    given = {http.TOKEN_HEADER: token} if token else {}
     return await AsyncHTTPClient(force_instance=True).fetch(
         f"http://127.0.0.1:{server.port}{path}",
         method=method,
@@ -365,24 +365,19 @@ async def get(server: Server, path: str, method: str = "GET", token: str = TOKEN
     )
 
 
-def test_page_served_with_token_alone(recorded: Path) -> None:
+def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     """The page asks no other host."""
 
     async def client(server: Server) -> None:
-        login = await get(server, f"/?token={TOKEN}", token="")
-        assert (login.code, login.headers["Location"]) == (303, "/")
-        cookie = login.headers["Set-Cookie"]
-        assert "HttpOnly" in cookie
-        assert "SameSite=Strict" in cookie
-        page = await get(server, "/")
-        assert page.code == 200
+        page = await get(server, "/", token="")  # a browser sends no header with the address of a page
+        assert (page.code, page.body) == (200, FILES["index.html"].read_bytes())
         assert page.headers["Content-Security-Policy"].startswith("default-src 'none'")
         assert "frame-ancestors 'none'" in page.headers["Content-Security-Policy"]
         assert page.headers["X-Content-Type-Options"] == "nosniff"
         assert page.headers["Referrer-Policy"] == "no-referrer"
-        assert "Server" not in page.headers
+        assert not {"Server", "Set-Cookie"} & set(page.headers)
         for name in FILES:
-            assert (await get(server, f"/{name}")).body == FILES[name].read_bytes()
+            assert (await get(server, f"/{name}", token="")).body == FILES[name].read_bytes()
         await whole_log(server)  # until then the epoch may change
         head, _ = decoded((await get(server, "/data/0")).body)
         assert (head["flight"]["name"], head["ghost"]) == ("run", False)
@@ -425,13 +420,16 @@ def test_foreign_host_another_path_and_another_method_refused(
     against(recorded)(client)
 
 
-@pytest.mark.parametrize("path", ["/", "/view.js", "/data/0", "/nothing", "/?token=another", "/data/0?token=\xff"])
-def test_nothing_is_served_without_the_token(path: str, recorded: Path) -> None:
+@pytest.mark.parametrize("path", ["/data/0", "/nothing", "/data/0?token=" + TOKEN])
+@pytest.mark.parametrize(
+    "headers", [{}, {"Cookie": f"token={TOKEN}"}, {http.TOKEN_HEADER: "another"}, {http.TOKEN_HEADER: "\xff"}]
+)
+def test_no_sample_served_without_token(path: str, headers: dict[str, str], recorded: Path) -> None:
+    """Neither the query, which a log of addresses may keep, nor a cookie, which goes to all ports of a host, has the token."""
+
     async def client(server: Server) -> None:
-        for token in ("", "another"):
-            response = await get(server, path.replace("\xff", "%ff"), token=token)
-            assert response.code in {400, 401}
-            assert b"rise-di watch" in response.body or response.code == 400
+        response = await get(server, path, token="", **headers)
+        assert (response.code, response.body) == (401, f"401: {http.NO_TOKEN}\n".encode())
 
     against(recorded)(client)
 
@@ -448,7 +446,7 @@ async def connect(server: Server, request: bytes = b"", count: int = http.MAX_CO
 
 
 def request(server: Server, path: str, token: str = TOKEN) -> bytes:
-    return f"GET {path}?token={token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode()
+    return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n{http.TOKEN_HEADER}: {token}\r\n\r\n".encode()
 
 
 def end(*connections: Connection) -> None:
@@ -484,12 +482,12 @@ def test_answer_without_token_ends_connection(token: str, recorded: Path) -> Non
 
 def test_connections_with_token_beyond_limit_refused(recorded: Path) -> None:
     async def client(server: Server) -> None:
-        kept = await connect(server, request(server, "/view.js"))
+        kept = await connect(server, request(server, "/data/0"))
         for reader, _ in kept:
-            assert (await reader.readline()).startswith(b"HTTP/1.1 303")
-        assert (await get(server, "/view.js")).code == 503
+            assert (await reader.readline()).startswith(b"HTTP/1.1 200")
+        assert (await get(server, "/data/0")).code == 503
         end(*kept)
-        while (await get(server, "/view.js")).code != 200:  # until the server has noticed
+        while (await get(server, "/data/0")).code != 200:  # until the server has noticed
             pass
 
     against(recorded)(client)
@@ -564,11 +562,12 @@ def test_browser_waits_for_next_samples(recorded: Path, tmp_path: Path, monkeypa
     against(tmp_path)(client)
 
 
-async def stream(server: Server) -> WebSocketClientConnection:
+async def stream(server: Server, token: str | bytes = TOKEN) -> WebSocketClientConnection:
     """A WebSocket as the page opens it."""
     address = f"127.0.0.1:{server.port}"
-    given = {"Cookie": f"rise_di_{server.port}={TOKEN}", "Origin": f"http://{address}"}
-    return await websocket_connect(HTTPRequest(f"ws://{address}/news/0", headers=given))
+    opened = await websocket_connect(HTTPRequest(f"ws://{address}/news/0", headers={"Origin": f"http://{address}"}))
+    await opened.write_message(token, binary=isinstance(token, bytes))
+    return opened
 
 
 async def whole_log(server: Server) -> None:
@@ -619,25 +618,52 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "token", "headers", "expected"),
+    ("path", "headers", "expected"),
     [
-        ("/news/0", "another", {}, 401),
-        ("/news/0", TOKEN, {"Host": "evil.example"}, 403),
-        ("/news/0", TOKEN, {"Origin": "http://evil.example"}, 403),
-        ("/news/0", TOKEN, {"Origin": "http://127.0.0.1:1"}, 403),
-        ("/news/0", TOKEN, {"Origin": "null"}, 403),
-        ("/news/0", TOKEN, {"Origin": "http://["}, 403),
-        ("/news/0", TOKEN, {"Origin": ""}, 403),  # none is sent
-        ("/news/1", TOKEN, {}, 404),
-        ("/news/2", TOKEN, {}, 404),
+        ("/news/0", {"Host": "evil.example"}, 403),
+        ("/news/0", {"Origin": "http://evil.example"}, 403),
+        ("/news/0", {"Origin": "http://127.0.0.1:1"}, 403),
+        ("/news/0", {"Origin": "null"}, 403),
+        ("/news/0", {"Origin": "http://["}, 403),
+        ("/news/0", {"Origin": ""}, 403),  # none is sent
+        ("/news/1", {}, 404),
+        ("/news/2", {}, 404),
     ],
 )
-def test_foreign_websocket_refused(path: str, token: str, headers: dict[str, str], expected: int, recorded: Path) -> None:
-    """A WebSocket of a foreign page, host or user is refused, and of an unknown flight."""
+def test_foreign_websocket_refused(path: str, headers: dict[str, str], expected: int, recorded: Path) -> None:
+    """A WebSocket of a foreign page or host is refused, and of an unknown flight."""
 
     async def client(server: Server) -> None:
         given = UPGRADE | {"Origin": f"http://127.0.0.1:{server.port}"} | headers
-        assert (await get(server, path, token=token, **{name: text for name, text in given.items() if text})).code == expected
+        assert (await get(server, path, **{name: text for name, text in given.items() if text})).code == expected
+
+    against(recorded)(client)
+
+
+@pytest.mark.parametrize("token", ["", "another", b"another", b"\xff", "epoch=&y=0"])
+def test_websocket_whose_first_message_is_not_the_token_closed(token: str | bytes, recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        socket = await stream(server, token)
+        await socket.write_message("")
+        assert await socket.read_message() is None
+        assert (socket.close_code, socket.close_reason) == (1008, http.NO_TOKEN)
+        socket.close()
+
+    against(recorded)(client)
+
+
+def test_websockets_without_token_leave_place(recorded: Path) -> None:
+    async def client(server: Server) -> None:
+        address = f"127.0.0.1:{server.port}"
+        head = {"Host": address, "Origin": f"http://{address}"} | UPGRADE
+        silent = "\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode()
+        connections = await connect(server, silent, 200)
+        asks = await stream(server)
+        await asks.write_message("")
+        assert await asks.read_message()
+        assert len(server.streams) <= http.MAX_CONNECTIONS + http.RESERVED
+        asks.close()
+        end(*connections)
 
     against(recorded)(client)
 
@@ -667,7 +693,10 @@ def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.M
 
     async def client(server: Server) -> None:
         sockets = [await stream(server) for _ in range(http.MAX_CONNECTIONS)]
-        assert (await get(server, "/news/0", **UPGRADE)).code == 503
+        surplus = await stream(server)
+        assert await surplus.read_message() is None
+        assert (surplus.close_code, surplus.close_reason) == (1013, http.FULL)
+        surplus.close()
         for websocket in sockets:
             websocket.close()
         await left(server)
@@ -716,8 +745,9 @@ def test_websocket_without_reader_gets_few_answers(
     async def client(server: Server) -> None:
         browser.connect(("127.0.0.1", server.port))
         address = f"127.0.0.1:{server.port}"
-        head = {"Host": address, "Origin": f"http://{address}", "Cookie": f"rise_di_{server.port}={TOKEN}"} | UPGRADE
+        head = {"Host": address, "Origin": f"http://{address}"} | UPGRADE
         browser.sendall("\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode())
+        browser.sendall(bytes([0x81, 0x80 | len(TOKEN), 0, 0, 0, 0]) + TOKEN.encode())
         browser.sendall(bytes([0x81, 0x80, 0, 0, 0, 0]) * 10_000)  # empty texts with a mask, RFC 6455, 5.2
         while not made:
             await asyncio.sleep(0.01)
@@ -781,7 +811,7 @@ def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> Non
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([*before, *command("watch", recorded, "--port", 0)], **pipes) as process:  # type: ignore[call-overload]
         address, tunnel = process.stdout.readline(), process.stdout.readline()
-        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{20,}\n", address)
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/#token=[\w-]{20,}\n", address)
         port = address.split(":")[2].partition("/")[0]
         assert f"ssh -L {port}:127.0.0.1:{port} " in tunnel
         sockets = psutil.Process(process.pid).net_connections()

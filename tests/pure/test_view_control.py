@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import check_gains, manoeuvre, study_airframe
 from flight_bringup.scenarios import find_scenario
 from flight_view.control import BURST, KEY_PERIOD, LEASE, Control, RefusedError, gains_of, new_key
-from flight_view.server import MAX_CONNECTIONS, Server
+from flight_view.server import MAX_CONNECTIONS, TOKEN_HEADER, Server
 from rise_di_controller.params import ControllerConfig
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
@@ -405,7 +405,7 @@ def test_action_by_key_lease_rate_and_state(
 async def post(server: Server, body: object, **headers: str) -> HTTPResponse:
     """A request of the page, with some headers changed; one that is empty is left out."""
     own = {
-        "Cookie": f"rise_di_{server.port}={TOKEN}",
+        TOKEN_HEADER: TOKEN,
         "Origin": f"http://127.0.0.1:{server.port}",
         "Content-Type": "application/json",
         "X-Control-Key": KEY,
@@ -428,7 +428,7 @@ def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
         port, state = server.port, {"do": "state"}
         try:
             for body, headers, expected in (
-                (state, {"Cookie": ""}, 401),
+                (state, {TOKEN_HEADER: ""}, 401),
                 (state, {"Origin": ""}, 403),
                 (state, {"Origin": "null"}, 403),
                 (state, {"Origin": f"http://127.0.0.1.evil.example:{port}"}, 403),
@@ -483,9 +483,10 @@ def test_clients_that_stay_and_read_nothing_do_not_delay_deactivation(desk: Desk
         try:
             lease = json.loads((await post(server, {"do": "state"})).body)["lease"]
             for k in range(MAX_CONNECTIONS + 200):
-                query = f"?token={TOKEN}" if k < MAX_CONNECTIONS else ""
+                token = TOKEN if k < MAX_CONNECTIONS else ""
                 _, writer = await asyncio.open_connection("127.0.0.1", server.port)
-                writer.write(f"GET /data/0{query} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n\r\n".encode())
+                head = ("GET /data/0 HTTP/1.1", f"Host: 127.0.0.1:{server.port}", f"{TOKEN_HEADER}: {token}", "", "")
+                writer.write("\r\n".join(head).encode())
                 writer.transport.pause_reading()  # type: ignore[attr-defined]
                 clients.append(writer)
             for _ in range(20):  # more than the reserved connections

@@ -58,7 +58,7 @@ def serving(*runs: Path, control: Callable[[Flight], Control] | None = None) -> 
         flights = [Flight(run) for run in runs]
         server = Server(flights, TOKEN, control(flights[0]) if control else None)
         server.listen(0)
-        address = f"http://127.0.0.1:{server.port}/?token={TOKEN}"
+        address = f"http://127.0.0.1:{server.port}/#token={TOKEN}"
         ready.set()
         try:
             await server.follow()
@@ -155,7 +155,10 @@ def test_recorded_flight_drawn_and_asks_no_other_host(browser: Browser, recorded
         hosts = browser.run("[...new Set(performance.getEntriesByType('resource').map(one => new URL(one.name).host))]")
         assert hosts == [address.split("/")[2]]
         assert browser.run("document.getElementById('events').textContent") == "0.00 s  mode: ENGAGED"
-        assert browser.run("location.search") == ""  # the token is not in the history
+        assert browser.run("location.href") == f"{address.partition('#')[0]}#"  # the token is not in the history
+        assert browser.run("document.cookie") == ""
+        browser.run("location.reload()")
+        browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")  # the tab has the token
         assert browser.console == []
 
 

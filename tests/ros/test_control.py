@@ -7,7 +7,6 @@ import re
 import time
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
-from http.cookiejar import CookieJar
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
@@ -34,10 +33,9 @@ class Page:
     """Posts requests as a page does."""
 
     def __init__(self, address: str, key: str) -> None:
-        self._base = address.partition("?")[0]
-        self._opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
-        self._opener.open(address).read()
+        self._base, _, token = address.partition("#token=")
         self._headers = {"Origin": self._base.rstrip("/"), "Content-Type": "application/json", "X-Control-Key": key}
+        self._headers["X-Page-Token"] = token
 
     def post(self, do: str, **request: Any) -> tuple[int, dict[str, Any]]:
         """Status and answer of a request; at most five a second."""
@@ -45,7 +43,7 @@ class Page:
         body = json.dumps({"do": do, **request}).encode()
         try:
             sent = urllib.request.Request(f"{self._base}control", body, self._headers)  # noqa: S310 - http of this host
-            with self._opener.open(sent) as response:
+            with urllib.request.urlopen(sent) as response:  # noqa: S310 - as above
                 status, content = response.status, json.loads(response.read())
         except HTTPError as error:
             return error.code, json.loads(error.read())

@@ -4,9 +4,10 @@
 
 A browser asks for news, and draws the answer before the next request: nothing queues for a slow browser. After the first
 answer the browser asks by a WebSocket, with two fifths of the processor time of an HTTP request. Only GET is answered, for a
-fixed list of names. The Host header has to name this host, against DNS rebinding. The token of the address is kept in a
-cookie, against foreign users of this host. A WebSocket has to come from the page. With `Control` there is a single POST, with
-a second key and the origin of the page.
+fixed list of names. The Host header has to name this host, against DNS rebinding. The files of the page hold no flight and need
+no token. Samples need the token, against foreign users of this host: in a header, or as the first message of a WebSocket, which
+has to come from the page. A cookie would go to the servers on all ports of this host. With `Control` there is a single POST,
+with a second key and the origin of the page.
 """
 
 import asyncio
@@ -26,7 +27,7 @@ from typing import Any, cast
 from urllib.parse import parse_qsl
 
 import numpy as np
-from tornado.http1connection import HTTP1Connection, HTTP1ServerConnection
+from tornado.http1connection import HTTP1Connection
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream, StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler
@@ -58,7 +59,10 @@ MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
 MAX_DIGITS = 18  # of a number of rows: below 2^63
-POLICY_VIOLATION = 1008  # status of a closed WebSocket, RFC 6455, 7.4.1
+POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013  # status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA
+TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
+NO_TOKEN = "Open the whole address that rise-di watch printed"  # noqa: S105 - a sentence
+FULL = f"{MAX_CONNECTIONS} connections are open"
 REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes a chunk each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
@@ -102,6 +106,10 @@ class Server:
         for stream in [*self.streams]:
             stream.close()
         await self.http.close_all_connections()
+
+    def knows(self, token: str | bytes) -> bool:
+        """Whether a peer has the token."""
+        return hmac.compare_digest(token.encode() if isinstance(token, str) else token, self.token.encode())
 
     def accepts(self, host: str) -> bool:
         """Whether a Host header names this server, exactly."""
@@ -198,7 +206,7 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
 
 
 class _LimitedServer(HTTPServer):
-    """Holds at most MAX_CONNECTIONS connections with the token, and RESERVED further connections.
+    """Holds at most MAX_CONNECTIONS connections with the token, WebSockets included, and RESERVED further connections.
 
     A new connection takes the place of the oldest connection that has not shown the token.
     """
@@ -208,24 +216,21 @@ class _LimitedServer(HTTPServer):
         self._admitted: dict[IOStream, bool] = {}  # by connection in the order of arrival: whether it has a place for long
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
+        self._leave_out_closed()
         if len(self._admitted) >= MAX_CONNECTIONS + RESERVED:
-            oldest = next((held for held, admitted in self._admitted.items() if not admitted), stream)
-            self._admitted.pop(oldest, None)
-            oldest.close()
-            if oldest is stream:
-                return
+            next(held for held, admitted in self._admitted.items() if not admitted).close()
         self._admitted[stream] = False
         super().handle_stream(stream, address)
 
     def admit(self, stream: IOStream) -> bool:
-        """Keep the connection of a request with the token. False where MAX_CONNECTIONS connections are kept already."""
+        """Keep a connection that has shown the token. False where MAX_CONNECTIONS connections are kept already."""
+        self._leave_out_closed()
         if sum(self._admitted.values()) < MAX_CONNECTIONS:
             self._admitted[stream] = True
-        return self._admitted[stream]
+        return self._admitted.get(stream, False)
 
-    def on_close(self, server_conn: object) -> None:
-        self._admitted.pop(cast("HTTP1ServerConnection", server_conn).stream, None)
-        super().on_close(server_conn)
+    def _leave_out_closed(self) -> None:
+        self._admitted = {stream: admitted for stream, admitted in self._admitted.items() if not stream.closed()}
 
 
 class _Handler(RequestHandler):
@@ -241,10 +246,6 @@ class _Handler(RequestHandler):
     def server(self) -> Server:
         return self.settings["flight_server"]  # type: ignore[no-any-return]
 
-    @property
-    def cookie(self) -> str:
-        return f"rise_di_{self.server.port}"  # browsers send a cookie to all ports of a host
-
     def set_default_headers(self) -> None:
         self.clear_header("Server")
         for name, value in HEADERS.items():
@@ -257,16 +258,19 @@ class _Handler(RequestHandler):
     def prepare(self) -> None:
         if not self.server.accepts(self.request.host):
             raise HTTPError(HTTPStatus.FORBIDDEN)
-        given = self.get_query_argument("token", "") or self.get_cookie(self.cookie) or ""
-        if not hmac.compare_digest(given.encode(), self.server.token.encode()):
-            raise HTTPError(HTTPStatus.UNAUTHORIZED, reason="Open the whole address that rise-di watch printed")
+        self.require_token()
+
+    def require_token(self) -> None:
+        """Refuse a request without the token, or beyond MAX_CONNECTIONS."""
+        if not self.server.knows(self.request.headers.get(TOKEN_HEADER, "")):
+            raise HTTPError(HTTPStatus.UNAUTHORIZED, reason=NO_TOKEN)
         self._kept = self.server.http.admit(self.stream)
         if not self._kept and not isinstance(self, _Control):
-            raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=f"{MAX_CONNECTIONS} connections are open")
+            raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE, reason=FULL)
 
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
         """Send the answer, and close the connection as the class says."""
-        stream, kept = self.stream, self._kept
+        stream, kept = self.stream, self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not kept:
             self.set_header("Connection", "close")
         sent = super().finish(chunk)
@@ -301,13 +305,12 @@ class _Handler(RequestHandler):
 
 
 class _File(_Handler):
-    """The page and the files of the page."""
+    """The page and the files of the page: they need no token."""
+
+    def require_token(self) -> None:
+        """Answer without the token."""
 
     def get(self, *names: str) -> None:
-        if self.get_query_argument("token", None) is not None:
-            self.set_cookie(self.cookie, self.server.token, httponly=True, samesite="Strict")
-            self.redirect("/", status=HTTPStatus.SEE_OTHER)
-            return
         name = names[0] or "index.html"
         if name not in FILES:
             raise HTTPError(HTTPStatus.NOT_FOUND)
@@ -330,12 +333,13 @@ class _Data(_Handler):
 
 
 class _News(_Handler, WebSocketHandler):
-    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the same answer."""
+    """The samples of a flight, again and again: a message holds a query as for `_Data` and gets the same answer.
 
-    def prepare(self) -> None:
-        super().prepare()
-        if len(self.server.streams) >= MAX_CONNECTIONS:
-            raise HTTPError(HTTPStatus.SERVICE_UNAVAILABLE)
+    The first message is the token: a page sets no header of a WebSocket.
+    """
+
+    def require_token(self) -> None:
+        """Leave the token to the first message."""
 
     async def get(self, *names: str) -> None:
         self.require_page()
@@ -346,6 +350,7 @@ class _News(_Handler, WebSocketHandler):
     def open(self, *names: str) -> None:
         self.flight = self.server.flights[int(names[0])]
         self._sending: Future[None] | None = None
+        self._peer = cast("IOStream", cast("WebSocketProtocol", self.ws_connection).stream)
         self.server.streams.add(self)
         self._await_request()
 
@@ -353,7 +358,15 @@ class _News(_Handler, WebSocketHandler):
         self._known: dict[str, str] | None = None  # by the request that waits for an answer
         self._since = time.monotonic()
 
-    def on_message(self, message: str | bytes) -> Awaitable[None]:
+    def on_message(self, message: str | bytes) -> Awaitable[None] | None:
+        if not self._kept:
+            if not self.server.knows(message):
+                self.close(POLICY_VIOLATION, NO_TOKEN)
+            elif not self.server.http.admit(self._peer):
+                self.close(TRY_AGAIN_LATER, FULL)
+            else:
+                self._kept = True
+            return None
         self._known = dict(parse_qsl(message if isinstance(message, str) else "", keep_blank_values=True))
         self._since = time.monotonic()
         self._answered = asyncio.get_running_loop().create_future()  # done once the answer is in the buffers of the network
@@ -372,7 +385,7 @@ class _News(_Handler, WebSocketHandler):
                 if (
                     self._sending is not None and not self._sending.done()
                 ):  # the peer does not read the end of the answer either
-                    cast("IOStream", cast("WebSocketProtocol", self.ws_connection).stream).close()
+                    self._peer.close()
             return
         try:
             if waited < MAX_WAIT and not has_news(self.flight, self._known):

@@ -85,7 +85,7 @@ async def _serve(
             break
     else:
         raise ParameterError(f"--port: {port} cannot be used ({reason}), expected a free port of this host")
-    announce(f"http://{ADDRESS}:{server.port}/?token={server.token}")
+    announce(f"http://{ADDRESS}:{server.port}/#token={server.token}")
     announce(f"from another machine first: ssh -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
     follow = asyncio.ensure_future(server.follow())
     loop = asyncio.get_running_loop()

@@ -1,4 +1,5 @@
 // Control of the flight: a pending list of gains, targets, the bridge, faults. Nothing is sent before a button is pressed.
+import {HEADERS} from "./data.js";
 
 const RENEW = 1500; // ms; the lease lasts 5 s
 const HOLD = 1000; // ms that the button of an engagement is held
@@ -12,7 +13,7 @@ let lease = "", key = "", state = null, margins = null, timer = 0, checking = 0;
 const pending = new Map(); // by gain: its values
 
 async function send(request) {
-  const headers = {"Content-Type": "application/json", "X-Control-Key": key, "X-Control-Lease": lease};
+  const headers = {...HEADERS, "Content-Type": "application/json", "X-Control-Key": key, "X-Control-Lease": lease};
   try {
     const response = await fetch("control", {method: "POST", headers, body: JSON.stringify(request), signal: AbortSignal.timeout(60_000)});
     const text = await response.text();

@@ -4,6 +4,20 @@ import {Series} from "./series.js";
 const PATIENCE = 10_000; // ms; the server answers within 2 s, also without news
 const GRACE = 500; // ms, in which a page that was frozen takes what came meanwhile, before its patience counts
 
+// The token of the address, after #: a browser sends this part to no server. The storage is of this tab and this port alone.
+function takeToken() {
+  const given = new URLSearchParams(location.hash.slice(1));
+  if (given.has("token")) {
+    sessionStorage.setItem("token", given.get("token"));
+    given.delete("token");
+    history.replaceState(null, "", `#${given}`); // without the token in the bar and in the history of the tab
+  }
+  return sessionStorage.getItem("token") ?? "";
+}
+
+const TOKEN = takeToken();
+export const HEADERS = {"X-Page-Token": TOKEN};
+
 // An answer of the server (server.py, answer): its head, and the time and the columns of each topic in the head.
 export function decode(buffer) {
   const size = new DataView(buffer).getUint32(0, true);
@@ -66,7 +80,7 @@ export class Flight { // one flight of the server
       const content = await this.ask();
       if (content) return this.take(decode(content));
     }
-    const response = await fetch(`data/${this.number}?${this.query()}`, {signal: AbortSignal.timeout(PATIENCE)});
+    const response = await fetch(`data/${this.number}?${this.query()}`, {headers: HEADERS, signal: AbortSignal.timeout(PATIENCE)});
     if (!response.ok) throw new Error(await response.text());
     const content = await response.arrayBuffer();
     this.socket ??= this.open();
@@ -76,7 +90,10 @@ export class Flight { // one flight of the server
   open() { // a socket that never opens stays, and its flight asks by HTTP
     const socket = new WebSocket(new URL(`news/${this.number}`, location.href.replace("http", "ws")));
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => { socket.onclose = () => { this.socket = null; }; };
+    socket.onopen = () => {
+      socket.onclose = () => { this.socket = null; };
+      socket.send(TOKEN);
+    };
     return socket;
   }
 
