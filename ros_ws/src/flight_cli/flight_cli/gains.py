@@ -145,8 +145,9 @@ def gains(
             _show_trade(console, selection)
         if origin:
             console.print(origin, highlight=False, soft_wrap=True)
-        if write is not None:
-            console.print(f"gains: {write}")
+        for key, path in (("gains", write), ("page", page)):
+            if path is not None:
+                console.print(f"{key}: {path}", highlight=False, soft_wrap=True)
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
 
