@@ -15,7 +15,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.report.summary import display_units
 from flight_bringup.scenarios import find_scenario
-from flight_campaign.campaign import define, fly_chunk
+from flight_campaign.campaign import define, fly_chunk_figures
 from flight_campaign.statistics import Tally
 
 LEVELS = (0.3, 0.5)
@@ -30,7 +30,8 @@ def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
 
 def fly_tally(scenario: Scenario, level: float, aircraft: int, seed: int) -> Tally:
     """Statistics of so many uncertain aircraft; the feedforward's model is the airframe as published."""
-    return Tally.model_validate_json(fly_chunk(define(scenario, aircraft, level, seed, aircraft).model_dump_json(), (0, 0)))
+    chunk = fly_chunk_figures(define(scenario, aircraft, level, seed, aircraft).model_dump_json(), (0, 0))
+    return Tally.of(chunk.first, chunk.diverged, chunk.figures)
 
 
 def main(

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaigns: statistics of constant size, chunks that do not depend on engine or order, kill and resume."""
 
+import io
 import json
 import os
 import shlex
@@ -16,12 +17,14 @@ from typing import Any
 
 import dask
 import numpy as np
+import polars as pl
 import psutil
 import pytest
 from distributed import LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from polars.testing import assert_frame_equal
 from tests.closed_loop import error
 from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
@@ -35,10 +38,12 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
 from flight_campaign.campaign_report import overview, write_page
+from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from rise_di import CampaignResult
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.margins import loop_margins
 
@@ -168,7 +173,8 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
 
 def test_report_of_missions_says_what_score_counts(mission: Definition, tmp_path: Path) -> None:
     campaign = Campaign.begin(tmp_path, mission)
-    tally = Tally.of(*fly_chunk_figures(mission.model_dump_json(), (0, 0)))
+    chunk = fly_chunk_figures(mission.model_dump_json(), (0, 0))
+    tally = Tally.of(chunk.first, chunk.diverged, chunk.figures)
     write_page(
         tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}], [None]
     )
@@ -258,6 +264,40 @@ def test_stopped_campaign_resumes_with_missing_chunks(tmp_path: Path) -> None:
     assert resumed.tally(0) == whole.tally(0)
 
 
+def test_row_of_aircraft_has_its_figures_outcome_and_drawn_entries(tmp_path: Path) -> None:
+    campaign = fly_campaign(tmp_path / "one", definition(21, 20))
+    table = campaign.rows().collect()
+    assert table["number"].to_list() == list(range(21))
+    assert set(table["seed"]) == {7}
+    assert table["score"].max() == campaign.tally(0).figures["score"].largest
+    frame = campaign.definition.aircraft_scenario(20).aircraft.sampled_airframe()
+    A, B = frame.matrix_a(), frame.matrix_b()
+    row = table.row(20, named=True)
+    assert row["A[q,alpha]"] == A[frame.index("q"), frame.index("alpha")]
+    assert row["B[V,thrust]"] == B[frame.index("V"), list(frame.inputs).index("thrust")]
+    assert "A[theta,q]" not in row  # kinematics are known
+    spread = table.select(entry_names(table)).to_numpy()
+    assert np.ptp(spread, axis=0).min() > 0.0
+
+
+def test_rows_do_not_depend_on_size_of_chunks(tmp_path: Path) -> None:
+    tables = [fly_campaign(tmp_path / f"{chunk}", definition(20, chunk)).rows().collect() for chunk in (10, 20)]
+    entries = entry_names(tables[0])
+    assert tables[0].select(entries).equals(tables[1].select(entries))
+    # another size of chunk may sum in another order: rounding alone
+    assert_frame_equal(*tables, rel_tol=1e-9)
+
+
+def test_figures_of_diverged_aircraft_are_null() -> None:
+    score = np.array([1.0, np.inf, 11.0])
+    chunk = Chunk(4, np.array([0.0, 1.0, 0.0]), {"score": score}, {"A[q,q]": np.ones(3)})
+    table = pl.read_parquet(io.BytesIO(encode(chunk, 7, 1.0)))
+    assert table["score"].to_list() == [1.0, None, 11.0]
+    assert table["diverged"].to_list() == [False, True, False]
+    assert table["lost"].to_list() == [False, False, True]
+    assert tally_of(table) == Tally.of(4, chunk.diverged, chunk.figures)
+
+
 def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.05, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
@@ -321,9 +361,13 @@ def test_an_address_without_a_port_is_refused() -> None:
 def flown(tmp_path: Path) -> Campaign:
     """A campaign of one chunk, whose figures are made up."""
     campaign, score = Campaign.begin(tmp_path, definition(20, 20)), np.linspace(1.0, 2.0, 20)
-    tally = Tally.of(0, np.zeros(20), {"score": score, "rms.q": score})
-    (tmp_path / CHUNKS / "0-000000.json").write_text(tally.model_dump_json(), encoding="utf-8")
+    (tmp_path / CHUNKS / "0-000000.parquet").write_bytes(made_up(score))
     return campaign
+
+
+def made_up(score: FloatArray) -> bytes:
+    """The rows of a chunk with these scores."""
+    return encode(Chunk(0, np.zeros(len(score)), {"score": score, "rms.q": score}, {}), 7, 1.0)
 
 
 def refusal(*words: str) -> str:
@@ -333,12 +377,12 @@ def refusal(*words: str) -> str:
     return str(result.exception)
 
 
-@pytest.mark.parametrize("content", ["", Tally.of(0, np.zeros(9), {"score": np.ones(9)}).model_dump_json()])
-def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, content: str) -> None:
-    path = flown.folder / CHUNKS / "0-000000.json"
-    path.write_text(content, encoding="utf-8")
+@pytest.mark.parametrize("content", [b"", made_up(np.ones(20))[:-9], made_up(np.ones(9))])
+def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, content: bytes) -> None:
+    path = flown.folder / CHUNKS / "0-000000.parquet"
+    path.write_bytes(content)
     assert refusal("--resume", str(flown.folder)).startswith(
-        f"{path}: found {'9' if content else 'none'}, expected the figures"
+        f"{path}: found {'9' if content == made_up(np.ones(9)) else 'none'}, expected the figures"
     )
 
 
@@ -352,6 +396,15 @@ def test_printed_command_quotes_path_with_spaces(flown: Campaign) -> None:
     result = CliRunner().invoke(application(["campaign"]), ["campaign", "--resume", str(folder), "--json"])
     words = shlex.split(json.loads(result.stdout)["cases"][0]["fly_again"][0]["command"])
     assert words == ["rise-di", "fly", str(folder / "osprey_servo_19.yaml"), "--in-process"]
+
+
+def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> None:
+    path = tmp_path / "rows.parquet"
+    words = ["campaign", "--resume", str(flown.folder), "--rows", str(path), "--json"]
+    assert CliRunner().invoke(application(["campaign"]), words).exit_code == 0
+    assert pl.read_parquet(path).equals(CampaignResult(flown.folder, flown.folder / REPORT, {}).rows())
+    sentence = refusal("--resume", str(flown.folder), "--rows", str(tmp_path / "none" / "rows.parquet"))
+    assert sentence.startswith("--rows: found ")
 
 
 def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
@@ -384,7 +437,7 @@ def figures(process: "subprocess.Popen[str]") -> list[object]:
 
 def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") -> Path:
     """Wait until so many chunks of the one campaign in `runs` are done; return its folder."""
-    while len(found := list(runs.glob(f"*/{CHUNKS}/*.json"))) < count:
+    while len(found := list(runs.glob(f"*/{CHUNKS}/*.parquet"))) < count:
         assert process.poll() is None, process.communicate()
         time.sleep(0.02)
     return found[0].parents[1]
@@ -401,7 +454,7 @@ def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(whole: list[obj
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
-    assert 2 <= len(list((folder / CHUNKS).glob("*.json"))) < 20, "the campaign ended before the kill"
+    assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 20, "the campaign ended before the kill"
     assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
 
 
@@ -447,4 +500,4 @@ def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(w
     assert workers, "no worker of dask found"
     workers[0].kill()
     assert figures(spread) == whole
-    assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.json"))) == 20
+    assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.parquet"))) == 20

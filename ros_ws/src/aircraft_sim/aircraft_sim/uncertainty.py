@@ -86,6 +86,22 @@ def sampled_matrices(
     return spread(A, of_A, uniform[:, : A.size]), spread(B, of_B, uniform[:, A.size :])
 
 
+def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:
+    """The entries that `sampled_matrices` draws, by name as A[q,alpha] and B[V,thrust], each of shape (N,), SI.
+
+    A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft. Entries that are 0 as published, and the rows of
+    angles, are not drawn.
+    """
+    named = (("A", A, airframe.matrix_a(), airframe.states), ("B", B, airframe.matrix_b(), tuple(airframe.inputs)))
+    return {
+        f"{matrix}[{state},{column}]": values[:, i, j]
+        for matrix, values, published, columns in named
+        for i, state in enumerate(airframe.states)
+        for j, column in enumerate(columns)
+        if published[i, j] != 0.0 and state not in KINEMATIC
+    }
+
+
 def as_yaml(airframe: Airframe) -> str:
     """An airframe as the text of an airframe file, whose numbers read back as they are to the last bit."""
     return dump_yaml(airframe.model_dump(mode="json", exclude_defaults=True))

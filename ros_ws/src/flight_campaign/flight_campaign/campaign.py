@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaign: thousands of uncertain aircraft in one scenario, in chunks; an interrupted campaign can be resumed.
 
-The folder of a campaign holds its definition, a file for each completed chunk, and at the end its figures and its report.
+The folder of a campaign holds its definition, a table for each completed chunk, and at the end its figures and its report.
 """
 
 from collections.abc import Iterator
@@ -13,20 +13,22 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import WindEffect, gust_directions, sampled_matrices
+from aircraft_sim.uncertainty import WindEffect, drawn_entries, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
+from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
-from flight_core.files import write_file, writing
+from flight_core.files import replacing, write_file, writing
 from flight_core.parameters import Config, ParameterError, require
-from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from flight_campaign.fleet import Vehicle
     from flight_campaign.missions import Mission
 
@@ -134,17 +136,10 @@ def define(
     return definition
 
 
-class Chunk(NamedTuple):
-    """Results of the aircraft of a chunk, arguments of `Tally.of`."""
-
-    first: int  # number of the first
-    diverged: FloatArray  # (N,)
-    figures: dict[str, FloatArray]  # (N,) each, by name
-
-
-def fly_chunk(text: str, job: Job) -> str:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its Tally as JSON. It has no other inputs."""
-    return Tally.of(*fly_chunk_figures(text, job)).model_dump_json()
+def fly_chunk(text: str, job: Job) -> bytes:
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no other inputs."""
+    definition = Definition.model_validate_json(text)
+    return encode(fly_chunk_figures(text, job), definition.seed, definition.factor(job[0]))
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
@@ -169,7 +164,8 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
         figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    return Chunk(first, np.asarray(result.diverged)[:count], figures)
+    entries = drawn_entries(airframe, A[:count], B[:count])
+    return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
 
 
 class _Shared(NamedTuple):
@@ -224,17 +220,28 @@ class Campaign:
 
     def fly(self, engine: Engine) -> Iterator[int]:
         """Fly the missing chunks; yields the number of flights of each completed one."""
-        for job, tally in engine(partial(fly_chunk, self.definition.model_dump_json()), self.missing()):
-            _write(self._path(job), tally)
-            yield Tally.model_validate_json(tally).flights
+        for job, table in engine(partial(fly_chunk, self.definition.model_dump_json()), self.missing()):
+            _write(self._path(job), table)
+            yield self.definition.size(job)
 
     def tally(self, case: int) -> Tally:
         """Statistics of a case, summed in the order of the chunks. Raises ParameterError for a damaged file."""
         total = Tally()
-        for job in self.definition.jobs():
-            if job[0] == case and self._path(job).exists():
-                total += self._read(job)
+        for job in self._flown():
+            if job[0] == case:
+                total += tally_of(self._read(job))
         return total
+
+    def rows(self) -> "pl.LazyFrame":
+        """The table of the completed chunks, ordered by case, then number; `rows` has the columns."""
+        import polars as pl  # noqa: PLC0415 - some tenths of a second
+
+        return pl.scan_parquet([self._path(job) for job in self._flown()], glob=False)
+
+    def write_rows(self, path: Path) -> None:
+        """Write the table as one Parquet file, chunk by chunk. Raises OSError."""
+        with replacing(path) as stream:
+            self.rows().sink_parquet(stream)
 
     def margins(self, case: int) -> LoopMargins | None:
         """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
@@ -244,21 +251,26 @@ class Campaign:
         except ParameterError:
             return None
 
-    def _read(self, job: Job) -> Tally:
+    def _flown(self) -> list[Job]:
+        return [job for job in self.definition.jobs() if self._path(job).exists()]
+
+    def _read(self, job: Job) -> "pl.DataFrame":
+        import polars as pl  # noqa: PLC0415 - as above
+
         path, size = self._path(job), self.definition.size(job)
         try:
-            tally = Tally.model_validate_json(path.read_text(encoding="utf-8"))
-        except ValueError:
-            tally = Tally()
+            table = pl.read_parquet(path, glob=False)
+        except pl.exceptions.PolarsError:
+            table = pl.DataFrame()
         again = f"the figures of {size} aircraft of this campaign; remove the file, and --resume flies them again"
-        require(tally.flights == size, str(path), f"{tally.flights or 'none'}", again)
-        return tally
+        require(table.height == size, str(path), f"{table.height or 'none'}", again)
+        return table
 
     def _path(self, job: Job) -> Path:
         case, chunk = job
-        return self.folder / CHUNKS / f"{case}-{chunk:06d}.json"
+        return self.folder / CHUNKS / f"{case}-{chunk:06d}.parquet"
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, content: str | bytes) -> None:
     with writing("", path, "a folder and a disk that can"):
-        write_file(path, text)
+        write_file(path, content)

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_core.fields import Field
 from flight_core.parameters import Config, require
@@ -103,7 +104,7 @@ class Tally(Config):
         return cls(
             flights=len(bounded),
             diverged=int((~bounded).sum()),
-            lost=int((score[bounded] > LOSS_OF_TRACK_SCORE).sum()),
+            lost=int(lost_track(diverged, score).sum()),
             figures={name: Figure.of(np.asarray(values)[bounded]) for name, values in figures.items()},
             worst=tuple(Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None) for k in order),
         )
@@ -138,6 +139,11 @@ class Tally(Config):
 
         interval = binomtest(of, self.flights).proportion_ci(0.95, method="exact")
         return of / self.flights, float(interval.low), float(interval.high)
+
+
+def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
+    """Which flights lost track, shape (N,): those that did not diverge with a score above LOSS_OF_TRACK_SCORE."""
+    return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
 
 def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:

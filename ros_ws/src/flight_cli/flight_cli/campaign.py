@@ -30,7 +30,7 @@ from flight_cli.output import (
     print_json,
     progress_bar,
 )
-from flight_core.files import display_path
+from flight_core.files import display_path, writing
 from flight_core.installation import require_package
 from flight_core.parameters import require
 
@@ -71,6 +71,9 @@ def campaign(
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, as in tcp://host:8786.")] = None,
     runs: Annotated[Path, typer.Option(help="Folder that the campaign's folder is made in.")] = Path("runs"),
     resume: Annotated[Path | None, typer.Option(help="Folder of an interrupted campaign to continue.")] = None,
+    rows: Annotated[
+        Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries of A and B.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else.")] = False,
 ) -> None:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a scenario, many at once.
@@ -80,6 +83,8 @@ def campaign(
     require_package("jax")
     require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
     require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
+    if rows is not None:
+        require(rows.parent.is_dir(), "--rows", rows, "a file in a folder that exists")
     if resume is not None:
         for name in OF_DEFINITION:
             given = context.get_parameter_source(name)
@@ -95,6 +100,9 @@ def campaign(
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
     figures, results = write_results(monte_carlo)
+    if rows is not None:
+        with writing("--rows", rows, "the path of a file"):
+            monte_carlo.write_rows(rows)
     if as_json:
         print_json(figures)
         return

@@ -4,7 +4,7 @@
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -18,6 +18,9 @@ from flight_campaign.campaign_report import write_results
 from flight_core.arguments import FilePath, as_count, as_path
 from flight_core.parameters import ParameterError, require
 
+if TYPE_CHECKING:
+    import polars as pl
+
 Progress = Callable[[int, int], None]
 """Takes the number of flights so far and of all flights of a campaign."""
 
@@ -28,6 +31,13 @@ class CampaignResult(NamedTuple):
     folder: Path
     report: Path
     figures: dict[str, Any]
+
+    def rows(self) -> "pl.DataFrame":
+        """A row an aircraft, SI: seed, number, factor of the sweep, whether it diverged or lost track, figures, drawn entries.
+
+        The entries of A and B have names as "A[q,alpha]" and "B[V,thrust]". The figures of a diverged aircraft are null.
+        """
+        return Campaign.resume(self.folder).rows().collect()
 
 
 def fly_campaign(

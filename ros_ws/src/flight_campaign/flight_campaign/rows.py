@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A campaign as a table: a row an aircraft with its figures, its outcome, and the entries of A and B that were drawn."""
+
+import io
+from typing import TYPE_CHECKING, NamedTuple
+
+from flight_campaign.statistics import Tally, lost_track
+from flight_core.vectors import FloatArray
+
+if TYPE_CHECKING:  # it loads in some tenths of a second
+    import polars as pl
+
+KEYS = ("seed", "number", "factor", "diverged", "lost")
+"""Columns of every table; "factor" is that of the sweep, 1 without one. Figures follow, then the drawn entries."""
+
+
+class Chunk(NamedTuple):
+    """Results of the aircraft of a chunk."""
+
+    first: int  # number of the first
+    diverged: FloatArray  # (N,)
+    figures: dict[str, FloatArray]  # (N,) each, by name
+    entries: dict[str, FloatArray]  # (N,) each, by name, of `uncertainty.drawn_entries`
+
+
+def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
+    """The table of a chunk as Parquet (zstd), SI; the figures of a diverged aircraft are null."""
+    import polars as pl  # noqa: PLC0415
+
+    count, stream = len(chunk.diverged), io.BytesIO()
+    diverged = pl.Series("diverged", chunk.diverged.astype(bool))
+    table = pl.DataFrame(
+        {
+            "seed": pl.repeat(seed, count, dtype=pl.Int64, eager=True),
+            "number": pl.int_range(chunk.first, chunk.first + count, eager=True),
+            "factor": pl.repeat(factor, count, dtype=pl.Float64, eager=True),
+            "diverged": diverged,
+            "lost": lost_track(chunk.diverged, chunk.figures["score"]),
+            **chunk.figures,
+            **chunk.entries,
+        }
+    )
+    table = table.with_columns(pl.when(~diverged).then(pl.col(name)).alias(name) for name in chunk.figures)
+    table.write_parquet(stream)
+    return stream.getvalue()
+
+
+def entry_names(table: "pl.DataFrame") -> list[str]:
+    """The columns with drawn entries of A and B."""
+    return [name for name in table.columns if name.startswith(("A[", "B["))]
+
+
+def tally_of(table: "pl.DataFrame") -> Tally:
+    """Statistics of the rows of a chunk."""
+    figures = [name for name in table.columns if name not in {*KEYS, *entry_names(table)}]
+    columns = {name: table[name].to_numpy() for name in figures}
+    return Tally.of(table["number"][0], table["diverged"].to_numpy(), columns)
