@@ -3,7 +3,7 @@
 """Feasibility: refusal of a route beyond the aircraft's performance before the flight, with the nearest feasible value."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -73,7 +73,7 @@ def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Pe
     require(period >= slowest, "guidance.period", f"{period:g} s", expected)
     named = [waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)]
     kept, notes = _without_short_legs(named, radius, least)
-    return _with_circles(kept, notes, radius, least, can)
+    return _with_circles(dict(kept), notes, radius, least, can)
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[Leg, ...]:
@@ -81,8 +81,13 @@ def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[L
     return path.route([waypoint.point for waypoint in waypoints], radius, least, loiters)
 
 
-def _without_short_legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[list[Waypoint], tuple[str, ...]]:
-    """The waypoints without those left out for short legs, and a note on each. Raises ShortLegError where none can go."""
+def _without_short_legs(
+    waypoints: Sequence[Waypoint], radius: float, least: float
+) -> tuple[list[tuple[int, Waypoint]], tuple[str, ...]]:
+    """The waypoints with their numbers, without those left out for short legs, and a note on each of these.
+
+    Raises ShortLegError where none can go.
+    """
     kept, refusal = list(enumerate(waypoints)), None
     while True:
         try:
@@ -105,7 +110,7 @@ def _without_short_legs(waypoints: Sequence[Waypoint], radius: float, least: flo
         if distance > max(radius, waypoint.speed or 0.0):
             raise refusal or ParameterError("route")
         notes.append(f"route[{number}]: corner cut, {distance:.0f} m from the waypoint: a leg is too short for the fillets")
-    return [waypoint for _, waypoint in kept], tuple(notes)
+    return kept, tuple(notes)
 
 
 def _offset(before: Point, at: Point, after: Point) -> float:
@@ -116,10 +121,10 @@ def _offset(before: Point, at: Point, after: Point) -> float:
 
 
 def _with_circles(
-    waypoints: list[Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
+    kept: Mapping[int, Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
 ) -> FlyableRoute:
-    """The route with a circle for each change of altitude beyond the climb or sink along the leg."""
-    waypoints, told = list(waypoints), list(notes)
+    """The route with a circle for each change of altitude beyond the climb or sink along the leg; waypoints by number."""
+    numbers, waypoints, told = list(kept), list(kept.values()), list(notes)
     while True:
         legs = _legs(waypoints, radius, least)
         lines: dict[int, float] = {}
@@ -136,13 +141,13 @@ def _with_circles(
             rises = change > 0.0
             found = f"{abs(change):g} m {'above' if rises else 'below'} the waypoint before"
             expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
-            require(rate > 0.0 and (rises or at.leave is None), f"route[{k}].altitude", found, expected)
+            require(rate > 0.0 and (rises or at.departure == at.altitude), f"route[{numbers[k]}].altitude", found, expected)
             if rises:
                 waypoints[k - 1] = before._replace(leave=at.altitude)
             else:
                 waypoints[k] = at._replace(altitude=before.departure, leave=at.altitude)
             where = f"round the waypoint {'before' if rises else 'itself'}, where the leg takes {math.floor(reach)} m"
-            told.append(f"route[{k}]: {found}, flown on circles {where}")
+            told.append(f"route[{numbers[k]}]: {found}, flown on circles {where}")
             break
         else:
             return FlyableRoute(legs, tuple(waypoints), tuple(told))

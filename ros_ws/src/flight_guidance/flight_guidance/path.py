@@ -251,13 +251,15 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 
 def distance_from(legs: Sequence[Leg], point: Point) -> float:
-    """Distance of a point from the lines and fillets of a route, m."""
+    """Distance of a point from the lines, the fillets and the endless orbit of a route, m."""
     distances = []
     for leg in legs:
         if isinstance(leg, Line):
             distances.append(math.dist(point, along(leg.start, leg.end, nearest(leg, point) / length(leg))))
-        elif not is_orbit(leg) and leg.end is not None:
-            distances += [abs(math.dist(point, leg.centre) - abs(leg.radius)), math.dist(point, leg.end)]
+        elif leg.loiter is None:
+            distances.append(abs(math.dist(point, leg.centre) - abs(leg.radius)))
+            if leg.end is not None:
+                distances.append(math.dist(point, leg.end))
     return min(distances)
 
 
