@@ -25,6 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from polars.testing import assert_frame_equal
+from scipy.stats import spearmanr
 from tests.closed_loop import error
 from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
@@ -33,11 +34,12 @@ from flight_analysis.closed_loop.margins import linear_loop
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
-from flight_analysis.report.run_folder import REPORT
+from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
 from flight_campaign.campaign_report import overview, write_page
+from flight_campaign.influence import chance_level, rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_cli.cli import application
@@ -175,9 +177,8 @@ def test_report_of_missions_says_what_score_counts(mission: Definition, tmp_path
     campaign = Campaign.begin(tmp_path, mission)
     chunk = fly_chunk_figures(mission.model_dump_json(), (0, 0))
     tally = Tally.of(chunk.first, chunk.diverged, chunk.figures)
-    write_page(
-        tmp_path / "page.html", campaign.definition, [tally], [tally.summary() | {"factor": 1.0, "fly_again": []}], [None]
-    )
+    case = tally.summary() | {"factor": 1.0, "fly_again": [], "influence": {"entries": []}}
+    write_page(tmp_path / "page.html", campaign.definition, [tally], [case], [None])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "the largest cross-track error on the route in 12.5 m" in page
     assert "max xtrack (m)" in page
@@ -298,6 +299,30 @@ def test_figures_of_diverged_aircraft_are_null() -> None:
     assert tally_of(table) == Tally.of(4, chunk.diverged, chunk.figures)
 
 
+def test_rank_correlations_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(1)
+    strong, weak = rng.uniform(1.0, 2.0, (2, 50))
+    score = np.round(10.0 * strong + weak)  # with ties
+    table = pl.DataFrame({"score": score, "A[q,q]": -weak, "A[q,alpha]": -strong, "B[V,thrust]": np.ones(50)})
+    correlations = rank_correlations(table, {"A[q,q]": -1.5, "A[q,alpha]": -1.5, "B[V,thrust]": 1.0})
+    expected = {name: spearmanr(size, score).statistic for name, size in (("A[q,alpha]", strong), ("A[q,q]", weak))}
+    assert list(correlations) == list(expected)  # the strongest first, without the one that is not uncertain
+    assert correlations == pytest.approx(expected, rel=1e-12)
+    lost = table.with_columns(pl.when(pl.col("score") < score.max()).then(pl.col("score")).alias("score"))
+    assert rank_correlations(lost, {"A[q,q]": -1.5, "A[q,alpha]": -1.5}) == correlations  # a diverged aircraft is the worst
+    assert rank_correlations(table.head(5), {}) == {}
+
+
+def test_entries_without_effect_stay_within_level_of_chance() -> None:
+    rng, names = np.random.default_rng(1), [f"A[q,{k}]" for k in range(20)]
+    exceeded = 0
+    for _ in range(300):
+        table = pl.DataFrame({"score": rng.normal(size=60), **dict(zip(names, rng.normal(size=(20, 60)), strict=True))})
+        strongest = next(iter(rank_correlations(table, dict.fromkeys(names, 1.0)).values()))
+        exceeded += abs(strongest) > chance_level(60, 20)
+    assert exceeded / 300 < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 300)  # three standard deviations of 300 draws
+
+
 def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.05, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
@@ -367,7 +392,7 @@ def flown(tmp_path: Path) -> Campaign:
 
 def made_up(score: FloatArray) -> bytes:
     """The rows of a chunk with these scores."""
-    return encode(Chunk(0, np.zeros(len(score)), {"score": score, "rms.q": score}, {}), 7, 1.0)
+    return encode(Chunk(0, np.zeros(len(score)), {"score": score, "rms.q": score}, {"B[p,aileron]": 6.0 - score}), 7, 1.0)
 
 
 def refusal(*words: str) -> str:
@@ -396,6 +421,23 @@ def test_printed_command_quotes_path_with_spaces(flown: Campaign) -> None:
     result = CliRunner().invoke(application(["campaign"]), ["campaign", "--resume", str(folder), "--json"])
     words = shlex.split(json.loads(result.stdout)["cases"][0]["fly_again"][0]["command"])
     assert words == ["rise-di", "fly", str(folder / "osprey_servo_19.yaml"), "--in-process"]
+
+
+def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campaign) -> None:
+    words = ["campaign", "--resume", str(flown.folder)]
+    shown = CliRunner().invoke(application(["campaign"]), words).stdout
+    assert "B[p,aileron]" in shown
+    ranked = json.loads((flown.folder / SUMMARY).read_text(encoding="utf-8"))["cases"][0]["influence"]
+    published = find_scenario("osprey_servo").aircraft.load()[0].matrix_b()[5, 2]
+    assert ranked["entries"] == [
+        {
+            "entry": "B[p,aileron]",
+            "rank_correlation": pytest.approx(-1.0),
+            "worst_aircraft": pytest.approx(4.0 / published - 1.0),
+            "worst_corner": -0.3,
+        }
+    ]
+    assert "B[p,aileron]" in (flown.folder / REPORT).read_text(encoding="utf-8")
 
 
 def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ The folder of a campaign holds its definition, a table for each completed chunk,
 from collections.abc import Iterator
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
+from flight_campaign.influence import RANKED, influence
 from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
@@ -78,6 +79,10 @@ class Definition(Config):
     def factor(self, case: int) -> float:
         """Factor of the swept parameter in a case."""
         return 1.0 if self.sweep is None else self.sweep.factors[case]
+
+    def label(self, case: int) -> str:
+        """The name of a case in tables."""
+        return self.name if self.sweep is None else f"{self.sweep.parameter} x {self.factor(case):g}"
 
     def size(self, job: Job) -> int:
         """Number of aircraft of a chunk."""
@@ -232,11 +237,11 @@ class Campaign:
                 total += tally_of(self._read(job))
         return total
 
-    def rows(self) -> "pl.LazyFrame":
-        """The table of the completed chunks, ordered by case, then number; `rows` has the columns."""
+    def rows(self, case: int | None = None) -> "pl.LazyFrame":
+        """The table of the completed chunks of a case or of all, ordered by case, then number; `rows` has the columns."""
         import polars as pl  # noqa: PLC0415 - some tenths of a second
 
-        return pl.scan_parquet([self._path(job) for job in self._flown()], glob=False)
+        return pl.scan_parquet([self._path(job) for job in self._flown() if case in {None, job[0]}], glob=False)
 
     def write_rows(self, path: Path) -> None:
         """Write the table as one Parquet file, chunk by chunk. Raises OSError."""
@@ -253,6 +258,19 @@ class Campaign:
 
     def _flown(self) -> list[Job]:
         return [job for job in self.definition.jobs() if self._path(job).exists()]
+
+    def influence(self, case: int, worst: int) -> dict[str, Any]:
+        """Rank correlations of the drawn entries with the score of a case; `worst` is the number of its worst aircraft."""
+        import polars as pl  # noqa: PLC0415 - as above
+
+        rows, airframe = self.rows(case), load_airframe(self.definition.scenario().aircraft.airframe)
+        published = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
+        return influence(
+            rows.head(RANKED).collect(),
+            rows.filter(pl.col("number") == worst).collect(),
+            {name: float(value[0]) for name, value in published.items()},
+            self.definition.uncertainty,
+        )
 
     def _read(self, job: Job) -> "pl.DataFrame":
         import polars as pl  # noqa: PLC0415 - as above

@@ -20,7 +20,7 @@ from flight_analysis.report.html import Line, Page, Section, TableGroup, page_ht
 from flight_analysis.report.margins import LEAST_MARGINS, least_margins, margins_as_json
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_analysis.report.summary import NO_UNIT, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null
+from flight_analysis.report.summary import NO_UNIT, NO_VALUE, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null
 from flight_analysis.report.tables import Table
 from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
@@ -30,6 +30,7 @@ from flight_core.vectors import FloatArray
 COARSE = PER_DECADE // 50  # bins of the statistics in one bin of a figure, 5 % wide
 WIND_EFFECTS: dict[WindEffect, str] = {"air_relative": "by each aircraft's own A", "published": "that of the airframe"}
 SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
+ENTRIES_SHOWN = 6
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 
@@ -52,6 +53,7 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
         cases = [
             {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign, case, tally)}
             | {"margins": None if of_loop is None else margins_as_json(of_loop)}
+            | {"influence": campaign.influence(case, tally.worst[0].number)}
             for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
         ]
         figures = {
@@ -102,6 +104,7 @@ def write_page(
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
     tables.append(_worst(labels, cases))
+    tables += [influence_table(label, case) for label, case in zip(labels, cases, strict=True) if case["influence"]["entries"]]
     sections = [
         Section("Score", "share of the aircraft by score", _spread(labels, tallies, ["score"], {}), over_time=False),
         Section(
@@ -137,9 +140,7 @@ def score_meaning(scenario: Scenario) -> str:
 
 
 def _labels(definition: Definition) -> list[str]:
-    if definition.sweep is None:
-        return [definition.name]
-    return [f"{definition.sweep.parameter} x {factor:g}" for factor in definition.sweep.factors]
+    return [definition.label(case) for case in range(definition.cases)]
 
 
 def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
@@ -186,6 +187,27 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
         for flight in case["fly_again"]
     ]
     return Table("Worst flights", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
+
+
+def influence_table(label: str, case: Mapping[str, Any]) -> Table:
+    """The entries of A and B whose size goes most with the score, of a case of the summary."""
+    ranked = case["influence"]
+    rows = [
+        [of["entry"], f"{of['rank_correlation']:+.2f}", f"{100 * of['worst_aircraft']:+.0f} %", _corner(of["worst_corner"])]
+        for of in ranked["entries"][:ENTRIES_SHOWN]
+    ]
+    legend = (
+        f"Spearman, over {ranked['aircraft']} aircraft; +: the score grows with the size of the entry. Worst corner: the limits"
+        " on the side of the higher score"
+    )
+    if ranked["chance"] is not None:
+        legend += f"; below {ranked['chance']:.2f} it may be chance"
+    columns = [Column("", head) for head in ("rank correlation with the score", "worst aircraft", "worst corner")]
+    return Table(f"Entries of A and B: {label}", columns, rows, legend)
+
+
+def _corner(value: float) -> str:
+    return f"{100 * value:+.0f} %" if value else NO_VALUE
 
 
 def _spread(

@@ -11,14 +11,16 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from aircraft_sim.uncertainty import WindEffect
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.summary import QUANTITY_UNITS, display_units
+from flight_analysis.report.tables import Table
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNK, Campaign, Definition, Sweep, define
-from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, write_results
+from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, influence_table, write_results
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, Tally
 from flight_cli.output import (
     COUNT_COLUMNS,
@@ -109,11 +111,9 @@ def campaign(
     console = Console()
     for case in range(monte_carlo.definition.cases):
         _show(console, monte_carlo.definition, case, monte_carlo.tally(case), figures["cases"][case])
-    table = new_table(f"\n{results.caption}", ("figure", *(column.head for column in results.columns)), left=("figure",))
-    for row in results.rows:
-        table.add_row(*row)
-    console.print(table)
-    console.print(results.legend, style="dim", highlight=False, soft_wrap=True)
+        if figures["cases"][case]["influence"]["entries"]:
+            _print(console, influence_table(monte_carlo.definition.label(case), figures["cases"][case]), "entry")
+    _print(console, results, "figure")
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
     print(f"folder:  {display_path(monte_carlo.folder)}\nreport:  {display_path(monte_carlo.folder / REPORT)}")
@@ -149,6 +149,15 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
         )
         raise typer.Exit(INTERRUPTED) from None
     return done * seconds / (time.monotonic() - begin)
+
+
+def _print(console: Console, results: Table, first: str) -> None:
+    """Print a table of the page; `first` heads the names of the rows."""
+    table = new_table(f"\n{results.caption}", (first, *(column.head for column in results.columns)), left=(first,))
+    for name, *values in results.rows:
+        table.add_row(escape(name), *values)
+    console.print(table)
+    console.print(results.legend, style="dim", highlight=False, soft_wrap=True)
 
 
 def _show(console: Console, definition: Definition, case: int, tally: Tally, figures: dict[str, Any]) -> None:
