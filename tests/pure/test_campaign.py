@@ -330,16 +330,11 @@ def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
 
 
-@pytest.mark.parametrize(
-    ("sweep", "sentence"),
-    [
-        (Sweep(parameter="gain", factors=(1.0,)), "sweep: found gain, expected a parameter of the controller: k_g"),
-        (Sweep(parameter="beta", factors=(0.0,)), r"sweep: found \(0.0,\), expected factors above 0"),
-    ],
-)
-def test_an_invalid_sweep_is_refused(sweep: Sweep, sentence: str) -> None:
-    with pytest.raises(ParameterError, match=f"^{sentence}"):
-        definition(20, 20, sweep)
+def test_invalid_sweep_refused() -> None:
+    with pytest.raises(ParameterError, match=r"^sweep: found gain, expected a parameter of the controller: k_g"):
+        definition(20, 20, Sweep(parameter="gain", factors=(1.0,)))
+    with pytest.raises(ParameterError, match=r"factors\[0\]: found 0.0, expected greater than 0"):
+        Sweep(parameter="beta", factors=(0.0,))
 
 
 def test_sweep_of_registered_law() -> None:

@@ -3,21 +3,26 @@
 """Invalid parameters: one sentence that names the key, what was found and what is expected."""
 
 import math
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.builders import aircraft_parameters
-from tools.parameters import page
+from tools.parameters import SECTIONS
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_bringup.scenarios import find_scenario
+from flight_campaign.campaign import Definition
 from flight_core.files import read_yaml, writing
-from flight_core.parameters import ParameterError, flatten, nest
+from flight_core.parameters import Config, ParameterError, flatten, nest
 from flight_core.rates import divide, period_ns
+from rise_di_controller import laws
 
 pytestmark = pytest.mark.package("flight_core")
 
@@ -27,7 +32,7 @@ BAD = {
     ("k_g: 1.0", "k_g: true"): "controller.k_g: found True, expected a number",
     ("    beta:", "    betta:"): "controller.betta: unknown key, expected beta perhaps, or another of D, Lambda,",
     ("    Lambda: [5.0, 5.0, 3.0, 0.5]", "    #"): "controller.Lambda: missing, expected the diagonal of Lambda (4), 1/s",
-    ("D: [1, 1, 1, 1]", "D: [1, 1, 2, 1]"): "controller.D[2]: found 2, expected +1 or -1",
+    ("D: [1, 1, 1, 1]", "D: [1, 1, 2, 1]"): "controller.D[2]: found 2, expected 1 or -1",
     ("D: [1, 1, 1, 1]", "D: [1, 1, 1]"): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
     ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
     ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, .nan, 7.0]"): "controller.k_d[1]: found nan, expected a finite number",
@@ -273,12 +278,48 @@ def test_output_that_cannot_be_written_is_one_sentence() -> None:
         assert str(rejected.value) == f"{place} cannot be written (No such file or directory), expected the path of a file"
 
 
-WITHOUT_END = {f"`actuators.{key}`" for key in ("lower", "upper", "rate", "stuck_at", "lost_at")}  # .inf: no limit, or never
+# A field without bounds takes .inf and NaN: no end stop, never, or what a message field has for "no value".
+ENDLESS = {
+    "ActuatorConfig": {"lower", "upper", "rate", "stuck_at", "lost_at"},
+    "InputRow": {"release"},
+    "MessageRow": {"values"},
+}
+RESULTS = {"flight_campaign.statistics"}  # modules with sets that only the stack writes
 
 
-def test_each_numeric_key_has_bounds() -> None:
-    """The page of parameters states a lower and an upper bound of each number."""
-    rows = [[cell.strip() for cell in line.split("|")[1:5]] for line in page().splitlines() if line.startswith("| `")]
-    numbers = {key: bounds for key, kind, _, bounds in rows if kind in {"number", "list of number"}}
-    assert len(numbers) > 100
-    assert {key for key, bounds in numbers.items() if not (">" in bounds and "<" in bounds)} == WITHOUT_END
+def schemas(base: type[Config] = Config) -> Iterator[type[Config]]:
+    """The parameter sets of files, nodes and laws."""
+    yield from (*SECTIONS.values(), Airframe, Definition)
+    for name in laws.names():
+        with suppress(ParameterError):  # loaded, but of the full state
+            laws.schema(name)
+    for schema in base.__subclasses__():
+        if schema.__module__ not in RESULTS and not schema.__module__.partition(".")[0].startswith("test"):
+            yield schema
+        yield from schemas(schema)
+
+
+def rules_of_numbers(annotation: Any, rules: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """The rules of each number in a type, those in lists and tables included."""
+    origin, parts = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        own = {rule: limit for field in parts[1:] for rule, limit in field.rules.items()}
+        yield from rules_of_numbers(parts[0], own | dict(rules))
+    elif origin in {Union, UnionType, tuple, dict}:
+        for part in parts:
+            yield from rules_of_numbers(part, rules if origin in {Union, UnionType} else {})
+    elif annotation in {int, float}:
+        yield rules
+
+
+@pytest.mark.parametrize("schema", sorted(set(schemas()), key=repr), ids=lambda schema: schema.__name__)
+def test_each_number_has_lower_and_upper_bound(schema: type[Config]) -> None:
+    endless = set()
+    for name, field in schema.model_fields.items():
+        for rules in rules_of_numbers(field.annotation, field.rules):
+            if rules.get("allow_inf_nan"):
+                endless.add(name)
+            else:
+                assert rules.keys() & {"ge", "gt"}, name
+                assert rules.keys() & {"le", "lt"}, name
+    assert endless == ENDLESS.get(schema.__name__, set())

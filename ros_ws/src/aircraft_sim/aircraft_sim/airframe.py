@@ -73,7 +73,7 @@ class Airframe(Config):
     )
     gravity: tuple[Gravity, ...] = Field(default=(), description="sine terms of f")
     inertial_coupling: tuple[Product, ...] = Field(default=(), description="terms of f from products of states")
-    gusts: dict[str, dict[str, float]] = Field(
+    gusts: dict[str, dict[str, Number]] = Field(
         default={},
         description="what wind w along each axis adds to each x_dot, per w / V0; axes: longitudinal, lateral, vertical",
     )

@@ -43,10 +43,12 @@ Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion"
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
 SystemId = Annotated[int, Field(ge=1, le=255)]
-Raw = Annotated[float, Field(allow_inf_nan=True)]
-Range = tuple[Raw, Raw]
-Limits = tuple[float, float]
-Value = bool | int | Raw | str | tuple[int, ...] | tuple[Raw, ...]
+Raw = Annotated[float, Field(allow_inf_nan=True)]  # of a message field, which may be NaN, infinite or FLT_MAX for "no value"
+Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # of a message field: from int64 to uint64
+Mask = Annotated[int, Field(gt=0, lt=2**64)]
+Baud = Annotated[int, Field(ge=50, le=12_000_000)]  # the least of termios, the highest of the USB converter FT232H
+Limits = tuple[Number, Number]
+Value = bool | Integer | Raw | str | tuple[Integer, ...] | tuple[Raw, ...]
 
 
 class Row(Config):
@@ -112,8 +114,8 @@ class InputRow(MovingRow):
     trim: Number = Field(description="the command in trim, to which u is added, SI; a row of `trims` replaces it")
     lower: Annotated[Number, Field(le=0)] = Field(description="the lower limit of u around trim, SI")
     upper: NonNegative = Field(description="the upper limit of u around trim, SI")
-    range: Range = Field(description="the lowest and the highest raw value of the field")
-    neutral: float | Literal["trim"] = Field(description="failsafe: the raw value that is sent when u has timed out, or trim")
+    range: Limits = Field(description="the lowest and the highest raw value of the field")
+    neutral: Number | Literal["trim"] = Field(description="failsafe: the raw value that is sent when u has timed out, or trim")
     at_limit: Positive | None = Field(
         default=None, description="how long u may stay at one of its limits while engaged, s: then the bridge disengages"
     )
@@ -143,7 +145,7 @@ class WatchedRow(Config):
     type: MessageType = Field(description="its type, package/msg/Type")
     field: str = Field(description="the path of the field")
     source: str = Field(min_length=1, description="where the row is from")
-    bits: Annotated[int, Field(gt=0)] | None = Field(default=None, description="for a bit field: mask of the bits that count")
+    bits: Mask | None = Field(default=None, description="for a bit field: mask of the bits that count")
 
     def masked(self, raw: float) -> float:
         """The value of the bits that count."""
@@ -199,7 +201,7 @@ class LinkConfig(Config):
         pattern=r"^((udpin|udpout|tcp|tcpin):[^:]+:\d+|/dev/\S+)$",
         description="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or a serial device",
     )
-    baud: Annotated[int, Field(gt=0)] = Field(default=57600, description="the rate of a serial device, bit/s")
+    baud: Baud = Field(default=57600, description="the rate of a serial device, bit/s")
     system: SystemId = Field(default=1, description="the autopilot's system, MAV_SYSID; its component is 1")
     source_system: SystemId = Field(
         default=255, description="the system of the bridge: ArduPilot takes RC overrides of MAV_GCS_SYSID alone, 255 by default"

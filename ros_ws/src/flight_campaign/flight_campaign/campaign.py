@@ -23,7 +23,7 @@ from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
 from flight_core.files import replacing, write_file, writing
-from flight_core.parameters import Config, ParameterError, require
+from flight_core.parameters import Config, ParameterError, Positives, require
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig
 
@@ -42,7 +42,7 @@ class Sweep(Config):
     """Factors of one parameter of the controller; every aircraft flies with each of them."""
 
     parameter: str
-    factors: tuple[float, ...] = Field(min_length=1)
+    factors: Positives
 
 
 class Definition(Config):
@@ -50,11 +50,11 @@ class Definition(Config):
 
     name: str  # of the scenario
     sections: dict[str, dict[str, object]]  # of the scenario, every parameter
-    aircraft: int = Field(ge=1, description="how many aircraft fly")
+    aircraft: int = Field(ge=1, le=2**32, description="how many aircraft fly")
     uncertainty: float = Field(ge=0, lt=1, description="the largest part by which an entry of A and of B differs")
     wind: WindEffect = Field(description="the effect of wind: by each aircraft's own A, or that of the airframe")
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
-    chunk: int = Field(ge=1, description="how many of them fly at once")
+    chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
     sweep: Sweep | None = None
 
     def scenario(self, case: int = 0) -> Scenario:
@@ -117,7 +117,6 @@ def define(
     if sweep is not None:
         swept = swept_parameters(scenario.controller)
         require(sweep.parameter in swept, "sweep", sweep.parameter, f"a parameter of the controller: {', '.join(swept)}")
-        require(all(factor > 0.0 for factor in sweep.factors), "sweep", sweep.factors, "factors above 0")
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 

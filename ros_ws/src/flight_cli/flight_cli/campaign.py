@@ -124,7 +124,7 @@ def _parse_sweep(text: str) -> Sweep:
     factors = parse_numbers(values)
     fits = bool(factors) and all(map(math.isfinite, factors))
     require(fits, "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2")
-    return Sweep(parameter=name.removeprefix("controller."), factors=tuple(factors))
+    return Sweep.validate_mapping({"parameter": name.removeprefix("controller."), "factors": factors}, "--sweep")
 
 
 def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:

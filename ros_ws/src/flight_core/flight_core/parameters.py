@@ -194,7 +194,7 @@ Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
 Names = Annotated[tuple[str, ...], Field(min_length=1)]
-Signs = Annotated[tuple[int, ...], Field(min_length=1)]
+Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 
 def require(condition: bool, key: str, found: object, expected: str) -> None:

@@ -171,8 +171,6 @@ class ControllerConfig(NodeConfig):
             require(low <= 0, f"lower[{i}]", low, "at most 0, so that trim is inside the limits")
         for i, high in enumerate(self.upper or ()):
             require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
-        for i, sign in enumerate(self.D):
-            require(sign in (-1, 1), f"D[{i}]", sign, "+1 or -1")
         self.check_law()
         self._check_state()
         nominal = self.nominal()
