@@ -330,11 +330,34 @@ def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
 
 
-def test_invalid_sweep_refused() -> None:
-    with pytest.raises(ParameterError, match=r"^sweep: found gain, expected a parameter of the controller: k_g"):
-        definition(20, 20, Sweep(parameter="gain", factors=(1.0,)))
+@pytest.mark.parametrize(
+    ("parameter", "sentence"),
+    [
+        ("gain", "sweep: found gain, expected a parameter of the controller: k_g"),
+        ("beta[h]", r"sweep: found beta\[h\], expected beta\[CHANNEL\], CHANNEL one of q, "),
+        ("k_d[V]", r"sweep: found k_d\[V\], expected k_d\[CHANNEL\], CHANNEL one of q, p, r, el"),
+        ("k_g[V]", r"sweep: found k_g\[V\], expected k_g: it does not have a value a channel"),
+    ],
+)
+def test_sweep_of_unknown_parameter_or_channel_refused(parameter: str, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=f"^{sentence}"):
+        definition(20, 20, Sweep(parameter=parameter, factors=(1.0,)))
+
+
+def test_sweep_by_zero_refused() -> None:
     with pytest.raises(ParameterError, match=r"factors\[0\]: found 0.0, expected greater than 0"):
         Sweep(parameter="beta", factors=(0.0,))
+
+
+@pytest.mark.parametrize(("channel", "place"), [("V", -1), ("thrust", -1), ("q", 0)])
+def test_sweep_of_channel_multiplies_that_value_alone(channel: str, place: int) -> None:
+    swept = definition(20, 20, Sweep(parameter=f"beta[{channel}]", factors=(1.0, 2.0)))
+    own, double = (swept.scenario(case).controller.model_dump()["beta"] for case in range(2))
+    assert own == SHORT.controller.model_dump()["beta"]
+    expected = np.array(own)
+    expected[SHORT.controller.outputs.index("V") if place else 0] *= 2.0
+    assert double == tuple(expected)
+    assert swept.label(1) == f"beta[{channel}] x 2"
 
 
 def test_sweep_of_registered_law() -> None:

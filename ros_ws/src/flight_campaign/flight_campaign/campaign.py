@@ -39,10 +39,34 @@ MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are c
 
 
 class Sweep(Config):
-    """Factors of one parameter of the controller; every aircraft flies with each of them."""
+    """Factors of one parameter of the controller, or of its value in a channel; every aircraft flies with each of them."""
 
-    parameter: str
+    parameter: str = Field(description="its name, as beta, or with a channel of y or u, as beta[V]")
     factors: Positives
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter, without the channel."""
+        return self.parameter.partition("[")[0]
+
+    def scaled(self, controller: ControllerConfig, factor: float) -> float | tuple[float, ...]:
+        """The parameter times a factor, in the channel alone where one is named.
+
+        A channel of u means the channel of y that it is paired with. Raises ParameterError for another parameter or channel.
+        """
+        swept = swept_parameters(controller)
+        require(self.name in swept, "sweep", self.parameter, f"a parameter of the controller: {', '.join(swept)}")
+        value = getattr(controller, self.name)
+        if self.name == self.parameter:
+            return tuple(factor * number for number in value) if isinstance(value, tuple) else factor * float(value)
+        m = len(controller.outputs)
+        by_channel = isinstance(value, tuple) and len(value) in (m - 1, m)  # k_d of (22) has none for the last
+        require(by_channel, "sweep", self.parameter, f"{self.name}: it does not have a value a channel")
+        named = [*enumerate(controller.outputs[: len(value)]), *enumerate(controller.inputs[: len(value)])]
+        places = [k for k, name in named if f"{self.name}[{name}]" == self.parameter]
+        names = ", ".join(name for _, name in named)
+        require(bool(places), "sweep", self.parameter, f"{self.name}[CHANNEL], CHANNEL one of {names}")
+        return tuple(factor * number if k == places[0] else number for k, number in enumerate(value))
 
 
 class Definition(Config):
@@ -62,9 +86,8 @@ class Definition(Config):
         scenario = scenario_of(self.name, Path(self.name), self.sections)
         if self.sweep is None:
             return scenario
-        value, factor = getattr(scenario.controller, self.sweep.parameter), self.factor(case)
-        scaled = tuple(factor * number for number in value) if isinstance(value, tuple) else factor * value
-        return scenario.vary(controller={self.sweep.parameter: scaled})
+        scaled = self.sweep.scaled(scenario.controller, self.factor(case))
+        return scenario.vary(controller={self.sweep.name: scaled})
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
         """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
@@ -115,8 +138,7 @@ def define(
     Raises ParameterError if a campaign cannot fly it.
     """
     if sweep is not None:
-        swept = swept_parameters(scenario.controller)
-        require(sweep.parameter in swept, "sweep", sweep.parameter, f"a parameter of the controller: {', '.join(swept)}")
+        sweep.scaled(scenario.controller, 1.0)
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 

@@ -197,12 +197,12 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
         for of in ranked["entries"][:ENTRIES_SHOWN]
     ]
     legend = (
-        f"Spearman, over {ranked['aircraft']} aircraft; +: the score grows with the size of the entry. Worst corner: the limits"
-        " on the side of the higher score"
+        f"rank correlation (Spearman, {ranked['aircraft']} aircraft) of the size of the entry with the score: above 0 larger"
+        " entries fly worse. Worst corner: the limits on the side of the higher score"
     )
     if ranked["chance"] is not None:
         legend += f"; below {ranked['chance']:.2f} it may be chance"
-    columns = [Column("", head) for head in ("rank correlation with the score", "worst aircraft", "worst corner")]
+    columns = [Column("", head) for head in ("rank correlation", "worst aircraft", "worst corner")]
     return Table(f"Entries of A and B: {label}", columns, rows, legend)
 
 

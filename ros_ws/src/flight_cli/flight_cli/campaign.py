@@ -59,7 +59,8 @@ def campaign(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
-        str | None, typer.Option(help="A controller parameter and factors to multiply it by, as in beta=0.5,1,2.")
+        str | None,
+        typer.Option(help="A controller parameter, or its value in a channel, and factors: beta=0.5,1,2 or 'beta[V]=0.5,1,2'."),
     ] = None,
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
     chunk: Annotated[
@@ -123,7 +124,7 @@ def _parse_sweep(text: str) -> Sweep:
     name, _, values = text.partition("=")
     factors = parse_numbers(values)
     fits = bool(factors) and all(map(math.isfinite, factors))
-    require(fits, "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2")
+    require(fits, "--sweep", repr(text), "a parameter and factors, as in beta=0.5,1,2 or beta[V]=0.5,1,2")
     return Sweep.validate_mapping({"parameter": name.removeprefix("controller."), "factors": factors}, "--sweep")
 
 
@@ -153,7 +154,9 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
 
 def _print(console: Console, results: Table, first: str) -> None:
     """Print a table of the page; `first` heads the names of the rows."""
-    table = new_table(f"\n{results.caption}", (first, *(column.head for column in results.columns)), left=(first,))
+    table = new_table(
+        escape(f"\n{results.caption}"), (first, *(escape(column.head) for column in results.columns)), left=(first,)
+    )
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
     console.print(table)
@@ -166,7 +169,7 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
-    table = new_table(title, ("figure", *FIGURE_HEADINGS), left=("figure",))
+    table = new_table(escape(title), ("figure", *FIGURE_HEADINGS), left=("figure",))
     for row in figure_rows(tally, units):
         table.add_row(*row)
     console.print(table)

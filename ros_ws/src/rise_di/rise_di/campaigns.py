@@ -62,7 +62,7 @@ def fly_campaign(
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the airframe; None: the scenario's.
         seed: Seed of the aircraft.
-        sweep: A parameter of the controller and factors that multiply it: {"beta": [0.5, 1.0, 2.0]}.
+        sweep: A parameter of the controller, or its value in a channel, and its factors: {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
         chunk: Aircraft computed at once. More are faster on a GPU.
         workers: Threads; None: one a core.
