@@ -455,6 +455,13 @@ def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campa
             "worst_corner": -0.3,
         }
     ]
+    corner = load_scenario(flown.folder / "osprey_servo_corner.yaml").aircraft.load()[0]
+    nominal = find_scenario("osprey_servo").aircraft.load()[0]
+    ratio = np.ones((8, 4))
+    ratio[5, 2] = 0.7
+    np.testing.assert_allclose(corner.matrix_b(), ratio * nominal.matrix_b(), rtol=1e-15)
+    np.testing.assert_allclose(corner.matrix_a(), nominal.matrix_a(), rtol=1e-15)
+    assert shlex.split(ranked["command"])[:2] == ["rise-di", "fly"]
     assert "B[p,aileron]" in (flown.folder / REPORT).read_text(encoding="utf-8")
 
 

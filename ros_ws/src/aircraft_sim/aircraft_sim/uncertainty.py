@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe, repeatable by seed."""
 
+from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
@@ -92,14 +93,29 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
     A, of shape (N, n, n), and B, of shape (N, n, m), are those of N aircraft. Entries that are 0 as published, and the rows of
     angles, are not drawn.
     """
-    named = (("A", A, airframe.matrix_a(), airframe.states), ("B", B, airframe.matrix_b(), tuple(airframe.inputs)))
+    matrices = {"A": A, "B": B}
+    return {name: matrices[matrix][:, i, j] for name, (matrix, i, j) in _drawn_places(airframe).items()}
+
+
+def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
+    """The entries that `sampled_matrices` draws: matrix, row and column by name."""
+    named = {"A": (airframe.matrix_a(), [*airframe.states]), "B": (airframe.matrix_b(), [*airframe.inputs])}
     return {
-        f"{matrix}[{state},{column}]": values[:, i, j]
-        for matrix, values, published, columns in named
+        f"{matrix}[{state},{column}]": (matrix, i, j)
+        for matrix, (published, columns) in named.items()
         for i, state in enumerate(airframe.states)
         for j, column in enumerate(columns)
         if published[i, j] != 0.0 and state not in KINEMATIC
     }
+
+
+def with_entries(airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE) -> Airframe:
+    """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`; wind as in `wind_factors`."""
+    matrices, places = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}, _drawn_places(airframe)
+    for name, deviation in deviations.items():
+        matrix, i, j = places[name]
+        matrices[matrix][i, j] *= 1.0 + deviation
+    return airframe.with_matrices(matrices["A"], matrices["B"], wind_factors(airframe, matrices["A"][None], wind)[0])
 
 
 def as_yaml(airframe: Airframe) -> str:

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from aircraft_sim.uncertainty import WindEffect
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
 from flight_analysis.closed_loop.margins import LoopMargins
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
@@ -53,7 +54,7 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
         cases = [
             {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign, case, tally)}
             | {"margins": None if of_loop is None else margins_as_json(of_loop)}
-            | {"influence": campaign.influence(case, tally.worst[0].number)}
+            | {"influence": _influence(campaign, case, tally)}
             for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
         ]
         figures = {
@@ -74,13 +75,35 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
 def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
     """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
     definition, again = campaign.definition, []
-    suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
     for aircraft in tally.worst[:RERUN]:
-        path = campaign.folder / f"{definition.name}{suffix}_{aircraft.number}.yaml"
+        path = _path(campaign, case, str(aircraft.number))
         write_file(path, scenario_yaml(definition.aircraft_scenario(aircraft.number, case)))
-        command = f"rise-di fly {shlex.quote(display_path(path))} --in-process"
-        again.append({"number": aircraft.number, "score": aircraft.score, "command": command})
+        again.append({"number": aircraft.number, "score": aircraft.score, "command": _command(path)})
     return again
+
+
+def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
+    """Rank correlations of a case; writes the airframe and the scenario of the worst corner where there is one."""
+    definition, ranked = campaign.definition, campaign.influence(case, tally.worst[0].number)
+    corner = {of["entry"]: of["worst_corner"] for of in ranked["entries"] if of["worst_corner"]}
+    if not corner:
+        return ranked | {"command": None}
+    scenario, path = definition.scenario(case), _path(campaign, case, "corner")
+    airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
+    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), corner, definition.wind)))
+    write_file(path, scenario_yaml(scenario.vary(aircraft={"airframe": str(airframe)})))
+    return ranked | {"command": _command(path)}
+
+
+def _path(campaign: Campaign, case: int, word: str) -> Path:
+    """The file of a scenario of a case."""
+    definition = campaign.definition
+    suffix = "" if definition.sweep is None else f"_{definition.factor(case):g}"
+    return campaign.folder / f"{definition.name}{suffix}_{word}.yaml"
+
+
+def _command(path: Path) -> str:
+    return f"rise-di fly {shlex.quote(display_path(path))} --in-process"
 
 
 def write_page(
@@ -202,6 +225,8 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
     )
     if ranked["chance"] is not None:
         legend += f"; below {ranked['chance']:.2f} it may be chance"
+    if ranked["command"] is not None:
+        legend += f". The worst corner flies by {ranked['command']}"
     columns = [Column("", head) for head in ("rank correlation", "worst aircraft", "worst corner")]
     return Table(f"Entries of A and B: {label}", columns, rows, legend)
 
