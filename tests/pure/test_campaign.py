@@ -498,7 +498,7 @@ def figures(process: "subprocess.Popen[str]") -> list[object]:
     assert process.returncode == 0, errors
     cases = json.loads(output)["cases"]
     for case in cases:
-        case.pop("fly_again")  # names the folder
+        del case["fly_again"], case["influence"]["command"]  # name the folder
     return list(cases)
 
 
