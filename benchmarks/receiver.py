@@ -13,8 +13,8 @@ from benchmarks.nodes import open_node
 from flight_bringup.scenarios import find_scenario
 from flight_core.publisher_lock import PublisherLock
 from flight_core.vectors import FloatArray
-from flight_ros.messages import Decoder, Encoder
-from flight_ros.receiver import MAX_SIZE, Receiver, Refusals
+from flight_ros.messages import MAX_SIZE, Decoder, Encoder
+from flight_ros.receiver import Receiver, Refusals
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import NEWEST_SAMPLES, Y
 from rise_di_controller.controller import Controller

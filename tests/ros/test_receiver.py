@@ -10,8 +10,9 @@ from tests.joint_states import JOINT_STATE, STORE, vector
 
 from flight_core.publisher_lock import PublisherLock
 from flight_core.vectors import ChannelError, StampedVector
-from flight_ros.messages import Decoder, Encoder
-from flight_ros.receiver import MAX_SIZE, Receiver, Refusals, require_size
+from flight_ros import messages
+from flight_ros.messages import MAX_SIZE, Decoder, Encoder, NamedDecoder, require_size
+from flight_ros.receiver import Receiver, Refusals
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.topics import Y
 
@@ -122,7 +123,24 @@ def test_size_limit_is_inclusive() -> None:
         require_size(bytes(MAX_SIZE + 1))
 
 
-@pytest.mark.parametrize("raw", [message("/foreign"), of_size(MAX_SIZE, "/foreign"), message("/foreign", names=("a",))])
+@pytest.mark.parametrize("decoder", [Decoder(NAMES), NamedDecoder()])
+def test_no_client_decodes_long_message(decoder: Decoder | NamedDecoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that waits for a topic has no receiver."""
+    monkeypatch.setattr(messages, "deserialize_message", None)
+    with pytest.raises(ChannelError, match="a message of 1200000 bytes"):
+        decoder.decode(of_size(1_200_000))
+
+
+def big_endian(sender: str) -> bytes:
+    """A message of NAMES by the big-endian encoding of CDR."""
+    made = STORE.deserialize_cdr(vector(0, NAMES, (0.5, 0.0), sender), JOINT_STATE)
+    return bytes(STORE.serialize_cdr(made, JOINT_STATE, little_endian=False))
+
+
+FOREIGN = [message("/foreign"), of_size(MAX_SIZE, "/foreign"), message("/foreign", names=("a",)), big_endian("/foreign")]
+
+
+@pytest.mark.parametrize("raw", FOREIGN)
 def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
     setup = Setup()
     assert setup.poll(message(), raw) == [True, False]
@@ -135,18 +153,18 @@ def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
     assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [True]  # the first one has timed out
 
 
-def test_big_endian_publisher_is_checked_after_decoding() -> None:
+def test_big_endian_publisher_is_taken() -> None:
     setup = Setup()
-    foreign = big_endian("/foreign")
-    assert setup.poll(big_endian("/aircraft#1"), message(), foreign) == [True, True, False]
-    assert setup.decoded[-1] == foreign
-    assert setup.refusals.counts == {"y: sender": 1}
+    assert setup.poll(big_endian("/aircraft#1"), message()) == [True, True]
 
 
-def big_endian(sender: str) -> bytes:
-    """A message of NAMES by the big-endian encoding of CDR."""
-    made = STORE.deserialize_cdr(vector(0, NAMES, (0.5, 0.0), sender), JOINT_STATE)
-    return bytes(STORE.serialize_cdr(made, JOINT_STATE, little_endian=False))
+@pytest.mark.parametrize("encapsulation", [b"\x00\x02", b"\x00\x03", b"\x00\x07", b"\x00\x0b", b"\xff\xff"])
+def test_message_of_another_encoding_is_not_decoded(encapsulation: bytes) -> None:
+    """PL_CDR and XCDR2, whose publisher has another place."""
+    setup = Setup()
+    assert setup.poll(encapsulation + message()[2:]) == [False]
+    assert setup.decoded == []
+    assert setup.refusals.counts == {"y: malformed": 1}
 
 
 def test_without_lock_each_publisher_is_taken() -> None:

@@ -29,9 +29,9 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
-from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample
+from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample, require_size
 from flight_ros.rclpy_private import DeserializationError
-from flight_ros.receiver import Receiver, require_size
+from flight_ros.receiver import Receiver
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import (

@@ -9,8 +9,9 @@ middleware leaves uninitialised memory between two strings.
 
 import math
 import struct
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -23,11 +24,15 @@ from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little-endian (DDS Interoperability Wire Protocol 2.2, 10.2)
+BYTE_ORDERS: Mapping[bytes, Literal["big", "little"]] = MappingProxyType({b"\x00\x00": "big", b"\x00\x01": "little"})
 STAMP = struct.Struct("<iI")  # seconds and nanoseconds; they follow the encapsulation
 STAMP_PLACE = len(ENCAPSULATION)
 LENGTH_PLACE = STAMP_PLACE + STAMP.size  # of header.frame_id
 COUNT = struct.Struct("<I")  # length of a sequence or a string, before its elements
 FRAME_ID_PLACE = LENGTH_PLACE + COUNT.size
+MAX_SIZE = 16_384
+"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest of a flight, has 1,844."""
+
 NO_CHANNELS: FloatArray = np.zeros(0)
 
 
@@ -152,11 +157,11 @@ class NamedDecoder:
 def sender_of(raw: bytes) -> str | None:
     """The publisher of a message that begins with a header, read without decoding names and values.
 
-    None for bytes that are too short, or not little-endian.
+    None for bytes that are too short, or not plain CDR.
     """
-    if len(raw) < FRAME_ID_PLACE or raw[:2] != ENCAPSULATION[:2]:
+    if len(raw) < FRAME_ID_PLACE or (order := BYTE_ORDERS.get(raw[:2])) is None:
         return None
-    (length,) = COUNT.unpack_from(raw, LENGTH_PLACE)
+    length = int.from_bytes(raw[LENGTH_PLACE:FRAME_ID_PLACE], order)
     return publisher_of(raw[FRAME_ID_PLACE : FRAME_ID_PLACE + length - 1].decode(errors="replace"))
 
 
@@ -171,7 +176,14 @@ def instant(stamp_ns: int) -> bytes:
     return ENCAPSULATION + STAMP.pack(*divmod(stamp_ns, NANOSECONDS))
 
 
+def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
+    """Raise ChannelError, reason "size", for a message of more bytes."""
+    if len(raw) > limit:
+        raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
+
+
 def _message(raw: bytes) -> JointState:
+    require_size(raw)
     try:
         return deserialize_message(raw, JointState)
     except DeserializationError as error:

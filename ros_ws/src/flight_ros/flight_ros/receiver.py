@@ -12,13 +12,10 @@ from rclpy.node import Node
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, require_not_future, require_not_old
-from flight_ros.messages import sender_of
+from flight_ros.messages import require_size, sender_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
 from flight_ros.topics import Topic
-
-MAX_SIZE = 16_384
-"""Bytes of a message of named vectors. `internals` of four channels with an observer, the longest of a flight, has 1,844."""
 
 LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one topic and reason
 
@@ -36,12 +33,6 @@ class Sample(Protocol):
 
 
 S = TypeVar("S", bound=Sample)
-
-
-def require_size(raw: bytes, limit: int = MAX_SIZE) -> None:
-    """Raise ChannelError, reason "size", for a message of more bytes."""
-    if len(raw) > limit:
-        raise ChannelError("size", f"a message of {len(raw)} bytes, expected at most {limit}")
 
 
 class Source(Protocol):
@@ -129,7 +120,9 @@ class Receiver(Generic[S]):
         """Check and take a message. Returns whether the message was valid."""
         try:
             require_size(raw)
-            if self.lock is not None and (sender := sender_of(raw)) is not None:
+            if self.lock is not None:
+                if (sender := sender_of(raw)) is None:
+                    raise ChannelError("malformed", "a message without a header in plain CDR")
                 self.lock.check(sender, now_ns)
             if (sample := self._decode(raw)) is not None:
                 self._accept(sample, now_ns)
