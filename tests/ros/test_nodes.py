@@ -43,7 +43,7 @@ def test_node_without_parameters_names_missing_one_and_ends_with_status_2(packag
         (["-p", "k_g:=-1.0"], "error: controller.k_g: found -1.0, expected greater than 0"),
         (["-p", "max_agee:=1.0"], "error: controller.max_agee: unknown key, expected max_age perhaps"),
         (["-p", "beta:=[1.0,2.0]"], "error: controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
-        (["-p", "D:=[1,1,1,0]"], "error: controller.D[3]: found 0, expected +1 or -1"),
+        (["-p", "D:=[1,1,1,0]"], "error: controller.D[3]: found 0, expected 1 or -1"),
         (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
     ],
 )
