@@ -99,10 +99,24 @@ def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "engine" / "prop_75in2f.xml").is_file()  # of the package, which the model names
 
 
-def test_archive_has_same_bytes_for_same_files(electric: Path) -> None:
+def test_archive_has_same_bytes_and_no_foreign_file(electric: Path) -> None:
     first = model_archive(electric)
+    foreign = electric.parent / "deep" / "notes.xml"  # a model may lie in a folder with much else, such as the home
+    foreign.parent.mkdir()
+    foreign.write_text("<notes/>", encoding="utf-8")
     assert model_archive(electric) == first
-    assert zipfile.ZipFile(io.BytesIO(first)).testzip() is None
+    names = set(zipfile.ZipFile(io.BytesIO(first)).namelist())
+    assert {"aircraft/plane/plane.xml", "aircraft/plane/Engines/own_engine.xml", "engine/prop_75in2f.xml"} == names
+
+
+def test_model_cut_short_is_one_sentence(electric: Path, tmp_path: Path) -> None:
+    model = tmp_path / "cut.xml"
+    model.write_bytes(electric.read_bytes()[:3000])
+    condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
+    with pytest.raises(
+        FlightEnded, match=r"cannot be loaded: .*cut.xml: found XML with no element found: .*, expected a whole file$"
+    ):
+        trim_solution(condition)
 
 
 def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike
 
 import rise_di
 from aircraft_sim.simulator import Simulator
+from flight_analysis.closed_loop.margins import scenario_loop
 from flight_core.modes import Mode
 from flight_core.outcome import FlightEnded
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, select
+from rise_di_controller.linear_loop import sampled_plant
 from rise_di_controller.margins import loop_transfer
 
 SCENARIO = rise_di.find_scenario("osprey_servo", 3.0)
@@ -25,7 +27,7 @@ M = len(CONTROLLER.outputs)
 
 @pytest.fixture(scope="module")
 def flown() -> Tape:
-    """Two seconds are enough for a pulse, noise and servos. y has no delay here, so each tick has the y of its instant."""
+    """A pulse, noise and servos. y has no delay here, so each tick has the y of its instant."""
     return rise_di.simulate(SCENARIO)
 
 
@@ -42,7 +44,8 @@ def test_loop_gives_bits_of_simulation(flown: Tape) -> None:
     u = [loop.step(t, *row) for t, *row in zip(flown.time("u"), y, y_m, strict=True)]
     assert np.array_equal(u, flown["u"].values)
     assert loop.mode is Mode.ENGAGED
-    assert np.array_equal(loop.output.internals, flown["internals"].values[-1]) if loop.output else pytest.fail("no output")
+    assert loop.output is not None
+    assert np.array_equal(loop.output.internals, flown["internals"].values[-1])
 
 
 def test_lost_samples_start_failsafe() -> None:
@@ -156,16 +159,15 @@ def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
 
 
-def test_linear_law_has_loop_transfer_of_margins() -> None:
-    from flight_analysis.closed_loop.margins import scenario_loop  # noqa: PLC0415 - imported with python-control's cases
-
-    law = rise_di.as_control(CONTROLLER, linear=True)
+def test_linear_law_closes_loop_of_margins() -> None:
+    # S = (I - K P)^-1 and L_i = 1 / S_ii - 1 by python-control's K and P, against the Schur form of the margins
     of = scenario_loop(SCENARIO, CONTROLLER)
     w = np.array([0.5, 2.0, 8.0])
     z = np.exp(1j * w * of.loop.period)
-    near = np.array([of.law.C @ np.linalg.solve(value * np.eye(len(of.law.A)) - of.law.A, of.law.B) + of.law.D for value in z])
-    np.testing.assert_allclose(np.moveaxis(law(z), 2, 0), near, rtol=1e-9)
-    assert loop_transfer(of.nominal, of.law, of.loop, w).shape == (3, M)
+    A, B, C = sampled_plant(of.nominal, of.loop, np.zeros(M))
+    plant, law = control.ss(A, B, C, 0.0, of.loop.period), rise_di.as_control(CONTROLLER, linear=True)
+    S = np.linalg.inv(np.eye(M) - np.moveaxis(law(z), 2, 0) @ np.moveaxis(plant(z), 2, 0))
+    np.testing.assert_allclose(1.0 / np.einsum("Fii->Fi", S) - 1.0, loop_transfer(of.nominal, of.law, of.loop, w), rtol=1e-6)
 
 
 # gymnasium

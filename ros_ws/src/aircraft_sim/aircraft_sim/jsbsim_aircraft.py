@@ -193,15 +193,18 @@ def _first_element(path: Path) -> str:
 def model_archive(model: Path) -> bytes:
     """A zip file with a model of the user's own and the files it names, as a root of JSBSim: the same bytes for the same files.
 
-    aircraft/NAME/ has the XML files of the model's folder, engine/ and systems/ those of the root that the model names.
+    aircraft/NAME/ has the model and the named files beside it, engine/ and systems/ those of the root.
     Unpacked, jsbsim:FOLDER/aircraft/NAME flies.
     """
-    members = {
-        f"aircraft/{model.stem}/{path.relative_to(model.parent)}": path for path in sorted(model.parent.rglob(f"*{SUFFIX}"))
-    }
-    named = {Path(name).stem for name in _named_files(model)}
+    names = {name.removesuffix(SUFFIX) for name in _named_files(model)}
+    stems = {Path(name).stem for name in names}
+    members = {f"aircraft/{model.stem}/{model.name}": model}
+    beside = {model.parent / f"{name}{SUFFIX}" for name in names}
+    beside |= {model.parent / folder / f"{stem}{SUFFIX}" for folder in ("Engines", "Systems") for stem in stems}
+    for path in sorted(path for path in beside if path.is_file() and path.is_relative_to(model.parent)):
+        members[f"aircraft/{model.stem}/{path.relative_to(model.parent)}"] = path
     for folder in ("engine", "systems"):
-        of_root = (path for path in sorted((root_of(model) / folder).glob(f"*{SUFFIX}")) if path.stem in named)
+        of_root = (path for path in sorted((root_of(model) / folder).glob(f"*{SUFFIX}")) if path.stem in stems)
         members |= {f"{folder}/{path.name}": path for path in of_root}
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -219,6 +222,9 @@ def missing_engines(model: Path) -> str:
 
 
 def _named_files(model: Path, elements: Collection[str] = ()) -> list[str]:
-    """The files that a model names, in these elements or in all."""
-    every = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim reads the file too
+    """The files that a model names, in these elements or in all. Raises ParameterError for a file cut short."""
+    try:
+        every = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim reads the file too
+    except ElementTree.ParseError as error:
+        raise ParameterError(f"{model}: found XML with {error}, expected a whole file") from None
     return [name for element in every if (name := element.get("file")) and (not elements or element.tag in elements)]

@@ -24,6 +24,7 @@ from aircraft_sim.jsbsim_aircraft import (
     root_of,
 )
 from flight_core.outcome import FlightEnded
+from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds, seconds
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
@@ -221,7 +222,11 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     if own:
         fdm.set_aircraft_path(str(model.parent))
     fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
-    if own and (problem := missing_engines(model)):
+    try:
+        problem = missing_engines(model) if own else ""
+    except ParameterError as error:
+        problem = str(error)
+    if problem:
         raise FlightEnded(f"{condition.title} cannot be loaded: {problem}")
     try:
         loaded = fdm.load_model(model.stem, not own)  # a model of JSBSim is in a folder of its name
