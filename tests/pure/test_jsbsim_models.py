@@ -40,10 +40,10 @@ STEP_NS = 5_000_000
 SECTION: dict[str, Any] = {"speed": 46.3, "altitude": 1219.2, "rate": 200.0, "step": 0.005}
 
 
-def write_model(folder: Path, engine: str, name: str = "plane.xml") -> Path:
+def write_model(folder: Path, engine: str, name: str = "plane.xml", engines: str = "Engines") -> Path:
     """A c172p with an engine of the package, whose file is copied beside the model."""
-    (folder / "Engines").mkdir(parents=True)
-    (folder / "Engines" / "own_engine.xml").write_bytes((PACKAGE / "engine" / f"{engine}.xml").read_bytes())
+    (folder / engines).mkdir(parents=True)
+    (folder / engines / "own_engine.xml").write_bytes((PACKAGE / "engine" / f"{engine}.xml").read_bytes())
     (folder / name).write_text(CESSNA.replace("eng_io320", "own_engine"), encoding="utf-8")
     return folder / name
 
@@ -164,6 +164,12 @@ def test_wrong_path_refused_with_what_is_there(
     with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
         aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
     assert len(str(refused.value)) < 300  # no list of all names
+
+
+def test_engine_in_small_letters_beside_model_is_found(electric: Path, tmp_path: Path) -> None:
+    model = write_model(tmp_path, "electric147kW", engines="engine")
+    assert np.array_equal(throttle_step(f"{PREFIX}{model}"), throttle_step(f"{PREFIX}{electric}"))
+    assert "aircraft/plane/engine/own_engine.xml" in zipfile.ZipFile(io.BytesIO(model_archive(model))).namelist()
 
 
 def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Path) -> None:

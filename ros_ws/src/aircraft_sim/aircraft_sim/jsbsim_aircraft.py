@@ -26,6 +26,7 @@ from flight_core.vectors import FloatArray
 PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
 ROOT_VARIABLE = "JSBSIM_ROOT"  # environment: a folder with aircraft, engine and systems in place of the package's
 SUFFIX, MODEL_ELEMENT = ".xml", "fdm_config"  # of the file of a model
+ENGINES, SYSTEMS = ("Engines", "engine"), ("Systems", "systems")  # folders beside a model in which JSBSim looks
 
 
 class Command(NamedTuple):
@@ -200,7 +201,7 @@ def model_archive(model: Path) -> bytes:
     stems = {Path(name).stem for name in names}
     members = {f"aircraft/{model.stem}/{model.name}": model}
     beside = {model.parent / f"{name}{SUFFIX}" for name in names}
-    beside |= {model.parent / folder / f"{stem}{SUFFIX}" for folder in ("Engines", "Systems") for stem in stems}
+    beside |= {model.parent / folder / f"{stem}{SUFFIX}" for folder in (*ENGINES, *SYSTEMS) for stem in stems}
     for path in sorted(path for path in beside if path.is_file() and path.is_relative_to(model.parent)):
         members[f"aircraft/{model.stem}/{path.relative_to(model.parent)}"] = path
     for folder in ("engine", "systems"):
@@ -215,10 +216,10 @@ def model_archive(model: Path) -> bytes:
 
 def missing_engines(model: Path) -> str:
     """A sentence on engines and thrusters that a model names and that are in no folder of JSBSim; "" where all are there."""
-    folders = model.parent / "Engines", root_of(model) / "engine"
+    folders = *(model.parent / folder for folder in ENGINES), root_of(model) / "engine"
     names = sorted({Path(name).stem for name in _named_files(model, ("engine", "thruster"))})
     missing = [name for name in names if not any((folder / f"{name}{SUFFIX}").is_file() for folder in folders)]
-    return f"no {SUFFIX} of {', '.join(missing)} is in {folders[0]} or {folders[1]}" if missing else ""
+    return f"no {SUFFIX} of {', '.join(missing)} is in {folders[0]} or {folders[-1]}" if missing else ""
 
 
 def _named_files(model: Path, elements: Collection[str] = ()) -> list[str]:
