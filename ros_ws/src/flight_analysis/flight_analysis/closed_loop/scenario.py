@@ -55,7 +55,8 @@ class Scenario:
     def from_parts(cls, name: str, **sections: Mapping[str, Any] | Config) -> "Scenario":
         """A scenario without a file: flight, aircraft, reference_model, controller and, if any, recorder and guidance.
 
-        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays. Raises ParameterError.
+        The value of a section is a mapping of parameters, or a parameter set. Lists may be arrays. Without `recorder` the
+        recorder writes at RECORDER_RATE. Raises ParameterError.
         """
         needed = [key for key in SCHEMAS if key not in OPTIONAL and key != "recorder"]
         missing = [key for key in needed if key not in sections]
