@@ -15,6 +15,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from flight_core.environment import require_ros_environment
+from flight_core.memory import limit_memory
 from flight_core.scheduling import lower_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_ros import transport
@@ -37,6 +38,7 @@ def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BAD_ENVIRONMENT)
     lower_real_time_priority(lower_by)
+    limit_memory()
     gc.disable()  # `run` enables it; collections during the imports find nothing and take a tenth of the time
     handle_shutdown(_exit)
     early_participant = _create_early_participant() if early else None
