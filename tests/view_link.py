@@ -45,6 +45,9 @@ class NodesInMemory:
         """The nodes that run."""
         return self.names
 
+    def keep_link(self) -> None:
+        """Nothing: no node in memory measures the time."""
+
     def parameters(self, node: str, names: Sequence[str]) -> dict[str, Any]:
         """Those that are set."""
         return {name: self.values[node][name] for name in names if name in self.values[node]}

@@ -14,7 +14,7 @@ from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.guided import guidance_notices
+from flight_analysis.report.guided import guidance_notices, unflown_legs
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, missions
 from flight_campaign.benchmark_course import build_course
@@ -23,7 +23,7 @@ from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.fence import BANKS, HOME, LEFT, RIGHT, Fence, Motion, Zone, clearance, last_safe_turn, turn_clearance
-from flight_guidance.guidance import Guidance
+from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.modes import Lateral
 from flight_guidance.params import GuidanceConfig
 
@@ -201,6 +201,37 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
 def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         GuidanceConfig.validate_mapping(SECTION | {"fence": BOX} | section, "guidance")
+
+
+def test_lost_link_flies_home() -> None:
+    """Without a message of an operator the route ends after the limit, which log, replay, notice and outcome know."""
+    route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
+    scenario = calm(5.0, route=route, home={"east": 300.0, "link_timeout": 3.0})
+    tape, section = simulate(scenario), scenario.guidance
+    assert section is not None
+    log, t = tape["guidance"], tape.time("guidance")
+    homeward = t[log["mode.lateral"] == Lateral.ORBIT]
+    assert homeward[0] - t[0] == pytest.approx(3.02)  # the first step after the limit
+    assert log["target.east"][-1] == 300.0
+    assert "no message of an operator for 3 s: home" in guidance_notices(tape, section)[0]
+    assert [*unflown_legs(tape, section)] == [0]
+    assert replay_guidance(tape, section).differing == 0
+
+
+class Operated(Guidance):
+    """Guidance with a message of an operator each second."""
+
+    def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
+        """A step, and before the first of a second a message."""
+        if t_ns % (1000 * MS) == 0:
+            self.keep_link()
+        return super().step(now_ns, t_ns)
+
+
+def test_kept_link_ends_no_command() -> None:
+    tape = simulate(calm(3.5, program=commanded(0.0), home={"link_timeout": 1.5}), guide=Operated)
+    assert tape["guidance"]["age.link"].max() == pytest.approx(0.98)
+    assert tape["guidance"]["mode.lateral"][-1] == Lateral.COURSE
 
 
 def test_home_is_target_and_choice_after_loss() -> None:

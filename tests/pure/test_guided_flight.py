@@ -105,7 +105,7 @@ def test_each_step_follows_from_log_to_last_bit() -> None:
     for stamp_ns, values in zip(signal.stamp_ns.tolist(), signal.values, strict=True):
         inputs, logged = guidance.restored(stamp_ns, dict(zip(signal.names, values.tolist(), strict=True)), params.outputs)
         state, commands = modes.step(state, inputs, None, params)
-        assert guidance.row(inputs, state, commands, guidance.digest(None)).tobytes() == values.tobytes()
+        assert guidance.row(inputs, state, commands, guidance.digest(None), 0.0).tobytes() == values.tobytes()
         assert state == logged
         state = logged
 

@@ -40,12 +40,14 @@ LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
 def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH)
+    lost_link = {"home": {"link_timeout": 1.0}}
+    scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH, guidance=lost_link)
     recorded = read_run(fly(start, scenario, "runs", status=STATUS_INCOMPLETE)).tape  # the route takes longer
     for name, signal in simulate(load_scenario(scenario)).signals.items():
         assert signal.names == recorded[name].names
         assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
+    assert recorded["guidance"]["mode.lateral"][-1] == Lateral.ORBIT  # home
     assert len(recorded["u_m"].stamp_ns) == 100  # one at each instant but the first: y takes 10 ms
 
 
@@ -150,6 +152,16 @@ def test_targets_select_modes_and_bad_ones_refused(flight: Flight) -> None:
     late = to_message(time.time_ns() - NANOSECONDS, ["heading"], np.array([0.5]), "/operator#1")
     flight.until(partial(flight.peer.counted, "refused target: old"), partial(flight.peer.publish, "target", late))
     assert flight.last("target.heading") == 1.0
+
+
+def test_target_without_channels_keeps_link(start: Start, peer_node: Peer, calm: Path) -> None:
+    with_limit = load_scenario(calm).vary(guidance={"home": {"link_timeout": 1.0}})
+    calm.write_text(scenario_yaml(with_limit), encoding="utf-8")
+    made = Flight(start, peer_node, calm)
+    made.until(lambda: made.last("age.link") > 0.3)
+    made.until(lambda: made.last("age.link") < 0.1, made.target)
+    made.until(lambda: made.last("mode.lateral") == Lateral.ORBIT)
+    assert "no message of an operator for 1 s: home" in made.process.output
 
 
 def test_modes_of_second_controller_refused(flight: Flight) -> None:

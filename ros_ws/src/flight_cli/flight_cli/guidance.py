@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di guidance`: hold, skip, resume, home and a route for a guided flight."""
+"""`rise-di guidance`: hold, skip, resume, home, the operator's link and a route for a guided flight."""
 
 import sys
 from collections.abc import Callable
@@ -46,6 +46,16 @@ _command("hold", "Hold the heading, the altitude and the airspeed of now.", "hol
 _command("skip", "Leave the waypoint ahead out and fly to the next waypoint.", "skips the waypoint ahead")
 _command("resume", "Fly the last leg of the route again, from the nearest point.", "resumes the last leg")
 _command("home", "Fly home and orbit there.", "flies home")
+
+
+@guidance.command()
+def link(namespace: Namespace = "") -> None:
+    """Keep the operator's link of a flight with `home.link_timeout`, until Ctrl-C: then the aircraft flies home."""
+    from flight_guidance.client import TargetClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+    with TargetClient(namespace) as client:
+        print("keeps the link until Ctrl-C", flush=True)
+        client.hold_link()
 
 
 @guidance.command()

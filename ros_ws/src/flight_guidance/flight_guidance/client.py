@@ -5,6 +5,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from typing import NoReturn
 
 import numpy as np
 from geometry_msgs.msg import Point, Pose, PoseStamped
@@ -24,6 +25,7 @@ from flight_ros.topics import GUIDANCE, NEWEST_SAMPLES, PUBLISH, RECORD_FOREIGN,
 
 TARGET_TIMEOUT = 3.0  # s, in which guidance takes a target at its ticks
 TARGET_PERIOD = 0.2  # s, between two equal targets
+LINK_PERIOD = 1.0  # s, between two targets without channels
 REFUSED = "sample refused: "  # before the reason in the log of a node
 ROUTE_TIMEOUT = 3.0  # s, in which the middleware of guidance confirms a route
 ROUTE_POLL_PERIOD = Duration(seconds=0.05)
@@ -115,14 +117,26 @@ class TargetClient(GuidanceClient):
         super().__init__("operator", namespace, parent)
         self._publisher = self._node.create_publisher(TARGET.type, TARGET.name, PUBLISH)
         self._sent = -TARGET_PERIOD  # monotonic time of the last target, s
+        self._silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
 
     def send(self, values: Mapping[str, float]) -> str:
         """Publish commands by channel until guidance has them in force. Returns why they are not, or ""."""
-        silent = f"{self._guidance.name}: not received, expected a flight with guidance in this domain"
-        self._spin_until(lambda: bool(self._received()), silent)
+        self._spin_until(lambda: bool(self._received()), self._silent)
         self._log.take()
         unknown = f"guidance did not take them in {TARGET_TIMEOUT:g} s; its log says why"
         return self._reason(TARGET, lambda: self._published(values), unknown)
+
+    def keep_link(self) -> None:
+        """Publish a target without channels, which says that an operator is there."""
+        encoder = Encoder((), self._node.get_fully_qualified_name())
+        self._publisher.publish(encoder.encode(time.time_ns(), np.array(())))
+
+    def hold_link(self) -> NoReturn:
+        """Keep the link, a message each LINK_PERIOD. Raises ParameterError where no guidance flies in the domain."""
+        while True:
+            self._spin_until(lambda: bool(self._received()), self._silent)
+            self.keep_link()
+            time.sleep(LINK_PERIOD)
 
     def _published(self, values: Mapping[str, float]) -> bool:
         if time.monotonic() - self._sent > TARGET_PERIOD:

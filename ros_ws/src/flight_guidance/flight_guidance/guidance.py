@@ -28,7 +28,7 @@ from flight_guidance.modes import (
     Target,
     Vertical,
 )
-from flight_guidance.notices import STALE_TIME
+from flight_guidance.notices import LINK_AGE, STALE_TIME
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 
@@ -54,7 +54,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
         *(f"fence.{name}" for name in FENCE),
         *("phi_c", "theta_c", "climb_c", "V_c"),
         *(f"limited.{name}" for name in LIMITED),
-        *("age.pose", "begin", "given"),
+        *("age.pose", LINK_AGE, "begin", "given"),
         *(f"target.{name}" for name in TARGETS),
         *(f"state.{name}" for name in STATE),
         *(f"wind.{name}" for name in WIND),
@@ -70,8 +70,11 @@ def u_m(state: GuidanceState) -> FloatArray:
     return np.array([*state.u_m, state.phi, state.theta - state.alpha])
 
 
-def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) -> FloatArray:
-    """A sample of the log, in the order of `names`: inputs, state after the step, commands. `route`: a `digest`."""
+def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, link_age: float) -> FloatArray:
+    """A sample of the log, in the order of `names`: inputs, state after the step, commands.
+
+    `route`: a `digest`; `link_age`: time since the last message of an operator, s, 0 without a limit.
+    """
     return np.array(
         [
             *(state.mode, state.lateral, state.vertical, state.leg, route, commands.xtrack, commands.to_go),
@@ -79,7 +82,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int) ->
             *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), inputs.begin, modes.bits(inputs.given)),
+            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.given)),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
@@ -149,6 +152,8 @@ class Guidance:
         self._engaged, self._paused, self._begin = True, False, Begin.HOLD
         self._notices = parameters.notices()
         self._waits_from_ns: int | None = None  # for a pose that is young enough
+        self._operated_ns: int | None = None  # the instant of the operator's last message, or of the first step
+        self._link_lost = False
 
     @property
     def mode(self) -> Mode:
@@ -202,6 +207,10 @@ class Guidance:
         without = ((start, {name: value for name, value in step.items() if name != "leg"}) for start, step in self._program)
         self._program = deque((start, step) for start, step in without if step)
         self.take_target({"leg": 0.0})
+
+    def keep_link(self) -> None:
+        """Know that an operator is there: the age of the link counts from the next step on."""
+        self._operated_ns, self._link_lost = None, False
 
     def hold(self) -> bool:
         """Hold the heading, the altitude and the airspeed of now; False while guidance does not fly."""
@@ -281,6 +290,17 @@ class Guidance:
         age, limit = seconds(now_ns - pose.stamp_ns), seconds(self._params.max_age_ns)
         return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
 
+    def _watch_link(self, now_ns: int) -> int:
+        """Age of the operator's link, ns, 0 without a limit; fly home, once, where the age exceeds the limit."""
+        if not (limit_ns := self._params.link_timeout_ns):
+            return 0
+        if self._operated_ns is None:
+            self._operated_ns = now_ns
+        age_ns = now_ns - self._operated_ns
+        if age_ns > limit_ns and not self._link_lost:
+            self._link_lost = self.home()  # again at the next step while guidance does not fly
+        return age_ns
+
     def step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
         """A step at an instant and flight time t; None without fresh y, before the first pose, and while disengaged.
 
@@ -298,11 +318,12 @@ class Guidance:
             self._waits_from_ns = now_ns if self._waits_from_ns is None else self._waits_from_ns
             return None
         self._waits_from_ns = None
+        link_age_ns = self._watch_link(now_ns)
         y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
         told = self.route.notes if self.route is not None and self._route_waits else ()
         self._begin, self._given, self._route_waits = Begin.NO, {}, False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
-        log = row(inputs, self._state, commands, self._digest)
+        log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
         notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))
         return GuidanceOutput(u_m(self._state), log, (*told, *(notice.text for notice in notices)))

@@ -137,6 +137,7 @@ class GuidanceParams(NamedTuple):
     turn_lag: float = 0.0  # s, of the turn behind the bank
     fence: Fence | None = None
     home: Home = Home()
+    link_timeout_ns: int = 0  # of the operator's link; 0: no limit
 
 
 class Begin(IntEnum):

@@ -108,7 +108,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             (Trigger, "resume", lambda _: self._guidance.resume() or "found no route to resume, or the route is flown"),
             (Trigger, "home", lambda _: self._guidance.home() or "guidance does not fly"),
         ):
-            self.create_service(kind, f"~/{name}", _service(answer))
+            self.create_service(kind, f"~/{name}", _service(answer, self._guidance.keep_link))
 
     def period_ns(self) -> int:
         return self._guidance.period_ns
@@ -193,7 +193,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._max_age_ns(), self._max_age_ns() + nanoseconds(self.parameters.hold)
 
     def _take_target(self, sample: NamedSample, now_ns: int) -> None:
-        self._guidance.take_target(sample.channels)
+        if sample.channels:  # a target without channels keeps the operator's link alone
+            self._guidance.take_target(sample.channels)
+        self._guidance.keep_link()
 
     def _take_routes(self) -> None:
         for received in self._route_subscription.take():
@@ -211,6 +213,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             else:
                 self.get_logger().info(f"route of {len(points)} waypoints")
                 self._guidance.take_route(route)
+                self._guidance.keep_link()
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
         """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a failsafe, go on."""
@@ -268,10 +271,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return LEVELS.get(self._mode, DiagnosticStatus.WARN), self._waits or SENTENCES[self._mode], further
 
 
-def _service(answer: Callable[[Any], bool | str]) -> Callable[[Any, Any], Any]:
-    """A service callback: True, or a sentence of refusal, as the response."""
+def _service(answer: Callable[[Any], bool | str], called: Callable[[], None]) -> Callable[[Any, Any], Any]:
+    """A service callback: True, or a sentence of refusal, as the response. `called` knows of each call."""
 
     def callback(request: Any, response: Any) -> Any:
+        called()
         result = answer(request)
         response.success, response.message = result is True, "" if result is True else str(result)
         return response

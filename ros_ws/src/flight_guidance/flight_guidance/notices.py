@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a wind far from `guidance.wind`.
+"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a strong wind, a lost link.
 
 The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
 """
@@ -15,6 +15,9 @@ from flight_guidance.modes import Lateral
 
 DWELL = 10.0
 """Time for which a condition lasts before the notice, and ends before a second notice, s."""
+
+LINK_AGE = "age.link"
+"""Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier versions had none."""
 
 STALE_TIME = 2.0
 """The same for a pose older than its limit, s."""
@@ -62,7 +65,7 @@ class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
     `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed command, m/s, the wind up to
-    which circles fit into the bank.
+    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s.
     """
 
     CHANNELS = (
@@ -70,8 +73,11 @@ class Notices:
         *("fence.action", "fence.clearance", "age.pose"),
     )
 
-    def __init__(self, wind: float, max_age: float, largest_wind: Callable[[float], float]) -> None:
-        self._wind, self._max_age, self._largest_wind = wind, max_age, largest_wind
+    def __init__(
+        self, wind: float, max_age: float, largest_wind: Callable[[float], float], link_timeout: float = math.inf
+    ) -> None:
+        self._wind, self._max_age, self._largest_wind, self._link_timeout = wind, max_age, largest_wind, link_timeout
+        self._link = _Lasting(0.0)
         self._stale = _Lasting(STALE_TIME)
         self._blown, self._strong, self._leg, self._action = _Lasting(), _Lasting(), 0, 0.0
 
@@ -85,6 +91,8 @@ class Notices:
             side = "right" if self._action == RIGHT else "left"
             texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
         wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
+        if self._link.due(t, holds=log.get(LINK_AGE, 0.0) > self._link_timeout):
+            texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
             texts.append(f"pose is {log['age.pose']:.2f} s old, guidance.max_age {self._max_age:g} s")
         if self._blown.due(t, holds=bool(is_blown_back(log))):
@@ -98,8 +106,9 @@ class Notices:
         """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""
         if not has_channels([*log]):
             return []
-        columns = [log[name].tolist() for name in self.CHANNELS]
-        samples = (dict(zip(self.CHANNELS, row, strict=True)) for row in zip(*columns, strict=True))
+        names = [*self.CHANNELS, *({LINK_AGE} & set(log))]
+        columns = [log[name].tolist() for name in names]
+        samples = (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
         return [notice for at, sample in zip(t.tolist(), samples, strict=True) for notice in self.take(at, sample)]
 
 

@@ -115,12 +115,15 @@ class ZoneConfig(Config):
 
 
 class HomeConfig(Config):
-    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose by choice."""
+    """Where the aircraft goes at a fence, by `guidance/home`, and after a loss of pose or of the operator's link by choice."""
 
     north: Number = Field(default=0.0, description="m")
     east: Number = Field(default=0.0, description="m")
     altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
     after_loss: bool = Field(default=False, description="fly home when pose returns after a loss; else level the wings")
+    link_timeout: Positive | None = Field(
+        default=None, description="time without a command or a `target` from an operator before the way home, s; none: no limit"
+    )
 
 
 class GuidanceConfig(NodeConfig):
@@ -276,7 +279,8 @@ class GuidanceConfig(NodeConfig):
 
     def notices(self) -> Notices:
         """What the notices of a flight depend on."""
-        return Notices(self.wind, self.max_age, lambda speed: largest_wind(speed, self.wind, self.bank))
+        link_timeout = self.home.link_timeout or math.inf
+        return Notices(self.wind, self.max_age, lambda speed: largest_wind(speed, self.wind, self.bank), link_timeout)
 
     def climb_limits(self) -> tuple[float, float]:
         """Largest climb and sink rate, m/s: 0.4 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0."""
@@ -320,6 +324,7 @@ class GuidanceConfig(NodeConfig):
             turn_lag=2.0 / frequency["r"],
             fence=self.fence_zones(),
             home=Home(self.home.north, self.home.east, self.home.altitude, self.home.after_loss),
+            link_timeout_ns=nanoseconds(self.home.link_timeout or 0.0),
         )
 
     def _vertical(self, climb: float, sink: float) -> VerticalParams:

@@ -62,6 +62,9 @@ class Link(Protocol):
     def send_route(self, points: Sequence[Sequence[float]]) -> str:
         """Publish a route."""
 
+    def keep_link(self) -> None:
+        """Tell guidance that an operator is there."""
+
     def guide(self, service: str) -> str:
         """Call a service of guidance: one of GUIDED."""
 
@@ -208,6 +211,7 @@ class Control:
     def _carry_out(self, action: str, request: Mapping[str, Any], cancellations: int) -> dict[str, Any]:
         """Carry out a request and write a line in the log. Refused after a cancellation later than `cancellations`."""
         self._link.resume()
+        self._link.keep_link()
         before = dict(self._values)
         what = {name: value for name, value in request.items() if name != "digest"}
         try:

@@ -64,6 +64,11 @@ class ControlClient(Client):
         """Publish a route of waypoints, each north, east and altitude in m."""
         return self._operator().send_route(points)
 
+    def keep_link(self) -> None:
+        """Tell guidance, where there is one, that an operator is there: `guidance.home.link_timeout` counts from now."""
+        if "guidance" in self.nodes():
+            self._operator().keep_link()
+
     def guide(self, service: str) -> str:
         """Call a service of guidance: hold, skip, resume, home."""
         return self._operator().call(service)

@@ -13,6 +13,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance import guidance, modes
 from flight_guidance.modes import Begin, GuidanceState
+from flight_guidance.notices import LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
 from flight_guidance.route_file import Waypoint
@@ -72,7 +73,7 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
             state, commands = modes.step(previous, inputs, legs[flown], params)
             both = (
                 np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
-                np.append(guidance.row(inputs, state, commands, flown), guidance.u_m(state)),
+                np.append(guidance.row(inputs, state, commands, flown, row[names.index(LINK_AGE)]), guidance.u_m(state)),
             )
             columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
             if len(columns):

@@ -15,7 +15,7 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
 from flight_guidance.modes import LATERAL, TARGETS, Lateral, Vertical, bits
-from flight_guidance.notices import Notice, has_channels
+from flight_guidance.notices import LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
 
 UNITS: Mapping[str, str] = {
@@ -121,14 +121,16 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     """Numbers of the legs ahead at the end of the flight, the leg under way among them.
 
     The last leg of a route is an orbit without end and not among them. Empty where a command replaced the route, and for a
-    route outside the log. A route that the fence or a lost pose ended has its legs still ahead.
+    route outside the log. A route that the fence, a lost pose or a lost link ended has its legs still ahead.
     """
     log = tape["guidance"]
     on_route = np.flatnonzero(log["mode.lateral"] == Lateral.ROUTE)
     if not len(on_route):
         return range(0)
     last = int(on_route[-1])
-    replaced = last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL)
+    limit = section.home.link_timeout or math.inf
+    lost = LINK_AGE in log.names and last + 1 < len(log.stamp_ns) and log[LINK_AGE][last + 1] > limit
+    replaced = last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
     route = None if replaced else known_routes(tape, section).get(int(log["route"][last]))
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
 
