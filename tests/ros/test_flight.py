@@ -102,10 +102,14 @@ def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start) ->
     assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
 
 
-def test_two_flights_on_one_domain_do_not_mix(start: Start, engaged: Engaged) -> None:
+def test_two_flights_on_one_domain_do_not_mix(start: Start, engaged: Engaged, tmp_path: Path) -> None:
     second = start("flight_cli.cli", "fly", "osprey_gust")
     assert second.end() == 2
-    assert "a domain of its own for each flight: set ROS_DOMAIN_ID" in second.output
+    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in second.output
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--duration", "0.5", "--runs", "beside")
+    assert beside.end() in {0, 4}, beside.output  # 4: a busy host
+    topics = read_run(next((tmp_path / "beside").glob("*-osprey_gust"))).topics
+    assert {name for name in topics if name.endswith(("/y", "/y_m", "/u"))} == {"/uav2/y", "/uav2/y_m", "/uav2/u"}
     first, _ = engaged
     first.interrupt()
     assert first.end() == 130

@@ -59,7 +59,7 @@ def test_flight_played_byte_by_byte_with_timing_and_clock(run: Path, start: Star
     receiving.until(CLOCK, 201)
     assert receiving.received["y"] == of(run, "y")
     assert receiving.received["y_m"] == of(run, "y_m")
-    assert [stamp_of(clock) for clock in receiving.received["/clock"]] == [k * 10 * MS for k in range(201)]
+    assert [stamp_of(clock) for clock in receiving.received[CLOCK.name]] == [k * 10 * MS for k in range(201)]
     # 2 s at twice the rate, on absolute deadlines: host delays do not accumulate
     sent = np.array(receiving.sent["y"])
     late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001

@@ -33,7 +33,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
     """At tick k it integrates from t(k-1) to t(k) with the last u held, publishes y and truth, then takes the newest u.
 
     In lockstep it sets the time: it publishes y, truth and pose at its instants. At the controller's instants it waits for u,
-    then publishes /clock with the next of them. Each instant has exactly one y, without channels where no sample arrives.
+    then publishes clock with the next of them. Each instant has exactly one y, without channels where no sample arrives.
     """
 
     def __init__(self) -> None:

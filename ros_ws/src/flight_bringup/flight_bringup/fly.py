@@ -64,15 +64,16 @@ def fly_over_topics(
     lockstep: bool = False,
     one_process: bool = False,
     autopilot: Autopilot | None = None,
+    namespace: str = "",
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = math.inf,
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
-    `autopilot` flies in the aircraft's place, in real time only. `announce` gets a line for each change of engagement and of
-    reason, but not for a changed number. With `engaged_for`, s, the flight ends so long after its first engagement, or with
-    it, or without one when too little time is left.
+    `autopilot` flies in the aircraft's place, in real time only. All nodes are in the `namespace`, as "/uav1". `announce` gets
+    a line for each change of engagement and of reason, but not for a changed number. With `engaged_for`, s, the flight ends so
+    long after its first engagement, or with it, or without one when too little time is left.
     Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
     """
     require_ros_environment()
@@ -81,9 +82,15 @@ def fly_over_topics(
     try:
         with (
             handle_signals(_interrupt),
-            FlightMonitor(scenario.controller.outputs, lockstep=lockstep) as monitor,
+            FlightMonitor(scenario.controller.outputs, lockstep=lockstep, namespace=namespace) as monitor,
             FlightProcesses(
-                scenario, run, monitor, lockstep=lockstep, one_process=one_process, autopilot=autopilot
+                scenario,
+                run,
+                monitor,
+                lockstep=lockstep,
+                one_process=one_process,
+                autopilot=autopilot,
+                namespace=namespace,
             ) as processes,
         ):
             if reason := processes.begin():

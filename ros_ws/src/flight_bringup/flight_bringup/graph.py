@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The graph of a flight: nodes, start order, parameter overrides. Launch files and process runner share the graph."""
 
+import re
 import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -57,6 +58,19 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         RECORDER: ("recorded",),
     }
 )
+
+
+NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")  # of a namespace: stricter than ROS 2, which permits _ at the ends
+
+
+def absolute_namespace(namespace: str) -> str:
+    """The namespace of an aircraft as "/uav1"; "" is the root. Raises ParameterError for a name that ROS 2 does not permit."""
+    words = [word for word in namespace.split("/") if word]
+    for word in words:
+        require(
+            bool(NAME.fullmatch(word)), "--namespace", repr(namespace), "letters, digits and single _, as uav1, a letter first"
+        )
+    return "".join(f"/{word}" for word in words)
 
 
 class Autopilot(NamedTuple):

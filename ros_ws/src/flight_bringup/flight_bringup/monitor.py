@@ -32,10 +32,11 @@ MODES = {float(mode): mode.name for mode in Mode}
 
 
 class FlightMonitor(Client):
-    """Monitors a flight: the states of its nodes, the controller's internals, in lockstep the progress of the log."""
+    """Monitors a flight: states of its nodes, internals of the controller, in lockstep the progress of the log."""
 
-    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool) -> None:
-        super().__init__("monitor")
+    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool, namespace: str = "") -> None:
+        super().__init__("monitor", namespace)
+        self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
         self._internals = None if lockstep else PolledSubscription(self._node, INTERNALS, NEWEST_SAMPLES, raw=True)
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
@@ -64,7 +65,7 @@ class FlightMonitor(Client):
     def _state(self, node: str, pid: int) -> str:
         for received in self._node_state.take():
             self._states[received.message.key] = received.message.value
-        return self._states.get(f"/{node}#{pid}", "")
+        return self._states.get(f"{self._namespace}/{node}#{pid}", "")
 
     def newest(self) -> tuple[str, FloatArray] | None:
         """Mode and e of the controller's newest sample since the last call, None without one."""
@@ -89,9 +90,10 @@ class FlightMonitor(Client):
         return seconds(stamp_of(messages[-1].message)) if messages else None
 
     def require_free_domain(self) -> None:
-        """Raise ParameterError where the domain already has an aircraft or a reference model."""
+        """Raise ParameterError where the namespace already has an aircraft or a reference model in this domain."""
         for topic in (Y, Y_M):
             count = self._node.count_publishers(topic.name)
             domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            publishers = f"{count} publishers of {topic.name} already"
-            require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, "a domain of its own for each flight: set ROS_DOMAIN_ID")
+            publishers = f"{count} publishers of {self._node.resolve_topic_name(topic.name)} already"
+            expected = "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own: --namespace"
+            require(count == 0, f"ROS_DOMAIN_ID {domain}", publishers, expected)

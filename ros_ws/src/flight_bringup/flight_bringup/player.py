@@ -22,6 +22,7 @@ from flight_ros.topics import CLOCK, LOCKSTEP
 DISCOVERY_TIME = 1.0  # s, to discover other publishers
 MATCHING_TIME = 0.5  # s, to discover the subscribers
 CLOCK_PERIOD_NS = 10_000_000  # ns of the log between two samples of `/clock`
+CLOCK_NAME = f"/{CLOCK.name}"  # as simulated time has it
 PROGRESS_PERIOD_NS = 100_000_000
 
 Outgoing = tuple[int, str, bytes, bool]
@@ -39,9 +40,9 @@ class Player(Client):
         kinds = {topic: _message_type(topic, name) for topic, name in types.items()}
         super().__init__("player", rosout=False)
         try:
-            self._require_no_publishers([topic for topic in (*types, CLOCK.name) if topic not in shared])
+            self._require_no_publishers([topic for topic in (*types, CLOCK_NAME) if topic not in shared])
             self._publishers = {topic: self._node.create_publisher(kind, topic, LOCKSTEP) for topic, kind in kinds.items()}
-            self._clock = self._node.create_publisher(CLOCK.type, CLOCK.name, LOCKSTEP)
+            self._clock = self._node.create_publisher(CLOCK.type, CLOCK_NAME, LOCKSTEP)
             time.sleep(MATCHING_TIME)
         except BaseException:
             self.__exit__()

@@ -84,11 +84,15 @@ class NotReadyError(ParameterError):
 class NodeProcess:
     """One node as a process. Its output goes to a file; `lines` holds the last lines."""
 
-    def __init__(self, node: NodeSpec, scenario_file: Path, overrides: ParameterOverrides, log: Path) -> None:
+    def __init__(
+        self, node: NodeSpec, scenario_file: Path, overrides: ParameterOverrides, log: Path, namespace: str = ""
+    ) -> None:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         module = ["-P", "-m", node.module]  # -P: a package in the working folder must not replace a package of the stack
         command = [*end_with_parent(), sys.executable, *module, "--ros-args", "--params-file", str(scenario_file)]
+        if namespace:
+            command += ["-r", f"__ns:={namespace}"]
         for name, value in overrides.items():
             command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
         self._log = log.open("x", encoding="utf-8")
@@ -126,8 +130,8 @@ class NodeProcess:
 class FlightProcesses:
     """All processes of one flight. A context manager: its exit stops them.
 
-    `monitor` reports the nodes that are ready. With an autopilot the bridge starts in the aircraft's place. A flight in real
-    time with an aircraft has its t = 0 from `begin`.
+    `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the bridge starts in the aircraft's
+    place. A flight in real time with an aircraft has its t = 0 from `begin`.
     """
 
     def __init__(
@@ -139,8 +143,9 @@ class FlightProcesses:
         lockstep: bool,
         one_process: bool,
         autopilot: Autopilot | None = None,
+        namespace: str = "",
     ) -> None:
-        self._scenario, self._run, self._monitor = scenario, run, monitor
+        self._scenario, self._run, self._monitor, self._namespace = scenario, run, monitor, namespace
         self._lockstep, self._autopilot = lockstep, autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
@@ -209,7 +214,7 @@ class FlightProcesses:
         )
         if node is BRIDGE:
             overrides = {**overrides, "first_y": FIRST_Y}
-        self.processes.append(NodeProcess(node, self._scenario.path, overrides, log))
+        self.processes.append(NodeProcess(node, self._scenario.path, overrides, log, self._namespace))
 
     def _wait_until_ready(self, deadline: float) -> None:
         while waiting := self.waiting():

@@ -13,7 +13,7 @@ from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, require_euler
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import Autopilot, find_autopilot, require_limits
+from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     flight_progress,
@@ -61,6 +61,9 @@ def fly(
     simplify: Simplify = 0.0,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")] = False,
+    namespace: Annotated[
+        str, typer.Option(help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.")
+    ] = "",
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
@@ -73,6 +76,8 @@ def fly(
     require(
         not (in_process and (lockstep or one_process)), "--in-process", "a flight over topics, in lockstep", "one of the two"
     )
+    require(not (in_process and namespace), "--namespace", "a flight in one process", "a flight over topics, which has nodes")
+    namespace = absolute_namespace(namespace)
     stepping = lockstep or one_process or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
@@ -105,6 +110,7 @@ def fly(
                 lockstep=stepping,
                 one_process=one_process,
                 autopilot=autopilot,
+                namespace=namespace,
                 announce=announce,
             )
         if outcome == "completed":

@@ -16,6 +16,8 @@ from flight_ros import transport
 from flight_ros.rclpy_private import ARGUMENT_ERRORS
 
 SERVICE_TIMEOUT = 10.0  # s
+DISCOVERY_TIMEOUT = 3.0  # s, until an aircraft of this namespace is known where others are
+NODES = ("controller", "guidance", "bridge", "aircraft")  # of an aircraft
 
 
 def start_middleware() -> None:
@@ -54,13 +56,20 @@ class Client:
         rclpy.try_shutdown()
 
     def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
-        deadline = time.monotonic() + timeout
+        begin = time.monotonic()
         while not condition():
             if self._cancelled.is_set():
                 raise ParameterError("cancelled by a later request")
-            if time.monotonic() > deadline:
+            if (waited := time.monotonic() - begin) > min(timeout, DISCOVERY_TIMEOUT) and (elsewhere := self._elsewhere()):
+                raise ParameterError(f"{message}; aircraft fly in {', '.join(elsewhere)}: --namespace")
+            if waited > timeout:
                 raise ParameterError(message)
             rclpy.spin_once(self._node, timeout_sec=0.02)
+
+    def _elsewhere(self) -> list[str]:
+        """The namespaces of the aircraft in the graph where none is in this namespace; "/" is the root."""
+        seen = {namespace for name, namespace in self._node.get_node_names_and_namespaces() if name in NODES}
+        return [] if self._node.get_namespace() in seen else sorted(seen)
 
     def _call(self, kind: Any, name: str, request: Any, expected: str = "a flight") -> Any:
         client = self._node.create_client(kind, name)

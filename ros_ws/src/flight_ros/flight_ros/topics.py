@@ -92,7 +92,7 @@ INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
 ROSOUT = Topic("/rosout", Log, foreign=True)  # of ROS 2 itself
-CLOCK = Topic("/clock", Clock)
+CLOCK = Topic("clock", Clock)  # relative: each aircraft in lockstep has its own
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 START = Topic("start", Time)  # t = 0 of a flight in real time, once its nodes are matched
