@@ -157,6 +157,49 @@ def test_lost_aileron_acts_like_zero_column_of_b() -> None:
     assert (actual == expected).all()
 
 
+def test_weak_aileron_acts_like_half_column_of_b() -> None:
+    params, u = osprey(weak_at=[math.inf, math.inf, 0.0, math.inf]), np.array([0.01, 0.1, -0.02, 0.03])
+    half = osprey()
+    half = half._replace(aircraft=half.aircraft._replace(B=half.aircraft.B * [1.0, 1.0, 0.5, 1.0]))
+    weak, expected = (advance(0, plant.initial_state(each), u, 500 * MS, each) for each in (params, half))
+    assert weak.x == pytest.approx(expected.x, rel=1e-12)
+    assert (weak.position == expected.position).all()
+
+
+def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
+    # From 50 ms on at 0.2 (1 - exp(-2.5)) with a lag of 0.2 s; the thrust, which has 1 s, stays as it is.
+    lag, at = [0.02, 1.0, 0.02, 0.02], [0.05, 0.05, math.inf, math.inf]
+    slow = position_history(range(0, 100, 10), 0.2, lag=lag, slow_at=at)
+    healthy = position_history(range(0, 100, 10), 0.2, lag=lag)
+    assert (slow[:5] == healthy[:5]).all()
+    assert (slow[:, 1:] == healthy[:, 1:]).all()
+    assert slow[-1, 0] == pytest.approx(0.2 * (1.0 - math.exp(-2.5) * math.exp(-0.05 / 0.2)))
+
+
+def test_loose_surface_follows_play_operator() -> None:
+    # Half-width 0.1: the position stays while the command is within 0.1 of it, and trails it by 0.1 otherwise.
+    params, position = Actuators(loose_at=np.array([1.0]), loose_play=np.array([0.1])), np.zeros(1)
+    history = []
+    for t, command in ((0.0, 0.05), (1.0, 0.1), (1.0, 0.3), (1.0, 0.15), (1.0, 0.05), (1.0, -0.2)):
+        position, _ = move(t, position, np.array([command]), 0.01, params)
+        history.append(float(position[0]))
+    assert history == pytest.approx([0.05, 0.05, 0.2, 0.2, 0.15, -0.1])
+
+
+def test_drift_ends_as_the_drifted_aircraft() -> None:
+    ice = aircraft_parameters(drift={"start": 1.0, "duration": 2.0, "A": 0.3, "B": 0.2})
+    after, before = plant.aircraft_at(3000 * MS, ice.plant()), ice.plant().aircraft
+    airframe = ice.drifted_airframe()
+    expected = (airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_gusts())
+    for matrix, first, last in zip(
+        ("A", "B", "gust_direction"), (before.A, before.B, before.gust_direction), expected, strict=True
+    ):
+        assert getattr(after, matrix) == pytest.approx(last)
+        assert getattr(plant.aircraft_at(2000 * MS, ice.plant()), matrix) == pytest.approx((first + last) / 2.0)
+        assert (getattr(plant.aircraft_at(1000 * MS, ice.plant()), matrix) == first).all()
+    assert not np.allclose(after.gust_direction, before.gust_direction)  # wind acts by the aircraft's own A
+
+
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 1), st.floats(0.01, 100), st.floats(0.01, 1))
 def test_rate_and_stops_hold_for_any_command(commands: list[float], lag: float, rate: float, stop: float) -> None:
     history = np.array([0.0, *positions(commands, 0.01, actuator(lag, -stop, stop, rate))])

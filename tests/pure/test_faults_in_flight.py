@@ -45,15 +45,19 @@ def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
     [
         ({"actuators": {"stuck_at": [0.0, NEVER, 0.0, NEVER]}}, {"actuators": {"stuck_at": [BEGIN, NEVER, BEGIN, NEVER]}}),
         ({"actuators": {"lost_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"lost_at": [BEGIN, NEVER, NEVER, NEVER]}}),
+        ({"actuators": {"weak_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"weak_at": [BEGIN, NEVER, NEVER, NEVER]}}),
+        ({"actuators": {"slow_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"slow_at": [BEGIN, NEVER, NEVER, NEVER]}}),
+        ({"actuators": {"loose_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"loose_at": [BEGIN, NEVER, NEVER, NEVER]}}),
         ({"gusts": {"vertical": GUST}}, {"gusts": {"vertical": GUST}}),
     ],
-    ids=["stuck", "lost", "gust"],
+    ids=["stuck", "lost", "weak", "slow", "loose", "gust"],
 )
 def test_fault_that_begins_now_is_one_that_was_scheduled(name: str, now: dict[str, Any], scheduled: dict[str, Any]) -> None:
     scenario = find_scenario(name).vary(aircraft={"gusts": {}, "rate": 500.0, "step": 0.002})
     still = scenario.aircraft
     changed = flown(still, varied(scenario, **now))
-    assert changed.tobytes() == flown(varied(scenario, **scheduled), varied(scenario, **scheduled)).tobytes()
+    whole = flown(varied(scenario, **scheduled), varied(scenario, **scheduled))
+    assert np.array_equal(changed, whole, equal_nan=True)  # no bytes: a lag of 0 s gives -0.0 for a command of 0
     assert not np.array_equal(changed, flown(still, still), equal_nan=True)
 
 
@@ -77,7 +81,27 @@ def test_gust_changes_neither_past_nor_gust_that_acts(osprey_gust: Scenario) -> 
         flown(scenario.aircraft, varied(scenario, gusts={"vertical": GUST}))
 
 
+def test_drift_that_is_scheduled_in_flight_is_one_of_the_scenario(osprey_gust: Scenario) -> None:
+    ice = {"duration": 0.2, "A": 0.3, "B": 0.3}
+    never, later = (varied(osprey_gust, drift=ice | {"start": start}) for start in (NEVER, BEGIN + 0.1))
+    assert flown(never, later).tobytes() == flown(later, later).tobytes()
+    with pytest.raises(ParameterError, match=r"drift\.start: found 0\.1 s, expected at least t = 0\.4 s"):
+        flown(never, varied(osprey_gust, drift=ice | {"start": 0.1}))
+    with pytest.raises(ParameterError, match=r"^drift: found a change of a drift that acts, expected one before its start"):
+        flown(varied(osprey_gust, drift=ice | {"start": 0.1}), later)
+
+
 def test_faults_may_change_in_flight_and_nothing_else() -> None:
     names = AircraftConfig.tunable()
-    assert {"actuators.stuck_at", "sensors.noise", "gusts.lateral.start"} <= names
-    assert not names & {"airframe", "rate", "step", "actuators", "actuators.lag", "sensors", "sensors.delay", "gusts"}
+    assert {"actuators.stuck_at", "actuators.weak_effect", "sensors.noise", "gusts.lateral.start", "drift.start"} <= names
+    assert not names & {
+        "airframe",
+        "rate",
+        "step",
+        "actuators",
+        "actuators.lag",
+        "sensors",
+        "sensors.delay",
+        "gusts",
+        "drift.A",
+    }

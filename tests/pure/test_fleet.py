@@ -94,6 +94,19 @@ VARIATIONS: dict[str, dict[str, Any]] = {
         "controller": {"lower": [-0.05, -0.02, -0.05, -0.1], "upper": [0.05, 0.02, 0.05, 0.1]},
         "aircraft": {"actuators": {"lag": LAG, "rate": [0.4, 0.3, 0.2, 0.2]}},
     },
+    "aileron weak, rudder slow, elevator loose, drift": {
+        "aircraft": {
+            "actuators": {
+                "lag": LAG,
+                "weak_at": [np.inf, np.inf, 2.0, np.inf],
+                "slow_at": [np.inf, np.inf, np.inf, 2.0],
+                "loose_at": [1.0, np.inf, np.inf, np.inf],
+                "loose_play": [0.001] * 4,
+            },
+            "drift": {"start": 1.0, "duration": 4.0, "A": 0.3, "B": 0.3},
+        },
+        "flight": {"duration": 8.0},
+    },
     "bias, sines, thrust stuck": {
         "aircraft": {
             "bias": {"q": {"start": 1.0, "value": 0.5, "rise": 0.5}},

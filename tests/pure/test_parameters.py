@@ -124,6 +124,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"dead_zone": [-0.1] * 4}, r"\.dead_zone\[0\]: found -0.1, expected greater than or equal to 0"),
         ({"stuck_at": [-1.0] * 4}, r"\.stuck_at\[0\]: found -1.0, expected greater than or equal to 0"),
         ({"lost_at": [math.nan] * 4}, r"\.lost_at\[0\]: found nan, expected greater than or equal to 0"),
+        ({"weak_effect": [3.0] * 4}, r"\.weak_effect\[0\]: found 3.0, expected less than or equal to 2"),
         ({"lags": [0.02]}, r"\.lags: unknown key, expected lag perhaps"),
     ],
     "sensors": [
@@ -280,7 +281,8 @@ def test_output_that_cannot_be_written_is_one_sentence() -> None:
 
 # A field without bounds takes .inf and NaN: no end stop, never, or what a message field has for "no value".
 ENDLESS = {
-    "ActuatorConfig": {"lower", "upper", "rate", "stuck_at", "lost_at"},
+    "ActuatorConfig": {"lower", "upper", "rate", "stuck_at", "lost_at", "weak_at", "slow_at", "loose_at"},
+    "DriftConfig": {"start"},
     "InputRow": {"release"},
     "MessageRow": {"values"},
 }

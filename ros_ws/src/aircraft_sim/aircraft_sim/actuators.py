@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Actuators between the command u and the aircraft: dead zone, lag, rate saturation, position saturation; actuator faults."""
+"""Actuators between the command u and the aircraft: dead zone, lag, rate and position saturation; faults of effectors."""
 
 from typing import Any, NamedTuple
 
@@ -19,12 +19,20 @@ class Actuators(NamedTuple):
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
     stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
     lost_at: Array | None = None  # (m,) when it loses its effect, s of flight time, inf = never
+    weak_at: Array | None = None  # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
+    weak_effect: Array | None = None  # (m,) factor
+    slow_at: Array | None = None  # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
+    slow_lag: Array | None = None  # (m,) s
+    loose_at: Array | None = None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
+    loose_play: Array | None = None  # (m,) half-width of the backlash
+    backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     """Actuator positions one step later, shape (m,), with the command held over the step.
 
-        input   = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at the edge
+        wanted  = command - clip(command, -dead_zone, dead_zone)               dead zone: zero inside, no jump at the edge
+        input   = clip(position, wanted - backlash, wanted + backlash)         the play operator; wanted without backlash
         lagged  = input - (input - position) exp(-dt / lag)                    exact solution of lag p_dot = input - p
         limited = position + clip(lagged - position, -rate dt, rate dt)        rate limit
         p+      = clip(limited, lower, upper)                                  end stops
@@ -36,7 +44,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
     Source: the lag is the zero-order-hold equivalent of 1 / (lag s + 1); Franklin, Powell, Workman, Digital Control, 4.3.
     """
     xp = array_namespace(position)
-    new = _beyond_dead_zone(command, params)
+    new = _input(position, command, params)
     if params.lag is not None:
         new = new - (new - position) * xp.exp(-dt / xp.maximum(params.lag, MIN_LAG))
     if params.rate is not None:
@@ -50,7 +58,7 @@ def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
 def mean_position(position: Array, command: Array, new: Array, dt: Any, params: Actuators) -> Array:
     """Mean of the actuator positions over a step from `position` to `new`, shape (m,): the input of the aircraft in this step.
 
-        input   = command - clip(command, -dead_zone, dead_zone)                  as in `step`
+        input                                                                     as in `step`
         lagged  = input - (input - position) lag / dt (1 - exp(-dt / lag))        exact mean of lag p_dot = input - p
         limited = clip(lagged, position - rate dt / 2, position + rate dt / 2)    exact mean of a motion at the rate limit
         mean    = clip(limited, min(position, new), max(position, new))           the motion is monotonic and has end stops
@@ -63,7 +71,7 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
     if params.lag is None and params.rate is None:
         return new
     xp = array_namespace(position)
-    mean = _beyond_dead_zone(command, params)
+    mean = _input(position, command, params)
     if params.lag is not None:
         mean = mean + (mean - position) * (params.lag / dt * xp.expm1(-dt / xp.maximum(params.lag, MIN_LAG)))
     if params.rate is not None:
@@ -73,17 +81,38 @@ def mean_position(position: Array, command: Array, new: Array, dt: Any, params: 
 
 
 def move(t: Any, position: Array, command: Array, dt: Any, params: Actuators) -> tuple[Array, Array]:
-    """Positions at the end of a step from t on, and mean positions over the step, with faults, shapes (m,)."""
-    new = step(position, command, dt, params)
-    mean = mean_position(position, command, new, dt, params)
-    return apply_faults(t, position, new, params), apply_faults(t, position, mean, params)
+    """Positions at the end of a step from t on, and the mean input of the aircraft over the step, with faults, shapes (m,)."""
+    now = in_force(t, position, params)
+    new = step(position, command, dt, now)
+    mean = mean_position(position, command, new, dt, now)
+    return apply_faults(t, position, new, params), effect(t, apply_faults(t, position, mean, params), params)
 
 
-def _beyond_dead_zone(command: Array, params: Actuators) -> Array:
-    if params.dead_zone is None:
-        return command
+def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
+    """Parameters of a step from t on: a slow actuator has at least `slow_lag`, a loose one the backlash `loose_play`."""
+    xp = array_namespace(position)
+    if params.slow_at is not None:
+        lag = 0.0 * position if params.lag is None else params.lag
+        params = params._replace(lag=xp.where(t >= params.slow_at, xp.maximum(lag, params.slow_lag), lag))
+    if params.loose_at is not None:
+        params = params._replace(backlash=xp.where(t >= params.loose_at, params.loose_play, 0.0 * position))
+    return params
+
+
+def effect(t: Any, position: Array, params: Actuators) -> Array:
+    """The input of the aircraft at these positions, shape (m,): a weak effector has `weak_effect` of it from `weak_at` on."""
+    if params.weak_at is None:
+        return position
+    return array_namespace(position).where(t >= params.weak_at, params.weak_effect * position, position)
+
+
+def _input(position: Array, command: Array, params: Actuators) -> Array:
     xp = array_namespace(command)
-    return command - xp.minimum(xp.maximum(command, -params.dead_zone), params.dead_zone)
+    if params.dead_zone is not None:
+        command = command - xp.minimum(xp.maximum(command, -params.dead_zone), params.dead_zone)
+    if params.backlash is None:
+        return command
+    return xp.minimum(xp.maximum(position, command - params.backlash), command + params.backlash)
 
 
 def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Array:

@@ -38,7 +38,7 @@ class JsbsimModel:
 
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
-        commands  = trim + position+, then JSBSim runs
+        commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
 
     JSBSim integrates the forces of the step before, then computes the forces of the new commands and the new wind: commands and
     wind act a step later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is right: the mean
@@ -88,9 +88,11 @@ class JsbsimModel:
         filters = self._wind_model.turbulence
         normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
         for k in range(steps):
-            position = actuators.step(self._position, u, dt, model)
-            self._position = actuators.apply_faults(seconds(t_ns + k * step_ns), self._position, position, model)
-            for nodes, values, deviation in zip(self._commands, self._trim_commands, self._position.tolist(), strict=True):
+            t = seconds(t_ns + k * step_ns)
+            position = actuators.step(self._position, u, dt, actuators.in_force(t, self._position, model))
+            self._position = actuators.apply_faults(t, self._position, position, model)
+            deviations = actuators.effect(t, self._position, model).tolist()
+            for nodes, values, deviation in zip(self._commands, self._trim_commands, deviations, strict=True):
                 for node, value in zip(nodes, values, strict=True):
                     node.set_double_value(value + deviation)
             if filters is not None:

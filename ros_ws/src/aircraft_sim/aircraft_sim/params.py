@@ -13,7 +13,7 @@ from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
-from aircraft_sim.plant import PlantParams
+from aircraft_sim.plant import Drift, PlantParams
 from aircraft_sim.pose import every
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
@@ -95,6 +95,22 @@ class UncertaintyConfig(Config):
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
 
 
+class DriftConfig(Config):
+    """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and independent."""
+
+    start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(description="when it begins, s; .inf is never")
+    duration: NonNegative = Field(
+        default=60.0, description="how long the entries then change, at a constant rate, s; 0 is at once"
+    )
+    A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
+    B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
+    seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
+    number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's change, from 0 on")
+
+    def _check(self) -> None:
+        require(self.A > 0.0 or self.B > 0.0, "A", "0, and B 0", "how far A or B change")
+
+
 # One value per channel; an empty list means ideal channels. A limit may be infinite (.inf in YAML): no limit on that channel.
 NonNegativesOrNone = tuple[NonNegative, ...]
 Lower = tuple[Annotated[float, Field(le=0, allow_inf_nan=True)], ...]
@@ -116,6 +132,24 @@ class ActuatorConfig(Config):
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
     stuck_at: Times = Field(default=(), description="from when on each keeps its position, s; .inf is never")
     lost_at: Times = Field(default=(), description="from when on each has no effect and is at trim, s; .inf is never")
+    weak_at: Times = Field(default=(), description="from when on each has `weak_effect` of its effect, s; .inf is never")
+    weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
+        default=(), description="factors of the effect from `weak_at` on, below 0 reversed; none: 0.5 each"
+    )
+    slow_at: Times = Field(default=(), description="from when on each has the lag `slow_lag` at least, s; .inf is never")
+    slow_lag: NonNegativesOrNone = Field(default=(), description="lags from `slow_at` on, s; none: 0.2 s each")
+    loose_at: Times = Field(default=(), description="from when on each has the backlash `loose_play`, s; .inf is never")
+    loose_play: NonNegativesOrNone = Field(
+        default=(), description="half-widths of the backlash from `loose_at` on, SI; none: 0.01 each"
+    )
+
+
+EFFECTOR_FAULTS = {"stuck_at": None, "lost_at": None, "weak_at": "weak_effect", "slow_at": "slow_lag", "loose_at": "loose_play"}
+"""Times at which faults of effectors begin, with the parameter that says how strong."""
+
+SEVERITIES = {"weak_effect": 0.5, "slow_lag": 0.2, "loose_play": 0.01}
+"""How strong a fault is where the scenario does not say it: half of the effect, ten times the lag of a servo of the osprey, and
+0.57 deg, or 1 % of thrust."""
 
 
 class SensorConfig(Config):
@@ -187,6 +221,7 @@ class AircraftConfig(NodeConfig):
     uncertainty: UncertaintyConfig = Field(
         default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
     )
+    drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
     pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
@@ -203,11 +238,10 @@ class AircraftConfig(NodeConfig):
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
-        """Faults that begin and end in flight: of actuators, of sensors, and gusts."""
+        """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a drift."""
         gusts = {f"gusts.{axis}.{key}" for axis in AXES for key in Gust.model_fields}
-        return frozenset(
-            gusts | {"actuators.stuck_at", "actuators.lost_at", "sensors.bias", "sensors.noise", "sensors.dropout"}
-        )
+        effectors = {f"actuators.{key}" for key in (*EFFECTOR_FAULTS, *SEVERITIES)}
+        return frozenset(gusts | effectors | {"sensors.bias", "sensors.noise", "sensors.dropout", "drift.start"})
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
@@ -268,6 +302,7 @@ class AircraftConfig(NodeConfig):
             ("inertial_coupling", self.inertial_coupling),
             ("kinematics", self.kinematics != "linear"),
             ("uncertainty", uncertain),
+            ("drift", self.drift),
         ):
             require(not value, key, "a value", f"none: {self.airframe} has no matrices to change")
 
@@ -298,6 +333,24 @@ class AircraftConfig(NodeConfig):
             load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind
         )
 
+    def drifted_airframe(self) -> Airframe:
+        """The airframe in flight after its drift."""
+        airframe, chosen = self.sampled_airframe(), self.drift
+        if chosen is None:
+            return airframe
+        return uncertainty.sample_airframe(airframe, chosen.A, chosen.B, chosen.seed, chosen.number, self.uncertainty.wind)
+
+    def drift_factors(self) -> Drift | None:
+        """The drift as factors of the matrices of equation (1)."""
+        if self.drift is None:
+            return None
+        matrices = ((a.matrix_a(), a.matrix_b(), a.matrix_gusts()) for a in (self.sampled_airframe(), self.drifted_airframe()))
+        factors = [
+            np.divide(after, before, out=np.ones_like(before), where=before != 0.0)
+            for before, after in zip(*matrices, strict=True)
+        ]
+        return Drift(self.drift.start, self.drift.duration, *factors)
+
     def load(self) -> tuple[Airframe, Aircraft]:
         """The airframe in flight and the arrays of equation (1) with the disturbances, for the axes of the airframe's gusts."""
         airframe = self.sampled_airframe()
@@ -319,16 +372,21 @@ class AircraftConfig(NodeConfig):
         )
 
     def plant(self) -> PlantParams:
-        """The plant as arrays: equation (1), the actuators and the turbulence."""
+        """The plant as arrays: equation (1), the actuators, the turbulence and the drift."""
         airframe, aircraft = self.load()
         turbulence = self._turbulence(airframe.speed, list(airframe.gusts))
-        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence)
+        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors())
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
-        return Actuators(
-            **{key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators.model_dump().items()}
-        )
+        arrays = {key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators.model_dump().items()}
+        for key, severity in EFFECTOR_FAULTS.items():
+            times = arrays[key]
+            if times is None or np.isinf(times).all():
+                arrays[key] = None
+            elif severity is not None and arrays[severity] is None:
+                arrays[severity] = np.full(len(times), SEVERITIES[severity])
+        return Actuators(**arrays)
 
     def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated plant: equation (1) behind actuators, integrated in fixed steps, with zero-order hold of u."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from aircraft_sim import actuators, dynamics, turbulence
 from aircraft_sim.actuators import Actuators
@@ -14,14 +16,44 @@ from flight_core.vectors import Array, array_namespace
 
 DIVERGENCE_LIMIT = 1e6  # SI. A state above this limit counts as diverged; no state of an aircraft in flight comes near it.
 
+SHORTEST_DRIFT = 1e-9  # s, for duration 0, which has no division by 0 then
+
+
+class Drift(NamedTuple):
+    """A change of A, B and the effect of wind in flight: factors of their entries after `duration`, linear in time before."""
+
+    start: float  # s of flight time
+    duration: float  # s, 0 for a change at once
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    wind: Array  # (n, G)
+
+
+def share(t: Array, start: Any, duration: Any) -> Array:
+    """How far a drift acts at t: 0 before the start, 1 after the duration."""
+    xp = array_namespace(t)
+    part = xp.minimum((t - start) / xp.maximum(duration, SHORTEST_DRIFT), 1.0)
+    return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
+
 
 class PlantParams(NamedTuple):
-    """Parameters of the plant: aircraft, actuators, integration step and turbulence."""
+    """Parameters of the plant: aircraft, actuators, integration step, turbulence and drift."""
 
     aircraft: Aircraft
     actuators: Actuators
     step_ns: int  # of the integration
     turbulence: Turbulence | None = None  # of one step; None without turbulence
+    drift: Drift | None = None
+
+
+def aircraft_at(t_ns: int, plant: PlantParams) -> Aircraft:
+    """The aircraft at t: its A, B and effect of wind times 1 + share (factor - 1)."""
+    aircraft, drift = plant.aircraft, plant.drift
+    if drift is None:
+        return aircraft
+    part = share(np.array(seconds(t_ns)), drift.start, drift.duration)
+    A, B, wind = (1.0 + part * (factor - 1.0) for factor in (drift.A, drift.B, drift.wind))
+    return aircraft._replace(A=aircraft.A * A, B=aircraft.B * B, gust_direction=aircraft.gust_direction * wind)
 
 
 class AircraftState(NamedTuple):
@@ -40,9 +72,9 @@ def initial_state(plant: PlantParams) -> AircraftState:
 
 
 def forcing(t_ns: int, steps: int, plant: PlantParams) -> Forcing:
-    """Forcing at the beginnings, middles and ends of a number of steps from t on: 2 steps + 1 instants."""
+    """Forcing at the beginnings, middles and ends of a number of steps from t on: 2 steps + 1 instants; the aircraft of t."""
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
-    return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, plant.aircraft)
+    return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, aircraft_at(t_ns, plant))
 
 
 def advance(
@@ -66,11 +98,11 @@ def advance(
     during the whole step: the spectrum is exact at the steps, with a hold in between. Time is counted in ns, so
     steps add up exactly.
 
-    n_k follow from the seed. `forced` is the `forcing` of these steps, from a caller that has computed it. Raises
-    ParameterError where the step does not divide the duration.
+    The aircraft of t acts during the whole duration. n_k follow from the seed. `forced` is the `forcing` of these steps, from a
+    caller that has computed it. Raises ParameterError where the step does not divide the duration.
     """
     x, position, z = state
-    aircraft, filters = plant.aircraft, plant.turbulence
+    aircraft, filters = aircraft_at(t_ns, plant), plant.turbulence
     steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
     normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
 

@@ -81,7 +81,7 @@ class StateSpaceModel:
         """See FlightDynamicsModel."""
         steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
         begin = (t_ns - self._block_ns) // self._plant.step_ns
-        if not 0 <= begin <= begin + steps <= BLOCK:
+        if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
             self._block_ns, begin = t_ns, 0
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant)
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
@@ -92,6 +92,14 @@ class StateSpaceModel:
         self._psi += half * (psi_dot + self._psi_dot)
         self._velocity = self._air_velocity(states)
         self._position = [x + half * (v + w) for x, v, w in zip(self._position, velocity, self._velocity, strict=True)]
+
+    def _drifts(self, t_ns: int) -> bool:
+        """Whether the aircraft at t differs from that of the block."""
+        drift = self._plant.drift
+        if drift is None:
+            return False
+        now, before = plant.share(np.array([seconds(t_ns), seconds(self._block_ns)]), drift.start, drift.duration)
+        return bool(now != before)
 
     def pose(self) -> FloatArray:
         """See FlightDynamicsModel."""
@@ -122,7 +130,8 @@ class StateSpaceModel:
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
-        return truth.values(self._state, self._block.wind[index], self._block.rate[index], self._plant)
+        flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant))
+        return truth.values(self._state, self._block.wind[index], self._block.rate[index], flown)
 
     def diverged(self) -> bool:
         """See FlightDynamicsModel."""
@@ -131,7 +140,9 @@ class StateSpaceModel:
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """See FlightDynamicsModel."""
         aircraft = self._plant.aircraft._replace(gusts=parameters.gust_arrays(self._axes))
-        self._plant = self._plant._replace(aircraft=aircraft, actuators=parameters.actuator_model())
+        self._plant = self._plant._replace(
+            aircraft=aircraft, actuators=parameters.actuator_model(), drift=parameters.drift_factors()
+        )
         self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant)
 
 
@@ -150,6 +161,7 @@ class Simulator:
         else:
             self._model = StateSpaceModel(parameters)
         self._wind, self._gusts, self._speed = parameters.wind, parameters.gusts, channels.speed
+        self._drift_section = parameters.drift
         self._pose_every, self._pose_sensors = parameters.pose_every(), parameters.pose_sensors()
         self._poses: DelayLine = ()
         self._sensors = parameters.sensor_arrays()
@@ -163,7 +175,7 @@ class Simulator:
         self._number = 0
 
     def retune(self, parameters: AircraftConfig) -> None:
-        """Take faults and gusts of these parameters from now on. Raises ParameterError where a gust would change the past."""
+        """Take faults and gusts of these parameters from now on. Raises ParameterError where one would change the past."""
         now_ns = self._number * self.period_ns
         t = seconds(now_ns)
         for axis, gust in parameters.gusts.items():
@@ -174,7 +186,11 @@ class Simulator:
             end = old.start + 2.0 * old.length / self._speed if old is not None and old.speed else t
             over = old is None or t <= old.start or end <= t
             require(over, f"gusts.{axis}", "a change of a gust that acts", f"one after its end at t = {end:g} s")
-        self._gusts, self._sensors = parameters.gusts, parameters.sensor_arrays()
+        if (drift := parameters.drift) != (before := self._drift_section):
+            require(drift is None or drift.start >= t, "drift.start", f"{drift and drift.start:g} s", f"at least t = {t:g} s")
+            acts = before is not None and before.start < t
+            require(not acts, "drift", "a change of a drift that acts", "one before its start")
+        self._drift_section, self._gusts, self._sensors = drift, parameters.gusts, parameters.sensor_arrays()
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:

@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from aircraft_sim import actuators, dynamics, sensors
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
-from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams
+from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams, share
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign import missions
 from flight_campaign.benchmark_course import Course, Segments
@@ -41,6 +41,17 @@ class StateBlock(NamedTuple):
     columns: tuple[int, ...]
 
 
+class Change(NamedTuple):
+    """A drift of N aircraft: differences of the matrices of Fleet after `duration`, linear in time before."""
+
+    start: float  # s
+    duration: float  # s
+    tick: tuple[Array, ...]
+    forced: Array
+    rate: Array
+    forced_rate: Array
+
+
 class Fleet(NamedTuple):
     """N aircraft over one tick of the controller, in K steps of the integration; q rows of the remainder, r of the forcing.
 
@@ -56,6 +67,7 @@ class Fleet(NamedTuple):
     forced_rate: Array  # (m, r, N)
     wind: Array  # (N,) factor of the course's gusts and turbulence
     late: Array  # (N,) delay of u, whole ticks
+    change: Change | None = None
 
 
 class Vehicle(NamedTuple):
@@ -122,7 +134,41 @@ def assemble(
     The steps, and the actuators' mean positions in them, are those of `plant.advance`. The remainder is held over a tick, and
     the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each. `gust_directions` of shape
     (N, n, G) are the effects of wind on x_dot, of `uncertainty.gust_directions`; None: those of the plant, for all aircraft.
+    The drift of the plant multiplies the entries of all aircraft alike; the matrices above are then interpolated.
     """
+    directions = plant.aircraft.gust_direction if gust_directions is None else gust_directions
+    tick, forced, rate, forced_rate = begin = _matrices(A, B, directions, plant, course)
+    blocks = _blocks((tick != 0.0).any(axis=0))
+
+    def of_blocks(whole: FloatArray) -> tuple[Array, ...]:
+        return tuple(_last(whole[:, block.rows][:, :, block.columns]) for block in blocks)
+
+    change, count = None, len(A)
+    if (drift := plant.drift) is not None:
+        end = _matrices(A * drift.A, B * drift.B, directions * drift.wind, plant, course)
+        moved, *others = (after - before for before, after in zip(begin, end, strict=True))
+        change = Change(drift.start, drift.duration, of_blocks(moved), *map(_last, others))
+    return Fleet(
+        blocks,
+        of_blocks(tick),
+        _last(forced),
+        _last(rate),
+        _last(forced_rate),
+        jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
+        jnp.broadcast_to(jnp.asarray(late), (count,)),
+        change,
+    )
+
+
+def _last(array: FloatArray) -> Array:
+    """The aircraft as the last axis."""
+    return jnp.asarray(np.moveaxis(array, 0, -1))
+
+
+def _matrices(
+    A: FloatArray, B: FloatArray, directions: FloatArray, plant: PlantParams, course: Course
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """tick, forced, rate and forced_rate of `Fleet`, the aircraft first."""
     dt, aircraft = seconds(plant.step_ns), plant.aircraft
     K, count = course.steps, len(A)
     L = A + aircraft.gravity
@@ -132,26 +178,11 @@ def assemble(
     powers = list(accumulate(repeat(Phi, K), lambda power, one: one @ power, initial=eye))
     held = [powers[K - 1 - k] @ Gamma for k in range(K)]
     tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., remainder_rows(aircraft)]]
-    rate = np.concatenate([L, B], axis=2)
     C = aircraft.C[course.order]
-    directions = aircraft.gust_direction if gust_directions is None else gust_directions
     parts = (directions[..., course.axes], course.basis)
     forcing = np.concatenate([np.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2)
-
-    def last(array: FloatArray) -> Array:
-        return jnp.asarray(np.moveaxis(array, 0, -1))
-
-    whole = np.concatenate(tick, axis=2)
-    blocks = _blocks((whole != 0.0).any(axis=0))
-    return Fleet(
-        blocks,
-        tuple(last(whole[:, block.rows][:, :, block.columns]) for block in blocks),
-        last(np.concatenate([of_step @ forcing for of_step in held], axis=2)),
-        last(C @ rate),
-        last(C @ forcing),
-        jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
-        jnp.broadcast_to(jnp.asarray(late), (count,)),
-    )
+    forced = np.concatenate([of_step @ forcing for of_step in held], axis=2)
+    return np.concatenate(tick, axis=2), forced, C @ np.concatenate([L, B], axis=2), C @ forcing
 
 
 def remainder_rows(aircraft: Aircraft) -> NDArray[np.int64]:
@@ -252,11 +283,11 @@ def _fly(
 
     def measure(now: LoopState, y: Array, segment: Segments, y_m: Array, y_m_dot: Array) -> Measurements:
         x = now.x.at[vehicle.outputs].set(y)
-        forced = _product(fleet.forced_rate, segment.forcing_now)
-        moving = _product(fleet.rate, [*now.x, *now.position]) + fleet.wind * forced
-        position = now.position[vehicle.inputs]
+        matrices = _at(segment.t, fleet)
+        acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
+        moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
         u_trim, x_air = segment.u_ff[:, None] + 0.0 * y, x - fleet.wind * segment.air[:, None]
-        return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving)
+        return Measurements(y, y_m, y_m_dot, u_trim, now.u, now.position[vehicle.inputs], x, x_air, moving)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array]:
@@ -297,10 +328,14 @@ def _fly(
         position, means = jax.lax.scan(move, now.position, segment.t + np.arange(steps) * vehicle.dt)
         remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
         moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
-        parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(fleet.tick, blocks, strict=True)]
+        matrices = _at(segment.t, fleet)
+        parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(matrices.tick, blocks, strict=True)]
         x = jnp.concatenate(parts)[places]
         x = jax.lax.cond(
-            jnp.any(segment.forcing != 0.0), lambda x: x + fleet.wind * _product(fleet.forced, segment.forcing), lambda x: x, x
+            jnp.any(segment.forcing != 0.0),
+            lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing),
+            lambda x: x,
+            x,
         )
         if mission is not None:
             flown = missions.advance(flown, x, mission)
@@ -331,6 +366,17 @@ def _fly(
     of_mission = None if mission is None else missions.figures(end.mission, mission)
     ticks = len(segments.t)
     return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.travel / ((ticks - 1) * period), ~end.bounded, of_mission)
+
+
+def _at(t: Array, fleet: Fleet) -> Fleet:
+    """The matrices at t."""
+    change = fleet.change
+    if change is None:
+        return fleet
+    part = share(t, change.start, change.duration)
+    keys = ("tick", "forced", "rate", "forced_rate")
+    now = {key: jax.tree.map(lambda begin, end: begin + part * end, getattr(fleet, key), getattr(change, key)) for key in keys}
+    return fleet._replace(**now)
 
 
 def _in_trim(fleet: Fleet, vehicle: Vehicle, y_late: int, u_late: int, mission: Mission | None) -> LoopState:

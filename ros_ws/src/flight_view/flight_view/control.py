@@ -404,8 +404,8 @@ def gains_of(controller: ControllerConfig) -> dict[str, Any]:
 
 
 def _faults_of(scenario: Scenario) -> list[str]:
-    """The parameters of the aircraft tunable in flight, without the gusts."""
-    return sorted(name for name in scenario.aircraft.tunable() if not name.startswith("gusts."))
+    """The parameters of the aircraft tunable in flight, without the gusts and the drift."""
+    return sorted(name for name in scenario.aircraft.tunable() if not name.startswith(("gusts.", "drift.")))
 
 
 def _plain(key: str) -> bytes:

@@ -5,7 +5,7 @@ const RENEW = 1500; // ms; the lease lasts 5 s
 const HOLD = 1000; // ms that the button of an engagement is held
 const CHECK = 400; // ms after the last change of a slider
 const ANGLES = ["phi", "theta", "heading", "course"]; // shown in degrees
-const KINDS = ["stuck", "lost"]; // faults of an actuator
+const KINDS = ["stuck", "lost", "weak", "slow", "loose"]; // faults of an effector
 const DEGREE = Math.PI / 180;
 
 const $ = id => document.getElementById(id);
