@@ -22,7 +22,6 @@ from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.turbulence import MODERATE
-from flight_analysis.closed_loop.learning import Event
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -32,6 +31,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from rise_di.gain_design import observed
 from rise_di.learning import learner
+from rise_di_controller.learning import Event
 
 IMAGE = Path(__file__).parents[1] / "docs" / "images" / "learning.png"
 SEED, UNCERTAINTIES = 11, (0.3, 0.5)

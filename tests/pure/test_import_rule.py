@@ -49,7 +49,7 @@ IMPORTS: dict[str, set[str]] = {
     },
     "flight_bringup": {
         "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.report", "flight_core", "flight_guidance",
-        "flight_log",
+        "flight_log", "rise_di_controller",
     },
     "flight_view": {
         "autopilot_bridge", "flight_analysis.closed_loop", "flight_analysis.metrics", "flight_analysis.report", "flight_core",

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from flight_analysis.closed_loop.learning import Proposal, changes
+from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -22,6 +22,7 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di.learning import learner
 from rise_di_controller import divergence
+from rise_di_controller.learning import changes
 from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = [pytest.mark.package("rise_di"), pytest.mark.slow]
@@ -143,14 +144,15 @@ def test_flight_without_learner_is_refused() -> None:
 
 def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     """A model without the delay of the aircraft, and a feedback eight times too strong: the model alone is certified."""
-    late = scenario(learn={"updates": [6.0], "latency": 0.0}).vary(
+    margin = {"observer": scenario().rise_di().model_dump()["observer"] | {"margin": 0.0}}
+    late = scenario(learn={"updates": [6.0], "latency": 0.0}, **margin).vary(
         aircraft={"sensors": {"delay": 0.03}}, flight={"duration": 12.0}
     )
     start, shipped = late.rise_di(), find_scenario("osprey_observer").rise_di().observer
     assert shipped is not None
     given = {f"observer.{key}": getattr(shipped, key) for key in ("Phi", "Gamma", "L")}
     strong = tuple(8.0 * value for value in shipped.F)
-    wrong = vary(start, given | {"observer.F": strong, "observer.part": 1.0, "observer.margin": 0.0})
+    wrong = vary(start, given | {"observer.F": strong, "observer.part": 1.0})
     assert isinstance(wrong, RiseDiConfig)
     tape = simulate(late, learn=lambda _: Fixed(wrong))
     assert tape.outcome == "completed"

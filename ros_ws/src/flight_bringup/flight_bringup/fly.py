@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flight_analysis.closed_loop.learning import Event, Learn
+from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
@@ -31,6 +31,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
+from rise_di_controller.learning import Event
 
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor
@@ -221,7 +222,7 @@ def fly_in_process(
             writer.write(signals)
 
     def learned(event: Event) -> None:
-        line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {'flies ' if event.change else ''}{event.sentence}"
+        line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.sentence}"
         with interrupt.deferred():
             if event.change:
                 writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)

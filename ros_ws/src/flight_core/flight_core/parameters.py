@@ -71,14 +71,15 @@ class Config:
         return f"{type(self).__name__}({', '.join(f'{name}={getattr(self, name)!r}' for name in self.model_fields)})"
 
     @classmethod
-    def validate_mapping(cls, values: Mapping[str, Any], where: str) -> Self:
+    def validate_mapping(cls, values: Mapping[str, Any], where: str, *, check: bool = True) -> Self:
         """Build the set from a nested mapping; `where` names the set in errors, e.g. "controller".
 
-        Raises ParameterError with a sentence for the first key not permitted.
+        Without `check` relations between the values of the set are left to the caller. Raises ParameterError with a sentence
+        for the first key not permitted.
         """
         problems = Problems()
         try:
-            built = cls.read(values, where, problems)
+            built = cls.read(values, where, problems, check=check)
         except ArithmeticError as error:  # of a check with several keys
             too_far = f"numbers too large or too small ({error.args[-1]})"
             raise ParameterError(f"{where}: found {too_far}, expected those of a flight") from None
@@ -88,7 +89,7 @@ class Config:
         return built
 
     @classmethod
-    def read(cls, values: Mapping[Any, Any], key: str, problems: Problems) -> Self | None:
+    def read(cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True) -> Self | None:
         """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not permitted."""
         before, content = len(problems.sentences()), {}
         for name, field in cls.model_fields.items():
@@ -110,7 +111,8 @@ class Config:
         built = cls.__new__(cls)
         vars(built).update(content, _given=frozenset(values))
         try:
-            built._check()
+            if check:
+                built._check()
         except ValueError as error:  # from `require`, with the rest of the key and the sentence
             problems.others.append(f"{key}.{error}")
             return None

@@ -11,10 +11,11 @@ from rise_di.gain_design import observed
 from rise_di_controller.rise_di import RiseDiConfig
 
 
-def learner(scenario: Scenario) -> Learn | None:
+def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not learn.
 
-    The published airframe is the rough model, not the aircraft that flies. Raises ParameterError for an aircraft of JSBSim.
+    The published airframe is the rough model, not the aircraft that flies. In real time the loop has the delay of the
+    controller's section; in one process and in lockstep u acts at once. Raises ParameterError for an aircraft of JSBSim.
     """
     controller, aircraft = scenario.controller, scenario.aircraft
     if not isinstance(controller, RiseDiConfig) or controller.learn is None:
@@ -25,4 +26,4 @@ def learner(scenario: Scenario) -> Learn | None:
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
         return observed(start, scenario, model, margin)[0]
 
-    return lambda parameters: Learner(parameters, airframe, design)
+    return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0)

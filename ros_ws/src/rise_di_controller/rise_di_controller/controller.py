@@ -63,6 +63,11 @@ class Controller:
         """Whether the law has a state to log: from the first engagement on."""
         return self._state.law is not None
 
+    @property
+    def digest(self) -> int:
+        """Digest of the parameters in force."""
+        return self._digest
+
     def restart(self) -> None:
         """Engage the law again with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
         if self._state.mode is Mode.ENGAGED:

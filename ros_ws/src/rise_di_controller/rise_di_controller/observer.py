@@ -9,6 +9,8 @@ here. See docs/theory.md.
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from flight_core.arithmetic import product
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
@@ -62,14 +64,21 @@ def initial_estimates(e: Array, params: ObserverParams) -> Array:
 def estimates_after(history: tuple[PastTick, ...], change: Array, params: ObserverParams) -> Array:
     """Estimates of the filter over the last ticks, predicted for the next tick.
 
-        z = z + L (e - H z),  z = Phi z + Gamma (u - change)        from H'e of the first tick with a y
+        z = z + L (e - H z),  z = Phi z + Gamma (u - change)        from H'e of the first tick with a y,
+        that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    A tick without a y has no correction. Arguments: `history` with a y at least; `change` of the feedforward since then, (m,).
+    A tick without a y has no correction. The products with e and u are those of all ticks together, which takes a third of the
+    time. Arguments: `history` with a y at least; `change` of the feedforward since then, (m,).
     """
-    z = initial_estimates(next(tick.e for tick in history if tick.e is not None), params)
-    for tick in history:
-        corrected = z if tick.e is None else z + product(params.L, tick.e - product(params.H, z))
-        z = predict(corrected, tick.u - change, params)
+    known = np.array([tick.e is not None for tick in history])
+    e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
+    u = np.array([tick.u - change for tick in history]).T
+    gain = product(params.Phi, params.L)
+    added = (product(gain, e) + product(params.Gamma, u)).T
+    corrected = params.Phi - product(gain, params.H)
+    z = initial_estimates(history[int(np.argmax(known))].e, params)
+    for has_y, addend in zip(known, added, strict=True):
+        z = product(corrected if has_y else params.Phi, z) + addend
     return z
 
 

@@ -7,7 +7,7 @@ The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by th
 
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -27,6 +27,7 @@ from flight_core.parameters import (
     Positives,
     Signs,
     flatten,
+    nest,
     require,
     require_length,
 )
@@ -156,6 +157,14 @@ class ControllerConfig(NodeConfig):
         return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
 
     def _check(self) -> None:
+        for _ in self.checks():
+            pass
+
+    def checks(self) -> Iterator[None]:
+        """The relations between the values, checked in parts of at most about 1 ms, for a controller that flies meanwhile.
+
+        Raises ParameterError.
+        """
         period = period_ns(self.rate, "rate")
         if self.lockstep:
             require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
@@ -173,13 +182,15 @@ class ControllerConfig(NodeConfig):
             require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
         self.check_law()
         self._check_state()
+        yield
         nominal = self.nominal()
         if nominal is not None:
             self._check_nominal(nominal)
+            yield
         if self.observer is not None:
             if nominal is None:
                 raise ParameterError("observer: found no feedforward beside it, expected that section too: it has the model")
-            self._check_observer(self.observer, nominal)
+            yield from self._check_observer(self.observer, nominal)
 
     def _check_state(self) -> None:
         """The log holds each array of the law's state by output, beside groups of its own."""
@@ -200,7 +211,7 @@ class ControllerConfig(NodeConfig):
         slow = f"at most {limit:.3g} 1/s, which ticks of {self.rate:g} Hz can follow"
         require(fastest <= limit, "feedforward.A", f"zero dynamics as fast as {fastest:.3g} 1/s", slow)
 
-    def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> None:
+    def _check_observer(self, observer: ObserverConfig, nominal: Nominal) -> Iterator[None]:
         """Sizes, stable filter and feedback, and the delay margin of the nominal loop, which certifies what flies."""
         expected = tuple(f"x.{name}" for name in self.feedforward.states) if self.feedforward else ()
         require(
@@ -214,6 +225,7 @@ class ControllerConfig(NodeConfig):
         for key, matrix in (("L", Phi @ (np.eye(len(Phi)) - L @ H)), ("F", Phi - Gamma @ F)):
             radius = spectral_radius(matrix)
             require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
+        yield
         plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, nominal.C)
         period, m = 1.0 / self.rate, len(self.inputs)
         loop, law = Loop(np.array(self.lag), 0.0, period), linear_law(self.tuned_law(), m, period)
@@ -223,6 +235,14 @@ class ControllerConfig(NodeConfig):
             found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late"
             expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
             require(stable, "observer.margin", found, expected_margin)
+            yield
+
+    def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The values with changes by dotted name, not validated; None removes a parameter. Raises ParameterError."""
+        flat = dict(flatten(self.model_dump()))
+        for name in changes:
+            flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
+        return nest(flat | dict(changes))
 
     def check_law(self) -> None:
         """Checks of the law's own parameters against each other and the channels. Raises ParameterError."""

@@ -3,6 +3,7 @@
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -35,17 +36,18 @@ class LearnConfig(Config):
 
     window: Annotated[float, Field(ge=6, le=600)] = Field(default=30.0, description="length of the record of y and u, s")
     updates: Positives = Field(
-        default=(10.0, 15.0, 20.0, 30.0, 60.0), description="flight times of the first identifications, s; then one a window"
+        default=(10.0, 15.0, 20.0, 30.0, 60.0),
+        description="when the first identifications begin, from the first tick of the law, s; then one a window",
     )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
-        default=4.0, description="from the end of a window until the controller takes the model, s: identification and design"
+        default=4.0,
+        description="in lockstep and in one process: from the end of a window until the controller takes the model, s",
     )
 
-    def is_due(self, t: float) -> bool:
-        """Whether an identification begins at a flight time, s, a whole number of ticks."""
-        last = self.updates[-1]
-        beyond = (t - last) % self.window
-        return t in self.updates or (t > last and min(beyond, self.window - beyond) < 1e-6)
+    def spacing(self) -> float:
+        """The shortest time between two identifications, s."""
+        times = (*self.updates, self.updates[-1] + self.window)
+        return min(after - before for before, after in pairwise(times))
 
 
 class RiseDiConfig(ControllerConfig):
@@ -91,6 +93,9 @@ class RiseDiConfig(ControllerConfig):
             require(self.observer is not None, "learn", "no observer", "one, with part 0 if it does not fly yet")
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
+            spacing = self.learn.spacing()
+            least = f"at most {spacing:g} s, the shortest time between two identifications"
+            require(self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least)
 
     def tuned_law(self) -> TunedLaw:
         """The law with parameters, extended by the observer or the schedule, if any."""

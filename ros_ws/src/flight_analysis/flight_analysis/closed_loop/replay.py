@@ -14,7 +14,7 @@ from flight_core.arguments import FilePath
 from flight_core.arithmetic import arithmetic
 from flight_core.fields import short_repr
 from flight_core.modes import Mode
-from flight_core.parameters import flatten, nest, require
+from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
@@ -114,10 +114,7 @@ def _as_run(run: RecordedRun | FilePath) -> RecordedRun:
 
 def vary(parameters: ControllerConfig, changes: Mapping[str, Any]) -> ControllerConfig:
     """Parameters with changes by dotted name, validated; None removes a parameter. Raises ParameterError."""
-    flat = dict(flatten(parameters.model_dump()))
-    for name in changes:
-        flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
-    return AnyLaw.validate_mapping(nest(flat | dict(changes)), "controller")
+    return AnyLaw.validate_mapping(parameters.changed(changes), "controller")
 
 
 def replay(

@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from aircraft_sim.simulator import Simulator
-from flight_analysis.closed_loop.learning import Event, Learn, LearningLoop
+from flight_analysis.closed_loop.learning import Learn, LearningLoop
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_euler
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
@@ -21,6 +21,7 @@ from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
+from rise_di_controller.learning import Event
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -156,7 +157,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
                     signals["u"].add(output.stamp_ns, output.u)
                     signals["internals"].add(output.stamp_ns, output.internals)
                 if learning is not None:
-                    learning.after_tick(output, t_ns)
+                    learning.after_tick(controller, output, t_ns)
             if t_ns % NANOSECONDS == 0:
                 record({topic: builder.take() for topic, builder in signals.items()})
                 if progress is not None:

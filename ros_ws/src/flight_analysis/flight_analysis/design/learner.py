@@ -17,7 +17,7 @@ from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import PRIOR, Identification, identify
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import seconds
+from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -32,16 +32,20 @@ Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
 class Learner:
     """The record of y and u over a window, and proposals from it."""
 
-    def __init__(self, controller: RiseDiConfig, airframe: Airframe, design: Design) -> None:
-        """Raises ParameterError for a controller that does not learn. `airframe` is the rough model, the prior."""
+    def __init__(self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0) -> None:
+        """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling and lags.
+
+        Raises ParameterError for a controller that does not learn.
+        """
         settings = controller.learn
         require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
         assert settings is not None  # noqa: S101 - for the type checker
         self._controller, self._airframe, self._design = controller, airframe, design
         self._period = 1.0 / controller.rate
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
-        self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), controller.delay)
-        self._record: deque[tuple[int, FloatArray, FloatArray]] = deque(maxlen=round(settings.window / self._period))
+        self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
+        self._record: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        self._window_ns = nanoseconds(settings.window)
         self.identification: Identification | None = None  # the last one
         self._has_model = False
 
@@ -49,6 +53,8 @@ class Learner:
         """Record y and u, after its limits, of a tick, (m,), in the law's order."""
         if not self._record or stamp_ns > self._record[-1][0]:
             self._record.append((stamp_ns, y, u))
+        while stamp_ns - self._record[0][0] >= self._window_ns:
+            self._record.popleft()
 
     def recording(self) -> Recording:
         """The record in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models learned in flight, on the side of the controller: when identifications begin, which proposals fly, the fallback.
+
+Pure: for the node and for the loop in one process.
+"""
+
+from collections import deque
+from collections.abc import Callable, Generator, Mapping
+from typing import Any, NamedTuple
+
+from flight_core.parameters import ParameterError, flatten, require
+from flight_core.rates import nanoseconds, seconds
+from rise_di_controller.controller import Controller
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
+
+DESIGNED = frozenset({"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer"})
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs."""
+
+
+class Proposal(NamedTuple):
+    """What a learner found in its window, as the controller receives it."""
+
+    stamp_ns: int  # the end of the window: the instant of its last tick
+    start: int  # digest of the parameters of the start, which `change` changes
+    flown: int  # digest of the parameters that flew at the end of the window
+    change: Mapping[str, Any]  # by dotted name, None for a parameter that is gone; empty where no model is proposed
+    sentence: str  # what was learned, or why there is no model
+
+
+class Event(NamedTuple):
+    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none, and why."""
+
+    stamp_ns: int
+    change: Mapping[str, Any]
+    sentence: str
+
+
+class Updates:
+    """When identifications begin: at the first tick at or after each of the times, counted from the first tick."""
+
+    def __init__(self, settings: LearnConfig) -> None:
+        self._window_ns = nanoseconds(settings.window)
+        self._times_ns = deque(map(nanoseconds, settings.updates))
+        self._first_ns: int | None = None
+
+    def due(self, now_ns: int) -> bool:
+        """Whether an identification begins at this tick. Call it at each tick in order."""
+        self._first_ns = now_ns if self._first_ns is None else self._first_ns
+        due = False
+        while now_ns - self._first_ns >= self._times_ns[0]:
+            due, last_ns = True, self._times_ns.popleft()
+            if not self._times_ns:
+                self._times_ns.append(last_ns + self._window_ns)
+        return due
+
+
+class Learning:
+    """The proposals of a flight and the fallback, stepped between two ticks of the controller.
+
+    In simulated time a proposal acts `learn.latency` after the end of its window, for which the flight waits. Else it acts
+    when it is certified: a part of the certificate a step, so that no tick waits for it.
+    """
+
+    def __init__(self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool) -> None:
+        assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
+        self._start, self._digest, self._settings = parameters, parameters.digest(), parameters.learn
+        self._announce, self._simulated = announce, simulated
+        self._flown: ControllerConfig = parameters
+        self._updates = Updates(parameters.learn)
+        self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
+        self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
+        self._certificate: tuple[Proposal, Generator[None, None, RiseDiConfig]] | None = None
+        self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
+        self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
+
+    def ticked(self, now_ns: int) -> bool:
+        """Note a tick of the engaged law or of its failsafe; whether an identification begins with it."""
+        due = self._updates.due(now_ns)
+        if due and self._simulated:
+            self._due.append(now_ns)
+        return due
+
+    def waits(self, now_ns: int) -> bool:
+        """In simulated time: whether the tick at `now_ns` waits for a proposal."""
+        return any(self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due)
+
+    def receive(self, proposal: Proposal, now_ns: int, flown: int) -> None:
+        """Take a proposal, or refuse it with an event. `flown` is the digest of the parameters in force."""
+        if refusal := self._refusal(proposal, now_ns, flown):
+            self._announce(Event(now_ns, {}, f"refused: {refusal}"))
+        elif self._simulated:
+            self._received[proposal.stamp_ns] = proposal
+        else:
+            self._last_ns = proposal.stamp_ns
+            self._begin(proposal, now_ns)
+
+    def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Certify, let the proposals act that are due, and fall back where the law diverges.
+
+        Returns the parameters that the controller has taken; None where it keeps its own.
+        """
+        taken = None
+        while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
+            self._begin(self._received.pop(self._due.popleft()), now_ns)
+            taken = self._certify(controller, now_ns) or taken
+        if not self._simulated:
+            taken = self._certify(controller, now_ns)
+        if (fallback := controller.fallback()) is not None:
+            self._take(controller, now_ns, fallback, "falls back to the law of the start: it diverges")
+            taken = fallback
+        return taken
+
+    def _acts_ns(self, end_ns: int) -> int:
+        return end_ns + nanoseconds(self._settings.latency)
+
+    def _refusal(self, proposal: Proposal, now_ns: int, flown: int) -> str:
+        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds, whatever the proposal."""
+        window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
+        if proposal.start != self._digest:
+            return f"found a proposal for the parameters {proposal.start}, expected {self._digest}, those of the start"
+        if self._simulated:
+            known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
+            return "" if known else f"found {window}, expected that of an identification that is due, once"
+        if now_ns - proposal.stamp_ns > nanoseconds(self._settings.window):
+            return f"found {window}, expected at most {self._settings.window:g} s"
+        if self._certificate is not None:
+            return f"found {window} while another proposal is certified, expected one at a time"
+        if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
+            later = f"one that ends at least {seconds(self._spacing_ns):g} s after that of the last proposal"
+            return f"found {window}, expected {later}"
+        return _race(proposal, flown)
+
+    def _begin(self, proposal: Proposal, now_ns: int) -> None:
+        if proposal.change:
+            self._certificate = proposal, _certificate(self._start, proposal.change)
+        else:
+            self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
+
+    def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """A part of the certificate, in simulated time all of it; the parameters taken at its end."""
+        if self._certificate is None:
+            return None
+        proposal, certificate = self._certificate
+        try:
+            next(certificate)
+            while self._simulated:
+                next(certificate)
+        except StopIteration as end:
+            self._certificate = None
+            refusal = _race(proposal, controller.digest)
+            if not refusal:
+                self._take(controller, now_ns, end.value, f"flies {proposal.sentence}")
+                return self._flown
+        except ArithmeticError as error:
+            refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
+        except ValueError as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
+            refusal = str(error)
+        else:
+            return None
+        self._certificate = None
+        self._announce(Event(now_ns, {}, f"refused: {refusal}"))
+        return None
+
+    def _take(self, controller: Controller, now_ns: int, new: ControllerConfig, sentence: str) -> None:
+        controller.retune(new)
+        self._announce(Event(now_ns, changes(self._flown, new), sentence))
+        self._flown = new
+
+
+def _race(proposal: Proposal, flown: int) -> str:
+    """The refusal of a proposal that lost the race with another change of the parameters; else empty."""
+    if proposal.flown == flown:
+        return ""
+    return f"found a proposal beside the parameters {proposal.flown}, expected {flown}: they changed meanwhile"
+
+
+def _certificate(start: RiseDiConfig, change: Mapping[str, Any]) -> Generator[None, None, RiseDiConfig]:
+    """The parameters of the start with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
+    foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
+    require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
+    proposed = RiseDiConfig.validate_mapping(start.changed(change), "controller", check=False)
+    yield
+    require(proposed.observer is not None, "proposal", "no observer", "one")
+    assert proposed.observer is not None  # noqa: S101 - for the type checker
+    assert start.observer is not None  # noqa: S101 - a controller that learns has one
+    require(
+        proposed.observer.states == start.observer.states,
+        "controller.observer.states",
+        ", ".join(proposed.observer.states),
+        f"those of the start: {', '.join(start.observer.states)}",
+    )
+    least = start.observer.margin
+    found = proposed.observer.margin
+    require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
+    try:
+        yield from proposed.checks()
+    except ParameterError as error:
+        raise ParameterError(f"controller.{error}") from None
+    return proposed
+
+
+def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """What differs between two parameter sets, by dotted name; None for a parameter that is gone."""
+    before, after = dict(flatten(old.model_dump())), dict(flatten(new.model_dump()))
+    return {name: after.get(name) for name in before | after if before.get(name) != after.get(name)}

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Proposals of a learner as the controller takes or refuses them, in real time and in simulated time."""
+
+import math
+import re
+from typing import Any
+
+import pytest
+
+from flight_bringup.scenarios import find_scenario
+from flight_core.parameters import flatten
+from flight_core.rates import NANOSECONDS, nanoseconds
+from rise_di_controller.controller import Controller
+from rise_di_controller.learning import DESIGNED, Event, Learning, Proposal, Updates, changes
+from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
+
+pytestmark = pytest.mark.package("rise_di_controller")
+
+START = find_scenario("osprey_learn").rise_di()
+END_NS = 10 * NANOSECONDS  # of the first window
+
+
+FLATTENED = flatten(find_scenario("osprey_observer").rise_di().model_dump())
+CHANGE = {name: value for name, value in FLATTENED if name.split(".")[0] in DESIGNED}
+"""A model with its observer and gains."""
+
+
+class Flight:
+    """A controller that has not engaged, and the proposals of its flight."""
+
+    def __init__(self, *, simulated: bool = False) -> None:
+        self.controller, self.events = Controller(START), list[Event]()
+        self.learning = Learning(START, self.events.append, simulated=simulated)
+        self.now_ns = END_NS
+
+    def receive(self, change: dict[str, Any] | None = None, **replaced: Any) -> None:
+        """A proposal of now."""
+        digest = self.controller.digest
+        proposal = Proposal(self.now_ns, START.digest(), digest, CHANGE if change is None else change, "model")
+        self.learning.receive(proposal._replace(**replaced), self.now_ns, digest)
+
+    def step(self, count: int = 20) -> int:
+        """Steps until the parameters change; how many it took."""
+        for k in range(count):
+            if self.learning.step(self.controller, self.now_ns) is not None:
+                return k + 1
+        return count
+
+    @property
+    def sentences(self) -> list[str]:
+        """What happened."""
+        return [event.sentence for event in self.events]
+
+
+def test_proposal_flies_after_certificate_in_parts() -> None:
+    flight = Flight()
+    flight.receive()
+    assert flight.step() == 8  # fields, relations, zeros, filter and feedback, three delays, the switch
+    assert flight.sentences == ["flies model"]
+    expected = RiseDiConfig.validate_mapping(START.changed(CHANGE), "expected")
+    assert flight.controller.digest == expected.digest()
+    assert flight.events[0].change == changes(START, expected)
+
+
+def scaled(name: str, factor: float) -> dict[str, Any]:
+    return CHANGE | {name: [factor * value for value in CHANGE[name]]}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (scaled("feedforward.B", -1.0), r"^refused: controller\.feedforward\.B: found a C B with D = \[-1, -1, -1, -1\]"),
+        (scaled("observer.F", -1.0), r"^refused: controller\.observer\.F: found a spectral radius"),
+        (scaled("observer.L", -1.0), r"^refused: controller\.observer\.L: found a spectral"),
+        (scaled("observer.F", 8.0), r"late, expected a delay margin of at"),
+        (
+            scaled("observer.Phi", math.nan),
+            r"^refused: controller\.observer\.Phi.*found nan",
+        ),
+        (
+            scaled("observer.Phi", 1e7),
+            r"^refused: controller\.observer\.L: found a spectral",
+        ),
+        (CHANGE | {"observer.margin": 0.0}, r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.03 s"),
+        (CHANGE | {"D": [-1, 1, 1, 1]}, r"^refused: proposal: found a change of D, expected changes of"),
+        (CHANGE | {"observer.states": ["x.q"]}, r"^refused: controller\.observer\.states: found x\.q"),
+        (CHANGE | {"feedforward": 1.0}, r"^refused: feedforward.*: found both a value and a group"),
+        ({"observer": None}, r"^refused: proposal: found no observer, expected one"),
+    ],
+)
+def test_lie_is_refused_with_a_sentence(change: dict[str, Any], sentence: str) -> None:
+    flight = Flight()
+    flight.receive(change)
+    flight.step()
+    assert flight.controller.digest == START.digest()
+    (event,) = flight.events
+    assert not event.change
+    assert re.search(sentence, event.sentence), event.sentence
+
+
+def test_model_that_is_not_proposed_is_said() -> None:
+    flight = Flight()
+    flight.receive({}, sentence="innovations of q: not white")
+    assert flight.sentences == ["no model: innovations of q: not white"]
+
+
+def test_proposal_for_other_parameters_or_beside_changed_ones_is_refused() -> None:
+    flight = Flight()
+    flight.receive(start=1)
+    flight.receive(flown=1)
+    assert "found a proposal for the parameters 1, expected" in flight.sentences[0]
+    assert "found a proposal beside the parameters 1, expected" in flight.sentences[1]
+
+
+def test_proposal_that_loses_the_race_during_its_certificate_is_refused() -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step(1)
+    flight.controller.retune(START.model_copy(update={"hold": 1.0}))
+    flight.step()
+    assert flight.sentences[0].endswith("they changed meanwhile")
+
+
+def test_second_and_late_proposals_are_refused() -> None:
+    flight = Flight()
+    flight.receive()
+    flight.receive()  # while the first is certified
+    flight.step()
+    flight.receive()
+    flight.receive(stamp_ns=END_NS - nanoseconds(31.0))  # of a learner that was stopped
+    assert [sentence.partition(", expected ")[2] for sentence in flight.sentences] == [
+        "one at a time",
+        "",
+        "one that ends at least 2.5 s after that of the last proposal",
+        "at most 30 s",
+    ]
+    flight.now_ns += nanoseconds(5.0)
+    flight.receive(CHANGE | {"observer.part": 0.5})
+    flight.step()
+    assert flight.sentences[-1] == "flies model"
+
+
+def test_storm_of_proposals_costs_one_certificate() -> None:
+    flight = Flight()
+    for _ in range(1000):
+        flight.receive()
+    assert len(flight.sentences) == 999
+    flight.step()
+    assert flight.sentences[-1] == "flies model"
+
+
+def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_latency() -> None:
+    flight = Flight(simulated=True)
+    acts_ns = END_NS + nanoseconds(4.0)
+    for now_ns in range(0, acts_ns + 1, NANOSECONDS):
+        flight.learning.ticked(now_ns)
+        assert flight.learning.waits(now_ns) is (now_ns >= acts_ns)
+    flight.receive()
+    flight.receive()
+    assert len(flight.sentences) == 1  # it came twice
+    assert flight.learning.step(flight.controller, acts_ns - 1) is None
+    assert not flight.learning.waits(acts_ns)
+    assert flight.learning.step(flight.controller, acts_ns) is not None
+    assert flight.sentences[1:] == ["flies model"]
+
+
+def test_identifications_begin_at_their_times_and_then_once_a_window() -> None:
+    updates = Updates(LearnConfig(window=30.0, updates=(10.0, 15.0)))
+    ticks = [7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(10_000)]  # 110 s of late ticks from 7 s on
+    begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
+    assert begins == pytest.approx([10.0, 15.0, 45.0, 75.0, 105.0], abs=0.011)
+
+
+def test_latency_above_shortest_spacing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learn\.latency: found 6 s, expected at most 5 s"):
+        find_scenario("osprey_learn").vary(controller={"learn": {"latency": 6.0}})
