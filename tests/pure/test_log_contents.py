@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameter_overrides
 from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
+from flight_log import columns
 from flight_log.bag import BagWriter, LogAttachments, read_metadata_records
 from flight_log.named_vectors import JOINT_STATE
 from flight_log.provenance import STACK, provenance, revision
@@ -176,3 +178,29 @@ def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> N
     tape = read_run(tmp_path / "run").tape
     assert tape["pose"]["climb"].tolist() == [3.0, 4.0, 5.0, 6.0]
     assert "pose: 12 samples with other names refused" in tape.notes
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_long_topic_kept_in_file_has_bits_of_one_in_memory(
+    recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *, indexed: bool
+) -> None:
+    log = next(Path(str(recorded.path)).glob("*.mcap")).read_bytes()
+    (tmp_path / "log.mcap").write_bytes(log if indexed else log[: -len(log) // 20])  # cut: without the number of samples
+    plain = read_run(tmp_path / "log.mcap").tape
+    monkeypatch.setattr(columns, "IN_MEMORY", 1000)
+    tape = read_run(tmp_path / "log.mcap").tape
+    for name, signal in plain.signals.items():
+        in_file, half_ns = tape[name], int(signal.stamp_ns[len(signal.stamp_ns) // 2])
+        assert in_file.values.tobytes("F") == signal.values.tobytes("F")
+        assert in_file[signal.names[-1]].tobytes() == signal[signal.names[-1]].tobytes()
+        assert in_file.until(half_ns).values.tobytes("F") == signal.until(half_ns).values.tobytes("F")
+    assert tape["truth"].group("x").values.tobytes("F") == plain["truth"].group("x").values.tobytes("F")
+    assert tape["truth"].group("x").names == plain["truth"].group("x").names
+    assert not tape["truth"].values.flags.owndata  # mapped
+
+
+def test_disk_without_space_for_long_topic_is_one_sentence(recorded: RecordedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(columns, "IN_MEMORY", 1000)
+    monkeypatch.setattr(tempfile, "tempdir", "/nowhere")
+    with pytest.raises(ParameterError, match=r"^a temporary file: cannot be written \(.*\), expected space .*TMPDIR"):
+        read_run(Path(str(recorded.path)))

@@ -9,7 +9,7 @@ from contextlib import suppress
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
@@ -25,6 +25,7 @@ from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
 from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
+from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
@@ -52,8 +53,6 @@ LEAST_CLOCK_STEP_NS = NANOSECONDS  # a stamp is the less before the sending by t
 RESTING = ("u", "internals")  # topics whose stamps rest during a failsafe
 UNSTAMPED = ("route",)  # plans, which are often published without a stamp
 AIRCRAFT_TOPICS = ("y", "y_m", "u", "u_m", "internals", "truth")  # a namespace with one of these topics is that of an aircraft
-
-T = TypeVar("T", bound=np.generic)
 
 SCENARIO_NAME = re.compile(r"(?!metadata\.yaml)[\w-][\w .()-]{0,99}\.yaml")
 """Names under which the scenario of a log may be written beside it: not metadata.yaml, and no path to another folder."""
@@ -181,32 +180,6 @@ def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
     }
 
 
-class _Columns(Generic[T]):
-    """Samples as columns of a growing array: metrics and figures use whole channels, contiguous in memory."""
-
-    def __init__(self, first: NDArray[T], expected: int) -> None:
-        self.count = len(first)
-        self._array = np.empty((*first.shape[1:], max(expected, self.count)), first.dtype)
-        self._array[..., : self.count] = first.T
-
-    def append(self, rows: NDArray[T]) -> None:
-        end = self.count + len(rows)
-        if end > self._array.shape[-1]:
-            before = self._array
-            self._array = np.empty((*before.shape[:-1], end + end // 2), before.dtype)
-            self._array[..., : self.count] = before[..., : self.count]
-        self._array[..., self.count : end] = rows.T
-        self.count = end
-
-    def all(self) -> NDArray[T]:
-        return self._array[..., : self.count].T
-
-
-class _Collected(NamedTuple):
-    stamp_ns: _Columns[np.int64]
-    values: _Columns[np.float64]
-
-
 class _TopicSamples:
     """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
 
@@ -218,7 +191,7 @@ class _TopicSamples:
         self._number: int | None = None  # of the last message, by the publisher
         self._numbered, self._lost = False, 0
         self._unset = 0  # samples with a zero stamp, left out at the end
-        self._samples: dict[tuple[str, ...], _Collected] = {}  # by names
+        self._samples: dict[tuple[str, ...], Columns] = {}  # by names
         self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
@@ -252,12 +225,10 @@ class _TopicSamples:
                 first, last = int(stamp_ns.min()), int(stamp_ns.max())
                 before, after = self._spans.get(sender, (first, last))
                 self._spans[sender] = min(first, before), max(last, after)
-                if names in self._samples:
-                    self._samples[names].stamp_ns.append(stamp_ns)
-                    self._samples[names].values.append(values)
-                else:
+                if names not in self._samples:
                     expected = 0 if self._samples else self._expected  # other names are few, or those of a hostile log
-                    self._samples[names] = _Collected(_Columns(stamp_ns, expected), _Columns(values, expected))
+                    self._samples[names] = Columns(len(names), max(expected, len(values)))
+                self._samples[names].append(stamp_ns, values)
             else:
                 self._refused += len(stamp_ns)
 
@@ -277,18 +248,19 @@ class _TopicSamples:
         if not self._samples:
             return None
         names = self._names()
-        stamps, values = self._samples[names].stamp_ns.all(), self._samples[names].values.all()
+        signal = self._samples[names].signal(tuple(map(printable, names)))
+        stamps = signal.stamp_ns
         zero = stamps == 0
         zeros, least = int(np.count_nonzero(zero)), len(stamps) - 1 if name in RESTING else 1
         if name not in UNSTAMPED and zeros and (zeros > max(least, 1) or stamps.max() > SINCE_EPOCH_NS):
             self._unset = zeros
-            stamps, values = stamps[~zero], values[~zero]
-            if not len(stamps):
+            signal = signal.where(~zero)
+            if not len(signal.stamp_ns):
                 return None
-        if np.any(stamps[1:] < stamps[:-1]):
-            order = np.argsort(stamps, kind="stable")
-            stamps, values = stamps[order], values[order]
-        return Signal(stamps, tuple(map(printable, names)), values)
+        if np.any(signal.stamp_ns[1:] < signal.stamp_ns[:-1]):
+            order = np.argsort(signal.stamp_ns, kind="stable")
+            signal = Signal(signal.stamp_ns[order], signal.names, signal.values[order])
+        return signal
 
     def _names(self) -> tuple[str, ...]:
         """The names of the first sample, or of the majority of samples with further names beside."""
@@ -296,7 +268,7 @@ class _TopicSamples:
         return max((names for names in self._samples if set(first) <= set(names)), key=self._count)
 
     def _count(self, names: tuple[str, ...]) -> int:
-        return self._samples[names].stamp_ns.count
+        return self._samples[names].count
 
     def conflict(self, name: str) -> str:
         """The note on simultaneous publishers, of which the nodes accept the first; empty for successive publishers."""

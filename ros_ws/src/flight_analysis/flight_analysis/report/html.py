@@ -4,7 +4,7 @@
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ from flight_analysis.report.summary import (
     format_value,
     parts_legend,
 )
-from flight_core.files import write_file
+from flight_core.files import replacing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -77,13 +77,18 @@ class Page(NamedTuple):
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the page of a flight, or the comparison of several."""
     page = _flight_page(flights[0]) if len(flights) == 1 else _comparison_page(flights)
-    write_file(path, page_html(page))
+    _write(path, page)
+
+
+def _write(path: Path, page: Page) -> None:
+    with replacing(path) as stream:
+        stream.writelines(part.encode() for part in _parts(page))
 
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
     table = margins.margin_table(loop_assessment(loop))
-    write_file(path, page_html(Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore())))
+    _write(path, Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore()))
 
 
 def _flight_page(flight: RecordedFlight) -> Page:
@@ -221,11 +226,16 @@ def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) ->
 
 def page_html(page: Page) -> str:
     """The page as HTML, with plotly, the script and the samples inside."""
+    return "".join(_parts(page))
+
+
+def _parts(page: Page) -> Iterator[str]:
+    """The text of a page in parts: that of a long flight has some 100 MB."""
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters |= {"script_json": script_json, "ratio": format_ratio, "css": Markup}
-    return environment.get_template("page.html.jinja").render(
+    return environment.get_template("page.html.jinja").generate(
         page=page,
         completed=COMPLETED,
         dark=plotting.DARK | figures.DARK | comparison.DARK,

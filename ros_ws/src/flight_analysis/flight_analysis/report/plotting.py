@@ -10,7 +10,7 @@ long curve, since the page takes long to unpack the samples.
 import base64
 import zlib
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from hashlib import blake2b
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ from flight_core.vectors import FloatArray
 
 MAX_POINTS = 2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
+PACKERS = 2  # threads that pack: each holds a channel twice
 MAX_READ = 100_000  # samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
 MANTISSA = 16  # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4 digits of a hover
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
@@ -47,10 +48,9 @@ class SampleStore:
 
     def __init__(self) -> None:
         self._packed: dict[str, Future[str]] = {}
-        self._pool = ThreadPoolExecutor()  # compression leaves the interpreter to the other threads
-        self._instants: dict[
-            tuple[int, int, bool], tuple[Instants, NDArray[np.int64]]
-        ] = {}  # with the stamps, whose id they keep
+        self._pool = ThreadPoolExecutor(PACKERS)  # compression leaves the interpreter to the other threads
+        self._instants: dict[tuple[str, int, bool], Instants] = {}
+        self._digests: dict[int, tuple[str, NDArray[np.int64]]] = {}  # of stamps by their id, which the stamps keep
         self._times: dict[int, tuple[str, NDArray[np.int64]]] = {}
 
     @property
@@ -59,11 +59,13 @@ class SampleStore:
         return {name: packed.result() for name, packed in self._packed.items()}
 
     def instants(self, stamp_ns: NDArray[np.int64], start_ns: int, *, steps: bool) -> Instants:
-        """The instants of a curve, once for the channels of a signal. A step curve has no gaps."""
-        key = id(stamp_ns), start_ns, steps
+        """The instants of a curve, once for equal stamps. A step curve has no gaps."""
+        if id(stamp_ns) not in self._digests:
+            self._digests[id(stamp_ns)] = _digest(stamp_ns), stamp_ns
+        key = self._digests[id(stamp_ns)][0], start_ns, steps
         if key not in self._instants:
-            self._instants[key] = _instants(stamp_ns - start_ns, steps), stamp_ns
-        return self._instants[key][0]
+            self._instants[key] = _instants(stamp_ns - start_ns, steps)
+        return self._instants[key]
 
     def times(self, t_ns: NDArray[np.int64]) -> str:
         """Store instants as float64 steps in ns, the first from 0. Equal steps compress well."""
@@ -81,10 +83,15 @@ class SampleStore:
         return self._add("v", np.diff(bits + (1 << spare - 1) >> spare << spare, prepend=np.uint32(0)))
 
     def _add(self, kind: str, array: NDArray[Any]) -> str:
-        name = kind + blake2b(array.data, digest_size=8).hexdigest()
+        name = kind + _digest(array)
         if name not in self._packed:
+            wait([packed for packed in self._packed.values() if not packed.done()][: 1 - PACKERS])  # each holds its array
             self._packed[name] = self._pool.submit(pack, array, array.itemsize)
         return name
+
+
+def _digest(array: NDArray[Any]) -> str:
+    return blake2b(np.ascontiguousarray(array).data, digest_size=8).hexdigest()
 
 
 def pack(content: bytes | NDArray[Any], width: int = 1) -> str:

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of a topic as columns: a short topic in memory, a long one in a temporary file.
+
+Metrics and figures use whole channels, one after another. An hour of `truth` has 400 MB, and one of its channels 14 MB.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from tempfile import TemporaryFile
+from weakref import finalize
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.parameters import ParameterError
+from flight_core.tape import Signal
+from flight_core.vectors import FloatArray
+
+IN_MEMORY = 32_000_000
+"""Bytes of a topic in memory. 28 channels of `truth` at 500 Hz need more after 5 min."""
+
+
+class Columns:
+    """Samples in order of arrival: stamps, and rows of equal length that are read as columns, contiguous in memory.
+
+    `expected` samples are expected, more are taken. Raises ParameterError where no temporary file can hold a long topic.
+    """
+
+    def __init__(self, width: int, expected: int) -> None:
+        self.count, self._width = 0, width
+        self._stamp_ns, self._store = self._new(expected)
+
+    def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_Memory | _File"]:
+        kind = _File if 8 * self._width * capacity > IN_MEMORY else _Memory
+        return np.empty(capacity, np.int64), kind(self._width, capacity)
+
+    def append(self, stamp_ns: NDArray[np.int64], rows: FloatArray) -> None:
+        """Append samples: stamps (N,) and rows (N, k)."""
+        end = self.count + len(rows)
+        if end > len(self._stamp_ns):
+            stamps, store = self._stamp_ns, self._store
+            self._stamp_ns, self._store = self._new(end + end // 2)
+            self._stamp_ns[: self.count] = stamps[: self.count]
+            for index in range(self._width):
+                self._store.write(index, 0, store.read(index, index + 1, self.count)[:, 0])
+        self._stamp_ns[self.count : end] = stamp_ns
+        for index, column in enumerate(rows.T):
+            self._store.write(index, self.count, column)
+        self.count = end
+
+    def signal(self, names: tuple[str, ...]) -> Signal:
+        """The samples as a signal, in the order of arrival."""
+        stamp_ns = self._stamp_ns[: self.count]
+        if isinstance(self._store, _File):
+            return _StoredSignal(stamp_ns, names, self._store, 0)
+        return Signal(stamp_ns, names, self._store.read(0, self._width, self.count))
+
+
+class _Memory:
+    def __init__(self, width: int, capacity: int) -> None:
+        self._array = np.empty((width, capacity))
+
+    def write(self, index: int, start: int, values: FloatArray) -> None:
+        self._array[index, start : start + len(values)] = values
+
+    def read(self, first: int, end: int, count: int) -> FloatArray:
+        return self._array[first:end, :count].T
+
+
+class _File:
+    """Columns in a temporary file without a name, written past memory and mapped as long as an array of them is used."""
+
+    def __init__(self, width: int, capacity: int) -> None:
+        self._capacity, self._shape = capacity, (width, capacity)
+        with _on_disk():
+            self._file = TemporaryFile()  # noqa: SIM115 - open as long as a signal has it
+            finalize(self, self._file.close)
+            self._file.truncate(8 * width * capacity)
+
+    def write(self, index: int, start: int, values: FloatArray) -> None:
+        with _on_disk():
+            self._file.seek(8 * (index * self._capacity + start))
+            self._file.write(np.ascontiguousarray(values).data)
+
+    def read(self, first: int, end: int, count: int) -> FloatArray:
+        """Columns, (count, end - first)."""
+        with _on_disk():
+            self._file.flush()
+        if not self._capacity or first == end:
+            return np.empty((count, end - first))
+        return np.asarray(np.memmap(self._file, np.float64, "r", shape=self._shape))[first:end, :count].T
+
+
+@contextmanager
+def _on_disk() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        expected = "space for the samples of a long log: set TMPDIR to a folder with it"
+        raise ParameterError(f"a temporary file: cannot be written ({error.strerror}), expected {expected}") from None
+
+
+class _StoredSignal(Signal):
+    """A signal with values in a file, whose neighbouring columns from `first` on are its channels.
+
+    `values` maps the file each time: the memory is free once the caller drops the array. A caller in a loop keeps the array.
+    """
+
+    def __init__(self, stamp_ns: NDArray[np.int64], names: tuple[str, ...], store: _File, first: int) -> None:
+        for name, value in (("stamp_ns", stamp_ns), ("names", names), ("_store", store), ("_first", first)):
+            object.__setattr__(self, name, value)
+
+    _store: _File
+    _first: int
+
+    @property
+    def values(self) -> FloatArray:
+        return self._store.read(self._first, self._first + len(self.names), len(self.stamp_ns))
+
+    def until(self, end_ns: int) -> Signal:
+        count = int(np.searchsorted(self.stamp_ns, end_ns, side="right"))
+        return _StoredSignal(self.stamp_ns[:count], self.names, self._store, self._first)
+
+    def group(self, prefix: str) -> Signal:
+        names = [name for name in self.names if name.startswith(f"{prefix}.")]
+        first = self.names.index(names[0]) if names else 0
+        if tuple(names) != self.names[first : first + len(names)]:
+            return super().group(prefix)
+        return _StoredSignal(
+            self.stamp_ns, tuple(name.removeprefix(f"{prefix}.") for name in names), self._store, self._first + first
+        )
