@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
-from flight_analysis.report.account import Account, TopicAccount, account_of_json
+from flight_analysis.report.account import Account, Commands, ProcessAccount, TopicAccount, account_of_json
 from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
-from flight_analysis.report.summary import taken_over
+from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.processes import leave_outcome
 from flight_bringup.scenarios import find_scenario
@@ -30,8 +30,10 @@ from flight_cli.report import report
 from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_core.tape import Process
 from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
+from flight_log.flight_processes import flight_processes
 from flight_log.rosbag2_metadata import METADATA, bag_files
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
@@ -213,7 +215,9 @@ def test_flight_without_step_of_guidance_is_outcome(tmp_path: Path) -> None:
 
 def test_account_survives_summary(figures: dict[str, Any]) -> None:
     busy = "this host is too busy: 147 of 2001 y were never sent; see docs/faults.md"
-    of = Account(2.0, {}, ("y 1 of 2 samples",), busy, unguided=True)
+    processes = {"/controller#1": ProcessAccount(-1.5, 0.0, 2.0), "/recorder": ProcessAccount(-2.0, None, None)}
+    commands = Commands(3, 2, 1, 1)
+    of = Account(2.0, {}, ("y 1 of 2 samples",), busy, unguided=True, processes=processes, commands=commands)
     assert account_of_json(figures | {"account": json.loads(json.dumps(of.as_json()))}) == of
     assert account_of_json({"account": None}) is None
 
@@ -258,3 +262,23 @@ def test_rms_is_weighted_by_time() -> None:
 def test_equal_intervals_change_no_bit() -> None:
     e = np.random.default_rng(1).standard_normal(1001)
     assert error_metrics(e, sample_times(EPOCH + np.arange(1001) * 2_000_000)) == error_metrics(e)
+
+
+def test_process_has_ready_time_of_its_own_start() -> None:
+    """A controller that was killed and started again, of two aircraft, beside a recorder without samples."""
+    second = NANOSECONDS
+    ready = [("/recorder", 1), ("/one/controller", 2), ("/controller", 3 * second), ("/controller", 40 * second)]
+    spans = {"/controller#9": (10 * second, 30 * second), "/controller#4": (41 * second, 60 * second), "base_link": (0, 1)}
+    assert flight_processes(spans, ready, "") == {
+        "/controller#9": Process(3 * second, 10 * second, 30 * second),
+        "/controller#4": Process(40 * second, 41 * second, 60 * second),
+        "/recorder": Process(1, None, None),
+    }
+
+
+def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
+    """The first edge of the scenario is at 2.0 s, the end of the flight."""
+    edges = pulse_edges(find_scenario("osprey_gust"))
+    assert figures["account"]["commands"] == {"given": len(edges), "flown": 1, "targets": 0, "taken": 0}
+    assert command_results(figures) == f"1 of {len(edges)} commands flown"
+    assert figures["account"]["processes"] == {}  # of a flight in one process

@@ -22,6 +22,7 @@ from flight_analysis.report.summary import (
     Column,
     RecordedFlight,
     columns_of,
+    command_results,
     display_units,
     finite_or_null,
     format_seconds,
@@ -55,6 +56,8 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         console.print(_guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")))
         if legs := leg_results(summary["guidance"]["legs"]):
             console.print(legs, highlight=False, soft_wrap=True)
+    if commands := command_results(summary):
+        console.print(commands, highlight=False, soft_wrap=True)
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"] if note != busy)):
         console.print(line, highlight=False)

@@ -79,13 +79,21 @@ class Recording(NamedTuple):
     lost: int | None = None  # messages that are missing by the numbers of the publisher; None without numbers
 
 
+class Process(NamedTuple):
+    """A process of a flight. Stamps in ns; None: unknown, or without samples."""
+
+    ready_ns: int | None  # its event loop began
+    first_ns: int | None  # stamps of its first and last sample
+    last_ns: int | None
+
+
 @dataclass(frozen=True)
 class Tape:
     """A flight: signals by topic name.
 
     `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of `simulate`: `scenario`, and
-    `changes` of the controller's parameters in flight. Of a log: `recording` by topic, and `duration`, s, of a whole flight
-    where the log has it.
+    `changes` of the controller's parameters in flight. Of a log: `recording` by topic, `duration`, s, of a whole flight where
+    the log has it, and `processes` by name.
     """
 
     signals: Mapping[str, Signal]
@@ -96,6 +104,7 @@ class Tape:
     recording: Mapping[str, Recording] = field(default_factory=dict)
     duration: float | None = None
     changes: tuple[Mapping[str, Any], ...] = ()
+    processes: Mapping[str, Process] = field(default_factory=dict)
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""

@@ -4,7 +4,7 @@
 
 import re
 import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from operator import itemgetter
@@ -27,6 +27,7 @@ from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
+from flight_log.flight_processes import LOG, READY, ROSOUT, flight_processes, ready_times
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
 from flight_log.named_vectors import (
@@ -139,11 +140,25 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, told)]
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
-    tape = Tape(signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments))
+    processes = flight_processes(_spans(log.topics[topic] for topic in names), ready_times(log.lines), aircraft)
+    tape = Tape(
+        signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments),
+        processes={printable(name): process for name, process in processes.items()},
+    )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
     stored = given or log.scenario
     return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds)
+
+
+def _spans(topics: Iterable["_TopicSamples"]) -> dict[str, tuple[int, int]]:
+    """First and last stamp of each publisher over its topics."""
+    spans: dict[str, tuple[int, int]] = {}
+    for topic in topics:
+        for sender, (first, last) in topic.spans.items():
+            before, after = spans.get(sender, (first, last))
+            spans[sender] = min(first, before), max(last, after)
+    return spans
 
 
 def stored_scenario(path: Path) -> StoredFile:
@@ -192,7 +207,7 @@ class _TopicSamples:
         self._numbered, self._lost = False, 0
         self._unset = 0  # samples with a zero stamp, left out at the end
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self._spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
+        self.spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
         self._refused = 0
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
@@ -223,8 +238,8 @@ class _TopicSamples:
             if unordered.shape[1] == len(received):
                 names, values = self._ordered(received, unordered)
                 first, last = int(stamp_ns.min()), int(stamp_ns.max())
-                before, after = self._spans.get(sender, (first, last))
-                self._spans[sender] = min(first, before), max(last, after)
+                before, after = self.spans.get(sender, (first, last))
+                self.spans[sender] = min(first, before), max(last, after)
                 if names not in self._samples:
                     expected = 0 if self._samples else self._expected  # other names are few, or those of a hostile log
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
@@ -272,10 +287,10 @@ class _TopicSamples:
 
     def conflict(self, name: str) -> str:
         """The note on simultaneous publishers, of which the nodes accept the first; empty for successive publishers."""
-        spans = sorted(self._spans.items(), key=itemgetter(1))
+        spans = sorted(self.spans.items(), key=itemgetter(1))
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
             return ""
-        return f"{name}: samples of {', '.join(sorted(self._spans))}: the figures are of all, the nodes refuse all but one"
+        return f"{name}: samples of {', '.join(sorted(self.spans))}: the figures are of all, the nodes refuse all but one"
 
     def recording(self) -> Recording:
         """The stamps in the order of the recording; after `signal`."""
@@ -300,6 +315,7 @@ class _Log:
         self.last_ns = 0  # log time of the last message
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
+        self.lines: list[bytes] = []  # of /rosout: that a node is ready
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
@@ -320,6 +336,8 @@ class _Log:
             return take
         if samples is not None:
             return lambda batch: samples.add(batch.data, batch.log_ns, batch.sequence)
+        if topic == ROSOUT and type_name == LOG:
+            return lambda batch: self.lines.extend(line for line in map(bytes, batch.data) if READY in line)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(

@@ -5,6 +5,7 @@
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,23 @@ class TopicAccount(NamedTuple):
         return self.expected is None or count >= min(WHOLE * self.expected, max(self.expected - 1, 1))
 
 
+class ProcessAccount(NamedTuple):
+    """A process of the flight. Flight times in s; None: unknown, or without output."""
+
+    ready: float | None  # its event loop began
+    first: float | None  # stamps of its first and last output
+    last: float | None
+
+
+class Commands(NamedTuple):
+    """Commands of a flight, without the legs of a route."""
+
+    given: int  # edges of the scenario's pulses and of u_m
+    flown: int  # those that began before the end of the flight
+    targets: int  # messages of targets and routes in the log
+    taken: int  # steps of guidance with a new command: of a target, a route or a service
+
+
 class Account(NamedTuple):
     """What the log of a flight holds. `lacks` are the sentences on the parts that are missing, for the outcome."""
 
@@ -67,6 +85,8 @@ class Account(NamedTuple):
     unguided: bool = False  # the controller was engaged, and guidance took no step
     legs: tuple[FlownLeg, ...] = ()  # of the route, in order
     unflown: tuple[int, ...] = ()  # numbers of the legs that were ahead when the flight ended, in order
+    processes: Mapping[str, ProcessAccount] = {}
+    commands: Commands | None = None
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -87,7 +107,8 @@ class Account(NamedTuple):
         topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
         return {
             "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
-            "unflown": list(self.unflown),
+            "unflown": list(self.unflown), "processes": {name: of._asdict() for name, of in self.processes.items()},
+            "commands": None if self.commands is None else self.commands._asdict(),
         }  # fmt: skip
 
 
@@ -126,10 +147,7 @@ def flown(tape: Tape) -> Tape:
         end_ns = planned_ns
     elif min(others, default=end_ns) - end_ns > nanoseconds(SILENCE):
         return tape
-    return Tape(
-        {name: signal.until(end_ns) for name, signal in tape.signals.items()},
-        tape.start_ns, tape.notes, tape.outcome, tape.scenario, tape.recording, tape.duration,
-    )  # fmt: skip
+    return replace(tape, signals={name: signal.until(end_ns) for name, signal in tape.signals.items()})
 
 
 def _planned_ns(tape: Tape) -> int | None:
@@ -177,10 +195,25 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     legs = flown_legs(tape) if "guidance" in tape and len(tape["guidance"].stamp_ns) else []
     unflown = unflown_legs(tape, section) if legs and section is not None else ()
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
-    return Account(end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown))
+    return Account(
+        end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown), _processes(tape)
+    )  # fmt: skip
 
 
 RATED = ("y", "y_m", "u", "internals", "truth", "pose", "guidance", "u_m")  # topics with a rate of the scenario
+
+
+def _processes(tape: Tape) -> dict[str, ProcessAccount]:
+    """The processes in flight time. In lockstep the stamps are no times of day, and when a process was ready is not known."""
+
+    def flight_time(stamp_ns: int | None) -> float | None:
+        return None if stamp_ns is None else seconds(stamp_ns - tape.start_ns)
+
+    since_epoch = tape.start_ns > SINCE_EPOCH_NS
+    return {
+        name: ProcessAccount(flight_time(ready_ns) if since_epoch else None, flight_time(first_ns), flight_time(last_ns))
+        for name, (ready_ns, first_ns, last_ns) in tape.processes.items()
+    }
 
 
 def _too_busy(parts: Sequence[str]) -> str:
@@ -311,4 +344,7 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
     legs = tuple(FlownLeg(**leg) for leg in (summary["guidance"] or {}).get("legs", ()))
     unguided, unflown = content.get("unguided", False), tuple(content.get("unflown", ()))
-    return Account(content["end"], topics, tuple(content["lacks"]), content["busy"], unguided, legs, unflown)
+    processes = {name: ProcessAccount(**of) for name, of in content.get("processes", {}).items()}
+    commands = None if content.get("commands") is None else Commands(**content["commands"])
+    lacks = tuple(content["lacks"])
+    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands)

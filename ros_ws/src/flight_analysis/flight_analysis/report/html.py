@@ -20,6 +20,7 @@ from flight_analysis.report.replay import Replay, replay
 from flight_analysis.report.summary import (
     INPUT_COLUMNS,
     RecordedFlight,
+    command_results,
     display_units,
     finite_or_null,
     format_seconds,
@@ -97,7 +98,12 @@ def _flight_page(flight: RecordedFlight) -> Page:
     of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts))
     return Page(
         f"Flight {flight.name}",
-        [Line(f"{_description(flight)}.", flight.summary["outcome"])],
+        [
+            Line(
+                f"{'; '.join(filter(None, [_description(flight), command_results(flight.summary)]))}.",
+                flight.summary["outcome"],
+            )
+        ],
         [TableGroup([*of_flight, *([] if loop is None else [margins.margin_table(loop_assessment(loop))])])],
         [*_sections(flight, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,

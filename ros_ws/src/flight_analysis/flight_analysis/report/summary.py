@@ -30,7 +30,7 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
-from flight_analysis.report.account import Account, account, account_of_json, final_outcome
+from flight_analysis.report.account import Account, Commands, account, account_of_json, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.parameters import require
 from flight_core.rates import period_ns
@@ -133,8 +133,8 @@ def summarise(
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         require(topic in tape, "the log", f"no sample of {topic}{unset}", "a flight with y and y_m")
-    of = account(tape, scenario, outcome) if of is None else of
-    events = transients(scenario, tape)
+    of, events = account(tape, scenario, outcome) if of is None else of, transients(scenario, tape)
+    of = of._replace(commands=_commands(tape, events, of.end))
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS:  # in real time
@@ -155,6 +155,26 @@ def summarise(
         "notes": [*([of.busy] if of.busy else []), *tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
+    commands = [event.start for event in events if event.kind == "command"]
+    targets = sum(tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording)
+    guided = "guidance" in tape and "given" in tape["guidance"].names
+    taken = int(np.count_nonzero(tape["guidance"]["given"])) if guided else 0
+    return Commands(len(commands), sum(start <= end for start in commands), targets, taken)
+
+
+def command_results(summary: Mapping[str, Any]) -> str:
+    """The commands that the flight did not fly, and the targets: "8 of 24 commands flown"; empty without any."""
+    of = account_of_json(summary)
+    if of is None or of.commands is None:
+        return ""
+    given, flown, targets, taken = of.commands
+    parts = [f"{flown} of {given} commands flown"] if flown < given else []
+    if targets:
+        parts.append(f"{targets} targets and routes given, guidance took commands in {taken} steps")
+    return "; ".join(parts)
 
 
 BUSY = 0.05  # share of the ticks without a new y of a host that is too busy

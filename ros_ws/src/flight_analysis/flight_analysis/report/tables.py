@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
+from flight_analysis.report.account import account_of_json
 from flight_analysis.report.guided import BANDS, leg_results
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
@@ -104,6 +105,7 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
         Table("Events", times, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]),
         _guidance_table(summary),
         _tick_table(summary),
+        _process_table(summary),
     )
     return [table for table in tables if table.rows]
 
@@ -159,3 +161,11 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
         if latency is not None:
             rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
     return Table(f"Ticks of the controller{taken_over(summary, 'ticks')}", [Column("", "")], rows)
+
+
+def _process_table(summary: Mapping[str, Any]) -> Table:
+    of = account_of_json(summary)
+    processes = {} if of is None else of.processes
+    columns = [Column("", "ready (s)"), Column("output", "first (s)"), Column("output", "last (s)")]
+    rows = [[name, *("" if time is None else f"{time:.3f}" for time in process)] for name, process in processes.items()]
+    return Table("Processes", columns, rows)

@@ -1,0 +1,51 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The processes of a flight in a log: when each was ready, by its line on /rosout, and the span of its samples."""
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from rosbags.serde.errors import SerdeError
+
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Process
+from flight_log.named_vectors import typestore
+
+ROSOUT, LOG = "/rosout", "rcl_interfaces/msg/Log"
+READY = b"\x06\x00\x00\x00ready\x00"  # the text of the line in CDR: its length with the final zero, and its bytes
+INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
+
+
+def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
+    """Node and system time in ns of each line "ready" of a node of a flight, in order."""
+    times = []
+    for data in lines:
+        try:
+            line: Any = typestore().deserialize_cdr(data, LOG)
+        except SerdeError:
+            continue
+        if line.msg == "ready":
+            times.append((f"/{line.name.replace('.', '/')}", line.stamp.sec * NANOSECONDS + line.stamp.nanosec))
+    return sorted(times, key=lambda time: time[1])
+
+
+def flight_processes(
+    spans: Mapping[str, tuple[int, int]], ready: Iterable[tuple[str, int]], namespace: str
+) -> dict[str, Process]:
+    """The processes by name, "/controller#4711". `spans`: first and last stamp of the samples by publisher, ns.
+
+    A node that was restarted is several processes. A process was ready at the last such time of its node before its first
+    sample. A node without samples, as the recorder, has no process id.
+    """
+    waiting: dict[str, list[int]] = {}
+    for node, time_ns in ready:
+        if node.rpartition("/")[0] == namespace:
+            waiting.setdefault(node, []).append(time_ns)
+    processes = {}
+    for name, (first_ns, last_ns) in sorted(spans.items(), key=lambda span: span[1]):
+        if (instance := INSTANCE.fullmatch(name)) is not None:
+            before = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns <= first_ns + NANOSECONDS]
+            processes[name] = Process(before[-1] if before else None, first_ns, last_ns)
+            waiting[instance[1]] = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before]
+    return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}
