@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,14 @@ from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
 from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.processes import leave_outcome
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, written
 from flight_cli.cli import application
 from flight_cli.replay import replay
 from flight_cli.report import report
 from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Process
+from flight_core.tape import Process, Tape
 from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
 from flight_log.flight_processes import flight_processes
@@ -171,9 +172,25 @@ def test_outcome_that_launch_left_is_kept(tmp_path: Path) -> None:
     """A recorder that was killed, or `ros2 bag record`, took it into no log."""
     scenario = find_scenario("osprey_gust").vary(flight={"duration": 0.1})
     run = write_run(simulate(scenario), tmp_path / "run", LogAttachments(scenario.path)).parent
-    assert read_flight(run).summary["outcome"].startswith("unknown")
+    assert read_flight(run).summary["outcome"] == "ended early: the log holds y, y_m and u up to t = 0.100 of 60 s"
     leave_outcome(run, "controller-1 ended before the flight did")
     assert read_flight(run).summary["outcome"] == "controller-1 ended before the flight did"
+
+
+@pytest.mark.parametrize(
+    ("topics", "outcome"),
+    [
+        (TOPICS, "completed"),
+        (("y", "y_m", "truth"), "never flew: the controller never engaged"),
+    ],
+)
+def test_nodes_started_one_by_one_have_outcome_of_their_samples(
+    topics: tuple[str, ...], outcome: str, tape: Tape, tmp_path: Path
+) -> None:
+    """A recorder alone: the scenario in its log, no parameters of a flight, no outcome."""
+    path = written(find_scenario("osprey_gust", 2.0), tmp_path / "short.yaml").path
+    part = replace(tape, signals={topic: tape[topic] for topic in topics})
+    assert read_flight(write_run(part, tmp_path / "run", LogAttachments(path))).summary["outcome"] == outcome
 
 
 def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:

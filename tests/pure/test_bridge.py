@@ -4,6 +4,7 @@
 
 import signal
 import time
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
@@ -15,7 +16,7 @@ from tests.maps import MAP_FILES, named_map
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
-from flight_bringup.fly import _follow_real_time, _interrupt
+from flight_bringup.fly import _follow_real_time, _interrupt, _Span
 from flight_bringup.processes import handle_signals
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
@@ -658,34 +659,63 @@ def test_pose_has_fresh_channels_and_stamp_of_first_row() -> None:
     assert names == ("phi",)  # the others are 0.3 s old
 
 
+def followed(
+    processes: "FlightProcesses",
+    monitor: "FlightMonitor",
+    announce: Callable[[str], None] = lambda line: None,
+    engaged_for: float = np.inf,
+) -> str:
+    """The outcome of a flight of osprey_gust, 60 s, with an autopilot."""
+    scenario = find_scenario("osprey_gust")
+    span = _Span(scenario, processes, monitor, begins=False)
+    return _follow_real_time(scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span)
+
+
+@pytest.mark.parametrize(("until", "end"), [(60.0, 60.0), (59.0, 64.0), (None, 60.0)])
+def test_flight_with_autopilot_ends_once_log_holds_it(until: float | None, end: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """5 s after a log that stopped 1 s before the end. A log without u, of no engagement, is not waited for."""
+    now = [0.0]
+
+    def sleep(period: float) -> None:
+        now[0] += period
+
+    monkeypatch.setattr("flight_bringup.fly.time", SimpleNamespace(monotonic=lambda: now[0], sleep=sleep))
+
+    def recorded() -> float | None:
+        return None if until is None else 1000.0 + min(now[0], until)
+
+    processes = SimpleNamespace(started=0.0, start_time=1000.0, ended_early=lambda: None)
+    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=recorded)
+    assert followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor)) == "completed"
+    assert now[0] == pytest.approx(end, abs=0.1)
+
+
 def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:
     reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
     waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
     processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: None if waiting else "the end")
-    monitor = SimpleNamespace(engagement=lambda: [waiting.pop(0)], newest=lambda: None)
+    monitor = SimpleNamespace(engagement=lambda: [waiting.pop(0)], newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
-    assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, announced.append, np.inf) == "the end"
+    assert followed(*nodes, announce=announced.append) == "the end"
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
 
 
 def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
     processes = SimpleNamespace(started=time.monotonic() - 0.3, ended_early=lambda: None)
-    monitor = SimpleNamespace(engagement=list, newest=lambda: None)
+    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
-    scenario = find_scenario("osprey_gust")
-    outcome = _follow_real_time(scenario, *nodes, lambda t, text: None, lambda line: None, scenario.flight.duration - 0.2)
-    assert outcome == "not engaged within 0.2 s"
+    assert followed(*nodes, engaged_for=59.8) == "not engaged within 0.2 s"
 
 
 def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(["", "", "the end"])
     processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: next(calls) or None)
-    monitor = SimpleNamespace(engagement=list, newest=lambda: None)
+    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     later = time.time() + 3600.0
     monkeypatch.setattr(time, "time", lambda: later)
-    assert _follow_real_time(find_scenario("osprey_gust"), *nodes, lambda t, text: None, lambda line: None, np.inf) == "the end"
+    assert followed(*nodes) == "the end"
 
 
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:

@@ -375,9 +375,19 @@ def test_bridge_is_dry_run_by_default_and_topics_recorded(tmp_path: Path) -> Non
     follow = all_ready(*started("bridge", map=str(MAP_FILES["ardupilot_2024"]), scenario=slow, dry_run="false", runs=tmp_path))
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not every(TimerAction, follow)  # until Ctrl-C
-    follow = all_ready(*started("bridge", map="ardupilot", duration=5, runs=tmp_path))
+
+
+def test_flight_with_autopilot_ends_once_log_holds_it(tmp_path: Path) -> None:
+    actions, context = started("bridge", map="ardupilot", duration=1, runs=tmp_path)
+    follow = all_ready(actions, context)
     (timer,) = every(TimerAction, follow)
-    assert ends(timer.actions)
+    (end,) = every(OpaqueFunction, timer.actions)
+    assert ends(end.function(context) or [])  # a log without u
+    assert not flown_to(context, follow, time.time())
+    (wait,) = end.function(context) or []  # a log that grows
+    assert isinstance(wait, TimerAction)
+    assert ends(wait.actions)
+    assert not flown_to(context, follow, time.time() + 3600.0)  # stamps of a clock that is ahead
 
 
 def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -100,7 +100,7 @@ def fly_over_topics(
                 processes.outcome = _follow_lockstep(scenario, processes, monitor, progress)
             else:
                 begins = autopilot is None and scenario.controller.autostart and scenario.controller.start_active
-                span = _Span(scenario, processes, monitor) if begins else None
+                span = _Span(scenario, processes, monitor, begins=begins)
                 processes.outcome = _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
             return processes.outcome
     except KeyboardInterrupt:
@@ -110,22 +110,24 @@ def fly_over_topics(
 
 
 class _Span:
-    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u to the end."""
+    """Begin and end of a flight in real time: the aircraft takes u, and the log holds y, y_m and u to the end.
 
-    def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor") -> None:
+    A flight with an autopilot, or with a controller that a user activates, may fly without u: `begins` is False.
+    """
+
+    def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", *, begins: bool) -> None:
         self._duration, self._processes, self._monitor = scenario.flight.duration, processes, monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
-        self._moved = 0.0  # s, flight time of the last change
-        self._flies = False
+        self._moved = -math.inf  # s, flight time of the last change
+        self._flies = not begins
         self.engaged = False  # the controller has published
 
     def complete(self, t: float) -> bool:
         """Whether the log holds the flight, or is not going to."""
         if (stamp := self._monitor.recorded()) is not None and stamp - self._processes.start_time > self._until:
             self._until, self._moved = stamp - self._processes.start_time, t
-        return self._until >= self._duration - STAMP_ERROR or (
-            self._flies and t >= max(self._duration, self._moved + LOG_TIMEOUT)
-        )
+        held = self._until >= self._duration - STAMP_ERROR
+        return t >= self._duration and (held or (self._flies and t >= self._moved + LOG_TIMEOUT))
 
     def failed(self, t: float) -> str:
         """Why the flight has not begun; empty while it may begin, and from the first u on."""
@@ -145,19 +147,18 @@ def _follow_real_time(
     progress: Progress,
     announce: Callable[[str], None],
     engaged_for: float,
-    span: _Span | None = None,
+    span: _Span,
 ) -> str:
-    """Without a `span` the flight ends after the duration."""
     units, outputs = display_units(scenario), scenario.controller.outputs
     text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
     while True:
         t = time.monotonic() - processes.started
-        if t >= scenario.flight.duration if span is None else span.complete(t):
+        if span.complete(t):
             return COMPLETED
         if (reason := processes.ended_early()) is not None:
             return reason
-        if span is not None and (reason := span.failed(t)):
+        if reason := span.failed(t):
             return reason
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
@@ -174,8 +175,7 @@ def _follow_real_time(
             text = f"{phase}: {why}"
         elif (status := monitor.newest()) is not None:
             mode, values = status
-            if span is not None:
-                span.engaged = True
+            span.engaged = True
             errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
             text = f"{mode}  e: {', '.join(errors)}"
         progress(min(max(t, 0.0), scenario.flight.duration), text)

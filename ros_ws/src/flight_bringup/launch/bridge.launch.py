@@ -13,7 +13,7 @@ from pathlib import Path
 
 import yaml
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from autopilot_bridge.params import maps
@@ -32,8 +32,8 @@ from flight_bringup.graph import (
 from flight_bringup.launch.stages import (
     argument,
     boolean_argument,
-    complete,
     end_with_launch,
+    end_with_log,
     flight_node,
     namespace_argument,
     recorder_argument,
@@ -83,7 +83,8 @@ def _fly(context: LaunchContext) -> list[Action]:
         return flight_node(spec, scenario, overrides, run)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
-        end = [TimerAction(period=lead + scenario.flight.duration, actions=complete(run))] if duration else []
+        span = scenario.flight.duration
+        end = end_with_log(context, run, lead, start_time + span, span, by_rosbag2=recorder == "rosbag2") if duration else []
         return [*end, *(node(spec, start_time) for spec in second_stage(scenario, bridge=True))]
 
     page = watch_page(context, run) if recorded else []

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import yaml
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, OpaqueFunction, TimerAction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from flight_analysis.report.run_folder import new_run
@@ -32,6 +32,7 @@ from flight_bringup.launch.stages import (
     begin_when_matched,
     complete,
     end_with_launch,
+    end_with_log,
     flight_node,
     namespace_argument,
     on_state,
@@ -91,7 +92,7 @@ def _fly(context: LaunchContext) -> list[Action]:
         elif begins:
             end = begin_when_matched(context, run, (*first, *nodes), duration, by_rosbag2=by_rosbag2)
         else:  # a user activates the controller, or no user does
-            end = [TimerAction(period=lead + duration, actions=complete(run))]
+            end = end_with_log(context, run, lead, start_time + duration, duration, by_rosbag2=by_rosbag2)
         return [*end, *(node(spec, ON_START if begins else start_time) for spec in nodes)]
 
     first = (CONTROLLER,) if by_rosbag2 else FIRST_STAGE

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from aircraft_sim.jsbsim_aircraft import model_archive
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
-from flight_analysis.report.account import Account, account, flown
+from flight_analysis.report.account import Account, account, flown, outcome_of_log
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
 from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, read_file, write_file, writing
@@ -94,8 +94,8 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     folder, scenario = _folder(run), _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     log = replace(recorded.tape, signals=signals)
-    outcome = outcome or _previous_outcome(folder, recorded.tape.outcome)
     engagements = recorded.engagements
+    outcome = outcome or _previous_outcome(folder, recorded.tape, scenario, simulated=engagements is None)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
     tape, of = flown(log), account(log, scenario, outcome, simulated=engagements is None)
@@ -119,7 +119,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
         return None
     simulated = recorded.engagements is None
     folder = None if recorded.path is None else _folder(recorded.path)
-    outcome = recorded.tape.outcome if folder is None else _previous_outcome(folder, recorded.tape.outcome)
+    outcome = _previous_outcome(folder, recorded.tape, scenario, simulated=simulated)
     return account(recorded.tape, scenario, outcome, simulated=simulated)
 
 
@@ -207,14 +207,23 @@ def _folder(run: Path) -> Path:
     return run.resolve() if run.is_dir() else run.resolve().parent
 
 
-def _previous_outcome(folder: Path, of_log: str) -> str:
-    """The outcome in the summary of a run, else in the log, else that which a launch left for a recorder that took none."""
-    with suppress(OSError, ValueError, TypeError, KeyError):
-        return printable(str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"]))
-    with suppress(ParameterError):
-        if of_log == UNKNOWN and (left := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace")):
-            return bounded(left.strip())
-    return of_log if of_log != UNKNOWN else f"{UNKNOWN}: neither the run nor the log has one"
+def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
+    """The outcome in the summary of a run, else in the log, else that which a launch left for a recorder that took none.
+
+    Of nodes that were started one by one it is that of the samples in the log.
+    """
+    if folder is not None:
+        with suppress(OSError, ValueError, TypeError, KeyError):
+            before = printable(str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"]))
+            if not before.startswith(UNKNOWN):  # as of an earlier version
+                return before
+    if tape.outcome != UNKNOWN:
+        return tape.outcome
+    if folder is not None:
+        with suppress(ParameterError):
+            if left := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):
+                return bounded(left.strip())
+    return outcome_of_log(tape, scenario, simulated=simulated) or f"{UNKNOWN}: neither the run nor the log has one"
 
 
 def link_latest(run: Path) -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Start the nodes of a launch in stages: a stage waits for the `node_state` "ready" of the stage before."""
 
+import math
 import os
 import shlex
 import time
@@ -45,6 +46,7 @@ from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
 SHUTDOWN_DELAY = 0.05  # s
+UNHELD = "flight completed, and the log does not hold the end"
 
 
 class NodeStateEvent(Event):
@@ -237,11 +239,45 @@ def begin_when_matched(
         raise RuntimeError(f"{NEVER_FLEW}: {reason}")
 
     def give_up(context: LaunchContext) -> list[Action]:
-        return [] if context.is_shutdown else complete(run, "flight completed, and the log does not hold the end")
+        return [] if context.is_shutdown else complete(run, UNHELD)
+
+    return [
+        _complete_at(context, run, lambda stamp_ns: stamp_ns >= end_ns[0] > 0, by_rosbag2=by_rosbag2),
+        *(on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec)) for spec in nodes),
+        on_state(context, AIRCRAFT, NodeState.FLYING, fly),
+        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
+    ]
+
+
+def end_with_log(
+    context: LaunchContext, run: Path, lead: float, end_time: float, duration: float, *, by_rosbag2: bool
+) -> list[Action]:
+    """End a flight of `duration`, which began with `lead`, once the log holds y, y_m and u to the system time `end_time`, s.
+
+    A log without u, as of a bridge that is not engaged, ends it after the duration; one that has stopped, LOG_TIMEOUT later.
+    """
+    last = [-math.inf]  # monotonic time of the last change of the log, s
+
+    def held(stamp_ns: int) -> bool:
+        last[0] = time.monotonic()
+        return min(stamp_ns, time.time_ns()) >= nanoseconds(end_time)
+
+    def end(context: LaunchContext) -> list[Action]:
+        if context.is_shutdown:
+            return []
+        moves = time.monotonic() < last[0] + LOG_TIMEOUT
+        return [TimerAction(period=LOG_TIMEOUT, actions=complete(run, UNHELD))] if moves else complete(run)
+
+    timer = TimerAction(period=lead + duration, actions=[OpaqueFunction(function=end)])
+    return [timer, _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
+
+
+def _complete_at(context: LaunchContext, run: Path, held: Callable[[int], bool], *, by_rosbag2: bool) -> RegisterEventHandler:
+    """Complete the flight once the stamp up to which the log holds y, y_m and u satisfies `held`; with rosbag2 that of u."""
 
     def receive(message: Any) -> None:
         stamp = message.header.stamp if by_rosbag2 else message
-        if stamp.sec * NANOSECONDS + stamp.nanosec >= end_ns[0] > 0 and not context.is_shutdown:
+        if held(stamp.sec * NANOSECONDS + stamp.nanosec) and not context.is_shutdown:
             context.asyncio_loop.call_soon_threadsafe(context.emit_event_sync, FlownEvent())
 
     topic, qos = (U, NEWEST_SAMPLES) if by_rosbag2 else (RECORDED, LOCKSTEP)
@@ -251,12 +287,7 @@ def begin_when_matched(
         entities=[OpaqueFunction(function=lambda context: complete(run))],
         handle_once=True,
     )
-    return [
-        RegisterEventHandler(flown),
-        *(on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec)) for spec in nodes),
-        on_state(context, AIRCRAFT, NodeState.FLYING, fly),
-        TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
-    ]
+    return RegisterEventHandler(flown)
 
 
 def complete(run: Path, reason: str = "flight completed") -> list[Action]:
