@@ -32,7 +32,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance.path import route_outline
-from flight_guidance.route_file import Waypoint
+from flight_guidance.route_file import Origin, Waypoint
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock
 from flight_log.engagements import KEY_VALUE
@@ -40,6 +40,7 @@ from flight_log.named_vectors import typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS
 from flight_view import flight as followed_flight
 from flight_view import server as http
+from flight_view.background import read_background
 from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
@@ -322,6 +323,55 @@ def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
     assert [(event.kind, event.text) for event in flight.events] == [("route", "3 waypoints")]
     known = {"described": str(head_of["described"]), "epoch": head_of["epoch"]}
     assert "flight" not in decoded(answer(flight, known))[0]
+
+
+# The background of the map
+
+
+def geojson(path: Path, *geometries: dict[str, Any], **members: Any) -> Path:
+    path.write_text(json.dumps({"type": "GeometryCollection", "geometries": geometries} | members), encoding="utf-8")
+    return path
+
+
+LINE = {"type": "LineString", "coordinates": [[8.50, 47.40], [8.50, 47.41]]}
+
+
+def test_background_in_plane_of_flight(tmp_path: Path) -> None:
+    ring = [[8.50, 47.40], [8.51, 47.40], [8.51, 47.41], [8.50, 47.40]]
+    path = geojson(
+        tmp_path / "field.geojson",
+        LINE,
+        {"type": "Polygon", "coordinates": [ring]},
+        {"type": "MultiPoint", "coordinates": [[8.5, 47.4], [8.5, 47.41, 500.0]]},
+    )
+    line, polygon, *points = read_background(path, Origin(47.40, 8.50))
+    # A minute of arc of a meridian at 47.4 deg is 1853.1 m (WGS84), one of the parallel there 1258.1 m.
+    assert line == pytest.approx(np.array([[0.0, 0.0], [1111.8, 0.0]]), abs=0.3)
+    assert polygon[1] == pytest.approx((0.0, 754.9), abs=0.3)
+    assert (len(polygon), [len(point) for point in points]) == (4, [1, 1])
+    flight = Flight(tmp_path / "run", background=[line])
+    assert flight.description["background"] == [line]
+
+
+@pytest.mark.parametrize(
+    ("geometries", "members", "sentence"),
+    [
+        ([LINE], {"crs": {"properties": {"name": "EPSG:2056"}}}, "the coordinate system 'EPSG:2056', expected WGS84"),
+        ([{"type": "Circle", "coordinates": []}], {}, "a geometry of the type 'Circle', expected one of Point"),
+        ([], {}, "no position, expected lines, polygons or points"),
+        ([{"type": "Point", "coordinates": [47.4, 8.5]}], {}, "latitude and longitude exchanged"),
+    ],
+)
+def test_background_that_is_no_map_refused(
+    geometries: list[dict[str, Any]], members: dict[str, Any], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        read_background(geojson(tmp_path / "file.geojson", *geometries, **members), Origin(47.40, 8.50))
+
+
+def test_background_needs_origin(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="--origin: found none"):
+        read_background(geojson(tmp_path / "file.geojson", LINE), None)
 
 
 # The server

@@ -508,9 +508,9 @@ POSE = ("phi", "theta", "psi", "north", "east", "altitude", "v_north", "v_east",
 
 
 def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -> None:
-    names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude")
+    names = ("mode", "mode.lateral", "mode.vertical", "leg", "xtrack", "to_go", "phi_c", "theta_c", "target.altitude", "y.V")
     stamps = np.arange(200, dtype=np.int64) * 20_000_000
-    guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0], (200, 1)))
+    guidance = Signal(stamps, names, np.tile([1.0, 4.0, 2.0, 3.0, -2.5, 100.0, 0.1, 0.0, 30.0, 0.0], (200, 1)))
     pose = np.tile([0.1, 0.02, 0.0, 0.0, 0.0, 30.0, 25.0, 0.0, 0.0], (200, 1))
     pose[:, POSE.index("north")] = 25.0 * stamps / 1e9
     pose[:, POSE.index("altitude")] += np.sin(stamps / 1e9)
@@ -519,8 +519,32 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
     write_run(Tape(flown), tmp_path / "other", LogAttachments(find_scenario("osprey_servo").path))
     with shown(browser, tmp_path / "run"):
         readouts = browser.run("document.getElementById('readouts').innerText")
-        for text in ("ENGAGED", "ROUTE", "ALTITUDE", "-2.5 m", "30.0 m"):
+        for text in ("ENGAGED", "ROUTE, ALTITUDE", "3: 100 m, 0:04", "-2.5 m", "30.0 m"):  # 100 m at 25 m/s
             assert text in readouts
+        assert browser.run("document.querySelector('[data-camera=map]').ariaPressed") == "true"  # a guided flight shows its map
+        browser.run(SAID)
+        set_camera(browser, "map")
+        said = set(browser.run("said"))
+        assert {
+            "N",
+            "H",
+            "0",
+            "2",
+            "3",
+            "4",
+            "6",
+            "7",
+            "500 m",
+            "V (m/s)",
+            "altitude (m)",
+            "25.0",
+            "30",
+            "000",
+        } <= said  # 3: the timeline
+        browser.run("void (units.value = 'ft, kt', units.dispatchEvent(new Event('change')))")
+        browser.wait_for("['V (kt)', '48.6', '98'].every(text => said.includes(text))")  # 25 m/s and 30 m
+        assert "98.4 ft" in browser.run("document.getElementById('readouts').innerText")
+        browser.run("void (units.value = 'm, m/s', units.dispatchEvent(new Event('change')))")
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
         assert titles == ["phi over its command", "theta over its command", "cross-track", "altitude"]
         for colour in ("--plant", "--reference"):  # the altitude, and its command

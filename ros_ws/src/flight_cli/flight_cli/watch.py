@@ -13,11 +13,13 @@ import typer
 
 from flight_bringup.processes import end_with_parent
 from flight_cli.log_options import LogScenario, scenario_file
+from flight_cli.route_options import parse_origin
 from flight_cli.target import RemovedKeyFile
 from flight_core.environment import require_ros_environment
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
 from flight_log.tape_reader import StoredFile, stored_scenario
+from flight_view.background import Line, read_background
 from flight_view.flight import Flight
 from flight_view.text import show
 from flight_view.watch import DEFAULT_PORT, newest_run, require_log, serve
@@ -48,6 +50,10 @@ def watch(
         str | None,
         typer.Option(help="Namespace of the aircraft: by default the first in the log, with --control the root."),
     ] = None,
+    background: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="GeoJSON of lines, polygons and points for the map, with --origin.")
+    ] = None,
+    origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for --background.")] = None,
     _: RemovedKeyFile = None,
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
@@ -61,6 +67,8 @@ def watch(
     for folder in chosen:
         if not wait:
             require_log(folder, namespace)
+    require(background is None or not (text or foxglove), "--background", "--text or --foxglove beside it", "the page")
+    lines = [] if background is None else read_background(background, parse_origin(origin))
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
         require(ghost is None, "--text", "two runs", "one run")
@@ -70,9 +78,9 @@ def watch(
         require(ghost is None and not (control or control_real), "--foxglove", "a ghost or --control beside it", "RUN alone")
         _serve_foxglove(chosen[0], port)
     elif control or control_real:
-        _serve_with_control(chosen, ports, namespace or "", given, real=control_real)
+        _serve_with_control(chosen, ports, namespace or "", given, lines, real=control_real)
     else:
-        serve(chosen, ports, _announce, None, namespace, given)
+        serve(chosen, ports, _announce, None, namespace, given, lines)
 
 
 def _announce(line: str) -> None:
@@ -90,7 +98,13 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
 
 
 def _serve_with_control(
-    runs: Sequence[Path], ports: Sequence[int], namespace: str, scenario: StoredFile | None, *, real: bool
+    runs: Sequence[Path],
+    ports: Sequence[int],
+    namespace: str,
+    scenario: StoredFile | None,
+    background: Sequence[Line],
+    *,
+    real: bool,
 ) -> None:
     from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
@@ -107,7 +121,7 @@ def _serve_with_control(
 
         _announce(f"control key: {key}")
         try:
-            serve(runs, ports, _announce, control, namespace or None, scenario)
+            serve(runs, ports, _announce, control, namespace or None, scenario, background)
         finally:
             for opened in controls:
                 opened.close()

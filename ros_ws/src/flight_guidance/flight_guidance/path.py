@@ -250,6 +250,27 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
     return points
 
 
+def lengths_after(route: Route) -> list[float]:
+    """Length of the legs after each leg, m, without the last orbit, which has no end."""
+    lengths, point = [], route.start(0)[0]
+    for leg in route.legs[:-1]:
+        points = outline(leg, leg.start if isinstance(leg, Line) else point)
+        lengths.append(sum(map(math.dist, points, points[1:])))
+        point = points[-1]
+    return [sum(lengths[number + 1 :]) for number in range(len(route.legs))]
+
+
+def leg_places(route: Route) -> dict[int, Point]:
+    """Where the number of a leg is drawn: the middle of a line, the centre of a circle; the fillets have none."""
+    places: dict[int, Point] = {}
+    for number, leg in enumerate(route.legs):
+        if isinstance(leg, Line):
+            places[number] = along(leg.start, leg.end, 0.5)
+        elif is_orbit(leg):
+            places[number] = leg.centre
+    return places
+
+
 def distance_from(legs: Sequence[Leg], point: Point) -> float:
     """Distance of a point from the lines, the fillets and the endless orbit of a route, m."""
     distances = []

@@ -202,6 +202,18 @@ def read_fence_file(
     return sections
 
 
+def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
+    """The lines, rings and points of a GeoJSON in the plane at the origin, north and east, m.
+
+    Raises ParameterError for unreadable content, no position, a coordinate system other than WGS84 and a position out of range.
+    """
+    lines = [line for line in route_formats.read_lines(content, key) if line]
+    require(bool(lines), key, "no position", "lines, polygons or points")
+    _require_order([place for line in lines for place in line], origin)
+    flat = [[place._replace(key=key, altitude=0.0) for place in line] for line in lines]
+    return [[_placed(place, origin, _Heights()).point for place in line] for line in flat]
+
+
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     """The waypoints without those within a distance in m of the line between the rest.
 

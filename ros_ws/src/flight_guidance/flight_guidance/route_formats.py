@@ -150,6 +150,24 @@ def _read_json(content: bytes, key: str) -> Places:
     return _one_route(key, geometries, others)
 
 
+def read_lines(content: bytes, key: str) -> list[list[Place]]:
+    """The lines, rings and points of a GeoJSON, in the order of the file. Raises ParameterError as `read`."""
+    tree = _parsed_json(content, key)
+    _require_wgs84(tree, key)
+    lines: list[list[Place]] = []
+    for node, _ in _nodes(tree):
+        kind, coordinates = _member(node, "type"), _member(node, "coordinates")
+        if node is None:
+            continue
+        known = isinstance(kind, str) and kind in GEOJSON
+        require(known, key, f"a geometry of the type {short_repr(kind)}", f"one of {', '.join(GEOJSON)}")
+        parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
+        if kind == "MultiPoint":
+            parts = [[position] for part in parts for position in part]
+        lines += [[_lon_lat(position) for position in part] for part in parts]
+    return lines
+
+
 def _ring(rings: list[Any]) -> list[list[Any]]:
     """The outer ring of a Polygon, whose only line is a route; every ring of a Polygon with holes."""
     return [ring for ring in rings if isinstance(ring, list)]

@@ -18,6 +18,7 @@ from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_scenario_sections
 from flight_analysis.metrics import settling_bands
+from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.run_folder import log_account
 from flight_analysis.report.summary import display_units, pulse_edges
 from flight_core.modes import Mode
@@ -27,7 +28,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.text import printable
 from flight_guidance import modes as guidance
 from flight_guidance.odometry import ROUTE_FRAMES
-from flight_guidance.path import route_outline
+from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
 from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
@@ -36,6 +37,7 @@ from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
+from flight_view.background import Line
 from flight_view.series import Series
 
 RATE = 50.0  # Hz
@@ -58,6 +60,7 @@ GROUPS = {
         "theta_c",
         "climb_c",
         "V_c",
+        "y",
         "limited",
         "target",
         "wind",
@@ -98,7 +101,8 @@ class _Topic:
 class Flight:
     """A flight in a log. `update` reads new messages.
 
-    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the scenario in the log.
+    `namespace` selects an aircraft, by default the first in the log. `scenario` replaces the scenario in the log. `background`:
+    lines of the map, of `background.read_background`.
     """
 
     def __init__(
@@ -107,6 +111,7 @@ class Flight:
         now: Callable[[], float] = time.monotonic,
         namespace: str | None = None,
         scenario: StoredFile | None = None,
+        background: Sequence[Line] = (),
     ) -> None:
         self.run = run
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
@@ -117,6 +122,7 @@ class Flight:
         self.description: dict[str, Any] = {
             "name": self.name,
             "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
+            "background": background,
         }
         self.notes: list[str] = []
         self.described = 0  # counts the changes of `description`
@@ -382,7 +388,7 @@ class Flight:
         if guided is None or not self._takes_routes:
             return
         try:
-            self.description["route"] = route_outline(guided.plan(waypoints))
+            self.description |= _mission(guided, waypoints)
         except ParameterError:
             return  # guidance says so in the log
         self.described += 1
@@ -433,5 +439,15 @@ def _described(scenario: Scenario) -> dict[str, Any]:
         "limits": {name: [bound if math.isfinite(bound) else None for bound in pair] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
-        "route": route_outline(guided.plan(waypoints)) if guided is not None and waypoints else [],
+        "speed": scenario.aircraft.channels().speed,
+        **({"route": []} if guided is None else _mission(guided, waypoints)),
     }
+
+
+def _mission(guided: GuidanceConfig, waypoints: Sequence[Waypoint]) -> dict[str, Any]:
+    """What the map shows of guidance with a route, `mission_drawing` and the waypoints: north, east, altitude, m.
+
+    Raises ParameterError for a route that cannot be flown.
+    """
+    drawing = mission_drawing(guided, [guided.plan(waypoints)] if waypoints else [])
+    return drawing | {"waypoints": [[*waypoint.point, waypoint.altitude] for waypoint in waypoints]}

@@ -18,6 +18,7 @@ from flight_log.named_vectors import JOINT_STATE, full_name
 from flight_log.open_log import log_files, log_topics
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import A_FLIGHT, StoredFile, chosen_namespace, listed
+from flight_view.background import Line
 from flight_view.control import Control
 from flight_view.flight import RATES, Flight
 from flight_view.server import ADDRESS, Server
@@ -57,15 +58,16 @@ def serve(
     control: Callable[[Flight], Control] | None = None,
     namespace: str | None = None,
     scenario: StoredFile | None = None,
+    background: Sequence[Line] = (),
 ) -> None:
     """Serve a run, and a second run as a ghost, on the first free port, until SIGINT or SIGTERM.
 
-    `announce` gets two lines for the user. `control` lets the page command the first flight. `namespace` and `scenario` as in
-    `Flight`.
+    `announce` gets two lines for the user. `control` lets the page command the first flight. `namespace`, `scenario` and
+    `background` as in `Flight`.
 
     Raises ParameterError where no port is free, or a log is unreadable.
     """
-    flights = [Flight(run, namespace=namespace, scenario=scenario) for run in runs]
+    flights = [Flight(run, namespace=namespace, scenario=scenario, background=background) for run in runs]
     asyncio.run(_serve(flights, ports, announce, control))
 
 

@@ -17,6 +17,7 @@ from flight_guidance.guidance import WIND
 from flight_guidance.modes import LATERAL, TARGETS, Lateral, Vertical, bits
 from flight_guidance.notices import LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.path import Route, leg_places, lengths_after, route_outline
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),
@@ -133,6 +134,23 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     replaced = last + 1 < len(log.stamp_ns) and int(log["given"][last + 1]) & bits(LATERAL) and not lost
     route = None if replaced else known_routes(tape, section).get(int(log["route"][last]))
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
+
+
+def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
+    """What a map shows of a mission, ready for JSON, in m.
+
+    `route` and `legs` of the routes, points of the line and [number, north, east]; `to_end`, the lengths after each leg of the
+    last route up to its last orbit; `fence` and `home` as in the section.
+    """
+    legs = [[number, *place] for route in routes for number, place in leg_places(route).items()]
+    fence = [zone.model_dump() for zone in section.fence.values()]
+    return {
+        "route": [point for route in routes for point in route_outline(route)],
+        "legs": legs,
+        "to_end": lengths_after(routes[-1]) if routes else [],
+        "fence": fence,
+        "home": [section.home.north, section.home.east],
+    }
 
 
 def leg_results(legs: Sequence[Mapping[str, Any]]) -> str:

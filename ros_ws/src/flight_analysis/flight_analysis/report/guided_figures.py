@@ -28,7 +28,7 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence import Fence
 from flight_guidance.modes import Lateral, Mode, Vertical
-from flight_guidance.path import Line, Point, Route, along, is_orbit, route_outline
+from flight_guidance.path import Route, leg_places, route_outline
 from flight_guidance.wind import wind_of
 
 TRACK_POINTS = 2400
@@ -96,13 +96,7 @@ def _add_labels(figure: Figure, trace: dict[str, Any]) -> None:
 
 
 def _add_numbers(figure: Figure, route: Route) -> None:
-    """The number of a leg at the middle of a line, and at the centre of a circle."""
-    places: dict[int, Point] = {}
-    for number, leg in enumerate(route.legs):
-        if isinstance(leg, Line):
-            places[number] = along(leg.start, leg.end, 0.5)
-        elif is_orbit(leg):
-            places[number] = leg.centre
+    places = leg_places(route)
     north, east = (np.array(values) for values in zip(*places.values(), strict=True))
     _add_labels(figure, {"x": east, "y": north, "text": [f"{number}" for number in places], "mode": "text", "name": "legs"})
 

@@ -44,7 +44,7 @@ async function replay() {
   Object.assign(slider, {min: begin, max: end, step: "any"});
   slider.addEventListener("input", () => { playing = false; t = Number(slider.value); ask(); });
   play.addEventListener("click", () => { playing = !playing; if (playing && t >= end) t = begin; before = performance.now(); ask(); });
-  for (const one of cameras) one.addEventListener("click", () => { scene.show(one.dataset.camera, flight, t); ask(); });
+  for (const one of cameras) one.addEventListener("click", () => { scene.show(one.dataset.camera); ask(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { colours = {}; ask(); });
   addEventListener("resize", ask, {passive: true});
   ask();

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.guided_figures import flown_routes
 from flight_analysis.report.plotting import PlotContext, pack, stored
 from flight_analysis.report.summary import NO_UNIT, RecordedFlight
 from flight_core.modes import Mode
 from flight_core.tape import Signal
-from flight_guidance.path import route_outline
 
 HERE = Path(__file__).parent
 SCENE = HERE / "scene"
-SCRIPTS = (SCENE / "canvas.js", SCENE / "series.js", SCENE / "scene.js", HERE / "replay.js")
+SCRIPTS = (*(SCENE / f"{name}.js" for name in ("canvas", "series", "units", "map", "scene")), HERE / "replay.js")
 
 POSE = ("phi", "theta", "psi", "north", "east", "altitude")
 POSE_RATE = 10.0  # Hz; the page interpolates
@@ -51,7 +51,7 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
         "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
         "positive": flight.scenario.aircraft.channels().positive,
         "modes": {int(mode): mode.name for mode in Mode},
-        "route": [point for route in routes for point in route_outline(route)],
+        **({} if (section := flight.scenario.guidance) is None else mission_drawing(section, routes)),
     }
     return Replay({"topics": topics, "info": info}, pack(_code().encode()), (SCENE / "scene.css").read_text(encoding="utf-8"))
 

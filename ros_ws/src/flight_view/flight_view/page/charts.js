@@ -1,5 +1,6 @@
 // Charts over time on canvases: lines decimated to the minimum and maximum of each pixel, bands, limits, one cursor.
 import {MODE_COLOURS, prepared} from "./canvas.js";
+import {ON_ROUTE} from "./scene.js";
 import {indexAt} from "./series.js";
 
 const LEFT = 58, RIGHT = 10, TOP = 17, BOTTOM = 4;
@@ -251,6 +252,7 @@ export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
     ctx.fillStyle = kind === "error" ? colour("--bad") : kind === "warning" ? colour("--warn") : colour("--ink");
     ctx.fillRect(x(t) - 0.75, 1, 1.5, 7);
   }
+  drawLegs(ctx, flight, [from, to], x, strip, colour);
   ctx.strokeStyle = colour("--ink");
   ctx.lineWidth = 1;
   ctx.strokeRect(x(Math.max(view[0], from)), 3.5, x(Math.min(view[1], to)) - x(Math.max(view[0], from)), strip + 1);
@@ -262,6 +264,26 @@ export function drawTimeline(canvas, flight, [from, to], view, cursor, colour) {
   for (const {value, text} of ticks(from, to, Math.max(width / 90, 2))) {
     ctx.textAlign = x(value) < 12 ? "left" : x(value) > width - 12 ? "right" : "center";
     ctx.fillText(`${text} s`, x(value), height - 4);
+  }
+}
+
+function drawLegs(ctx, flight, [from, to], x, strip, colour) { // where a leg of the route begins, with its number where there is room
+  const series = flight.get("guidance"), [legs, lateral] = ["leg", "mode.lateral"].map(name => series?.column(name));
+  if (!legs || !lateral) return;
+  ctx.fillStyle = colour("--ink");
+  ctx.font = "10px system-ui, sans-serif";
+  ctx.textAlign = "left";
+  ctx.textBaseline = "alphabetic";
+  let before = -1, free = -Infinity;
+  for (let k = 0; k < series.count; k++) {
+    const leg = lateral[k] === ON_ROUTE ? legs[k] : -1, place = x(series.t[k]);
+    if (leg === before) continue;
+    before = leg;
+    if (series.t[k] < from || series.t[k] > to || leg < 0) continue;
+    ctx.fillRect(place, 4 + strip / 2, 1, strip / 2);
+    if (place < free) continue;
+    ctx.fillText(`${leg}`, place + 3, 4 + strip - 2);
+    free = place + 6 + ctx.measureText(`${leg}`).width;
   }
 }
 

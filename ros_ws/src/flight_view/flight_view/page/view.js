@@ -5,12 +5,15 @@ import {offer} from "./control.js";
 import {Flight} from "./data.js";
 import {drawHorizon, poseAt, Scene} from "./scene.js";
 import {indexAt} from "./series.js";
+import {drawHeading, drawTape} from "./tapes.js";
+import {distanceText, shownAs, UNITS, windText} from "./units.js";
 
 const SPEEDS = [0.1, 0.2, 0.5, 1, 2, 5, 10];
 const WINDOW = 20; // s
 const SILENT = 1000; // ms without a sample after which a recording says "no data"
 const RETRY = 500; // ms between two requests to a server that does not answer
-const GUIDED = [["mode", "guidance"], ["mode.lateral", "lateral"], ["mode.vertical", "vertical"], ["leg", "leg"], ["xtrack", "cross-track"], ["to_go", "to go"]];
+const HEADINGS = {HEADING: "target.heading", COURSE: "target.course"}; // what the heading tape shows as the command
+const SPANS = {speed: 0.5, height: 200}; // of the tapes: of the airspeed itself, and of the altitude, m
 const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
 
 const ASKED = parseFloat(new URLSearchParams(location.hash.slice(1)).get("t")); // s, of an address that ends with #t=12.5
@@ -22,6 +25,7 @@ const clock = {t: 0, playing: false, speed: 1, live: true, started: false};
 const view = {kind: "window", from: 0, to: WINDOW};
 const link = {serving: false, refusal: "", samples: 0}; // the server answers; why it refuses; when, in ms, the last answer with samples came
 const scene = new Scene($("scene"), redraw);
+let cameraChosen = false; // by the user; until then a guided flight shows its map
 
 // ---- Colours of the scheme
 
@@ -62,6 +66,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
   const recording = ["recording", "no data"].includes(flight.head.state);
   if (!clock.started && flight.end > -Infinity) {
     clock.started = flight.head.state !== "reading";
+    if (!cameraChosen && flight.get("guidance") && flight.get("pose")?.column("north")) scene.show("map");
     clock.live = recording;
     view.kind = recording ? "window" : "whole";
     if (!recording) seek(Number.isFinite(ASKED) ? ASKED : begin());
@@ -135,13 +140,20 @@ function setSpeed(index) {
   redraw();
 }
 
+function setUnits(name) {
+  scene.units = UNITS[name] ?? UNITS["m, m/s"];
+  localStorage.setItem("units", name);
+  redraw();
+}
+
 function setView(kind) {
   view.kind = kind;
   redraw();
 }
 
 function setCamera(mode) {
-  scene.show(mode, flight, clock.t);
+  cameraChosen = true;
+  scene.show(mode);
   redraw();
 }
 
@@ -231,23 +243,49 @@ function list(node, lines) {
   return true;
 }
 
+const airspeed = () => { // V0 and V of y, m/s; NaN where V0 is not known
+  const V = flight.get("internals")?.at("y.V", clock.t) ?? NaN, y = Number.isFinite(V) ? V : flight.get("guidance")?.at("y.V", clock.t) ?? flight.get("y")?.at("V", clock.t) ?? NaN;
+  return (flight.info.speed ?? NaN) + y;
+};
+
+const named = (channel, guidance) => flight.info.modes[channel]?.[guidance?.at(channel, clock.t)];
+
+function minutes(seconds) { // as in 2:05
+  return Number.isFinite(seconds) ? `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}` : "-";
+}
+
+function drawTapes(pose) { // airspeed and altitude over the commands of guidance, and the heading
+  const {units} = scene, guidance = flight.get("guidance"), command = name => guidance?.at(name, clock.t) ?? NaN, degrees = 180 / Math.PI;
+  const speed = airspeed(), holdsAltitude = ["ALTITUDE", "PROFILE"].includes(named("mode.vertical", guidance));
+  const tape = ({unit, factor}, value, wanted, span) => ({unit, value: value * factor, command: wanted * factor, span: span * factor});
+  const hasSpeed = Number.isFinite(flight.info.speed ?? NaN);
+  $("airspeed").hidden = !hasSpeed;
+  if (hasSpeed) drawTape($("airspeed"), {name: "V", right: true, ...tape(units.speed, speed, command("V_c"), SPANS.speed * flight.info.speed)}, colour);
+  drawTape($("altitude"), {name: "altitude", right: false, ...tape(units.height, pose?.altitude ?? NaN, holdsAltitude ? command("target.altitude") : NaN, SPANS.height)}, colour);
+  const heading = pose?.row >= 0 ? pose.psi * degrees : NaN, wanted = command(HEADINGS[named("mode.lateral", guidance)]) * degrees;
+  drawHeading($("heading"), heading, wanted, colour);
+}
+
 function drawReadouts() {
-  const pose = poseAt(flight, clock.t), degrees = 180 / Math.PI, guidance = flight.get("guidance");
-  const shown = (value, digits, unit) => (Number.isFinite(value) ? `${value.toFixed(digits)} ${unit}` : "-");
+  const pose = poseAt(flight, clock.t), degrees = 180 / Math.PI, guidance = flight.get("guidance"), {units} = scene;
   const heading = pose?.row >= 0 && Number.isFinite(pose.psi) ? `${String((Math.round(pose.psi * degrees) + 360) % 360).padStart(3, "0")} deg` : "-";
+  const angle = value => shownAs({unit: "deg", factor: degrees}, value, 1);
   const values = {
-    heading, roll: shown(pose?.phi * degrees, 1, "deg"), pitch: shown(pose?.theta * degrees, 1, "deg"), altitude: shown(pose?.altitude, 1, "m"),
-    "ground speed": shown(pose?.speed, 1, "m/s"), climb: shown(pose?.climb, 1, "m/s"),
+    heading, roll: angle(pose?.phi), pitch: angle(pose?.theta), altitude: shownAs(units.height, pose?.altitude, 1),
+    "ground speed": shownAs(units.speed, pose?.speed, 1), climb: shownAs(units.climb, pose?.climb, units.climb.factor > 10 ? 0 : 1),
   };
-  for (const [name, label] of guidance ? GUIDED : []) {
-    const value = guidance.at(name, clock.t);
-    values[label] = flight.info.modes[name]?.[value] ?? shown(value, name === "leg" ? 0 : 1, name === "leg" ? "" : "m");
+  if (guidance) {
+    values.guidance = named("mode", guidance) ?? "-";
+    values.holds = ["mode.lateral", "mode.vertical"].map(name => named(name, guidance) ?? "-").join(", ");
+    const at = name => guidance.at(name, clock.t), leg = at("leg"), after = flight.info.to_end?.[leg];
+    const last = leg + 1 >= (flight.info.to_end?.length ?? Infinity); // the last orbit has no end
+    const toGo = distance => `${distanceText(units, distance)}, ${minutes(distance / Math.max(pose?.speed, 1))}`;
+    values.leg = !Number.isFinite(leg) ? "-" : last || !Number.isFinite(at("to_go")) ? leg.toFixed(0) : `${leg}: ${toGo(at("to_go"))}`;
+    values["cross-track"] = shownAs(units.near, at("xtrack"), 1);
+    values["route to go"] = last || after === undefined ? "-" : toGo(at("to_go") + after);
   }
   const toNorth = guidance?.at("wind.north", clock.t), toEast = guidance?.at("wind.east", clock.t);
-  if (Number.isFinite(toNorth) && Number.isFinite(toEast)) { // as a pilot reads a wind: where the air comes from
-    const from = String((Math.round(Math.atan2(-toEast, -toNorth) * degrees) + 360) % 360).padStart(3, "0");
-    values.wind = `${Math.hypot(toNorth, toEast).toFixed(1)} m/s from ${from} deg`;
-  }
+  if (Number.isFinite(toNorth) && Number.isFinite(toEast)) values.wind = windText(units, toNorth, toEast);
   const node = $("readouts"), names = Object.keys(values);
   if (node.children.length !== 2 * names.length) {
     node.replaceChildren(...names.flatMap(name => [Object.assign(document.createElement("dt"), {textContent: name}), document.createElement("dd")]));
@@ -288,6 +326,7 @@ function frame(now) {
     scene.draw(flight, ghost, clock.t, colour);
     drawState();
     drawHorizon($("horizon"), poseAt(flight, clock.t), colour);
+    drawTapes(poseAt(flight, clock.t));
     const shown = currentView();
     for (const chart of charts) {
       const {top, bottom} = chart.canvas.getBoundingClientRect();
@@ -314,6 +353,10 @@ function start() {
     ["previous", () => jump(-1)], ["next", () => jump(1)], ["live", live], ["window", () => setView("window")], ["whole", () => setView("whole")]]) {
     $(id).addEventListener("click", action);
   }
+  const kept = localStorage.getItem("units");
+  $("units").append(...Object.keys(UNITS).map(name => new Option(name, name, false, name === kept)));
+  $("units").addEventListener("change", () => setUnits($("units").value));
+  if (kept in UNITS) setUnits(kept);
   $("cameras").addEventListener("click", ({target}) => { if (target.dataset.camera) setCamera(target.dataset.camera); });
   addEventListener("keydown", event => {
     const action = ACTIONS[event.key];

@@ -1,17 +1,19 @@
 // The aircraft in three dimensions on a 2-D canvas, and the artificial horizon. No WebGL.
 // World: north, east, down (m). Body: forward, right, down. Angles in rad; matrices are rows.
 import {MODE_COLOURS, prepared} from "./canvas.js";
+import {drawGround, drawMarks, drawMission, extentOf, mapped, mapSpan} from "./map.js";
 import {indexAt} from "./series.js";
+import {UNITS} from "./units.js";
 
 const SPAN = 3; // m, least drawn span
 const RELATIVE_SPAN = 0.13; // of the distance of the camera: the aircraft stays visible from afar
 const NEAR = 0.2; // m, nothing closer to the camera is drawn
 const FULL_DEFLECTION = 25 * Math.PI / 180; // rad, of an input that is given as a fraction
 const REVERSED = ["nose down", "roll left", "nose left"]; // motions by a positive input that are opposite to those of `aircraft`
-const WHOLE = 2.3; // distance of the map over that of the farthest point of the path
 const MAX_TRAIL = 1500; // points
 const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
 const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
+export const ON_ROUTE = 4; // flight_guidance.modes.Lateral.ROUTE
 const MAX_WIND = 10; // m/s, drawn as one span
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -114,10 +116,21 @@ export class Scene {
     this.distance = 16; // m, of the camera
     this.azimuth = 0.6; // rad, orbit
     this.elevation = 0.35;
+    this.map = null; // of the map: centre, m, and px a metre; null shows everything
+    this.shownMap = null; // as drawn last
+    this.units = UNITS["m, m/s"];
     let held = null;
     canvas.addEventListener("pointerdown", event => { held = [event.clientX, event.clientY]; canvas.setPointerCapture(event.pointerId); });
     canvas.addEventListener("pointermove", event => {
       if (!held) return;
+      if (this.mode === "map" && this.shownMap) {
+        const {centre, scale} = this.shownMap;
+        this.map = {centre: [centre[0] + (event.clientY - held[1]) / scale, centre[1] - (event.clientX - held[0]) / scale], scale};
+        this.shownMap = this.map; // further moves may come before the next picture
+        held = [event.clientX, event.clientY];
+        changed();
+        return;
+      }
       if (this.mode === "chase") this.mode = "orbit";
       this.azimuth -= (event.clientX - held[0]) * 0.008;
       this.elevation = Math.max(-1.5, Math.min(1.5, this.elevation + (event.clientY - held[1]) * 0.008));
@@ -132,20 +145,21 @@ export class Scene {
     }, {passive: false});
   }
 
-  show(mode, flight, t) { // the map shows the whole path
-    const pose = flight.get("pose"), north = pose?.column("north"), east = pose?.column("east"), at = poseAt(flight, t);
+  show(mode) { // the map shows everything
     this.mode = mode;
     this.distance = 16;
-    if (mode !== "map" || !north || !at) return;
-    for (let k = 0; k < pose.count; k += 25) this.distance = Math.max(this.distance, Math.hypot(north[k] - at.place[0], east[k] - at.place[1]) * WHOLE);
+    this.map = null;
   }
 
   zoom(factor) {
+    if (this.mode === "map" && this.shownMap) {
+      this.map = this.shownMap = {...this.shownMap, scale: Math.max(1e-4, Math.min(20, this.shownMap.scale / factor))};
+      return;
+    }
     this.distance = Math.max(3, Math.min(1e5, this.distance * factor));
   }
 
   eye({place, psi}) {
-    if (this.mode === "map") return camera(plus(place, [0, 0, -this.distance * 1.5]), [0, 0, 1], [0, 1, 0]);
     const azimuth = this.mode === "chase" ? psi : this.azimuth, elevation = this.mode === "chase" ? 0.28 : this.elevation;
     const ahead = [Math.cos(elevation) * Math.cos(azimuth), Math.cos(elevation) * Math.sin(azimuth), Math.sin(elevation)];
     return camera(plus(place, ahead, -this.distance), ahead);
@@ -160,15 +174,23 @@ export class Scene {
       this.say(ctx, width, height, flight.get("pose")?.count ? "NO POSE YET" : "NO POSE IN THE LOG", colour);
       return;
     }
-    const eye = this.eye(pose), see = point => project(eye, point, focal, width, height);
-    this.grid(ctx, see, pose, flight, colour);
+    const map = this.mode === "map", eye = map ? null : this.eye(pose);
+    if (map) this.shownMap = this.map ?? extentOf(flight, width, height);
+    const see = map ? mapped(this.shownMap, width, height) : point => project(eye, point, focal, width, height);
+    if (map) {
+      this.legend = "";
+      drawGround(ctx, see, this.shownMap, flight.info, colour);
+    } else this.grid(ctx, see, pose, flight, colour);
     this.route(ctx, see, flight, pose, colour);
     if (ghost) this.trail(ctx, see, ghost, ghost.end, () => colour("--ghost"), 0.6);
     this.trail(ctx, see, flight, t, mode => MODE_COLOURS[mode] ?? colour("--plant"), 1);
     const other = ghost && poseAt(ghost, t);
-    if (other) this.aircraft(ctx, see, eye, other, deflections(ghost, t), colour, 0.35);
-    this.aircraft(ctx, see, eye, pose, deflections(flight, t), colour, 1);
-    this.wind(ctx, see, flight, pose, t, colour);
+    if (other) this.aircraft(ctx, see, other, deflections(ghost, t), colour, 0.35);
+    const guidance = flight.get("guidance"), winds = ["wind.north", "wind.east"].map(name => guidance?.at(name, t) ?? NaN);
+    if (map) drawMission(ctx, see, flight.info, guidance?.at("mode.lateral", t) === ON_ROUTE ? guidance.at("leg", t) : -1, this.units, colour);
+    this.aircraft(ctx, see, pose, deflections(flight, t), colour, 1);
+    if (map) drawMarks(ctx, width, height, this.shownMap, winds.every(Number.isFinite) ? winds : null, this.units, colour);
+    else this.wind(ctx, see, flight, pose, t, colour);
     if (!pose.attitude) this.say(ctx, width, height, "NO ATTITUDE IN THE LOG", colour);
   }
 
@@ -180,6 +202,7 @@ export class Scene {
   }
 
   get span() {
+    if (this.mode === "map" && this.shownMap) return mapSpan(this.shownMap);
     return Math.max(SPAN, RELATIVE_SPAN * this.distance);
   }
 
@@ -255,7 +278,7 @@ export class Scene {
     if (before) ctx.stroke();
   }
 
-  aircraft(ctx, see, eye, pose, surfaces, colour, alpha) {
+  aircraft(ctx, see, pose, surfaces, colour, alpha) {
     if (!pose.attitude) {
       const at = see(pose.place);
       if (at) {

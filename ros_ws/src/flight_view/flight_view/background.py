@@ -1,0 +1,29 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The background of the map: lines and points of a GeoJSON of the user, in the plane of the flight."""
+
+from pathlib import Path
+
+from flight_core.files import read_file
+from flight_core.parameters import ParameterError, require
+from flight_guidance.path import Point
+from flight_guidance.route_file import Origin, placed_lines
+
+Line = list[Point]  # north, east, m; a single point is a mark
+
+MAX_POINTS = 20_000
+"""Positions of a background: the page draws each of them in each picture."""
+
+
+def read_background(path: Path, origin: Origin | None) -> list[Line]:
+    """The lines of a GeoJSON, each ring of a polygon among them.
+
+    Raises ParameterError for an unreadable file, a coordinate system other than WGS84, a geometry of another type, no origin,
+    and more than MAX_POINTS positions.
+    """
+    if origin is None:
+        raise ParameterError("--origin: found none, expected the latitude and longitude where north and east are 0")
+    lines = placed_lines(read_file(path, str(path), "a GeoJSON"), str(path), origin)
+    count = sum(map(len, lines))
+    require(count <= MAX_POINTS, str(path), f"{count} positions", f"at most {MAX_POINTS}: ogr2ogr -simplify leaves some out")
+    return lines
