@@ -287,7 +287,7 @@ def test_new_gains_transfer_without_a_bump(state: LawState, k: float, Lambda: fl
 
 
 def logged(state: ControllerState, inputs: guard.TickInputs, limits: Limits, *others: Any) -> dict[str, float]:
-    values = internals.values(state, inputs, limits, *others)
+    values = internals.values(state, inputs, PARAMS.guard()._replace(limits=limits), *others)
     return dict(zip(internals.names(PARAMS.logged_groups()), values, strict=True))
 
 

@@ -46,7 +46,10 @@ BAD = {
     ),
     ("step: 0.002", "step: 0.003"): "aircraft.step: found 0.003 s, expected a whole fraction of 1 / rate (0.002 s)",
     ("airframe: osprey", "airframe: ospray"): "aircraft.airframe: found 'ospray', expected one of",
-    ("[q, p, r, V]", "[q, p, r, W]"): "controller.outputs: found q, p, r, W, expected the channels of the airframe osprey",
+    (
+        "[q, p, r, V]",
+        "[q, p, r, W]",
+    ): "controller.outputs: found q, p, r, W, expected some of the outputs of the airframe",
     ("rudder, thrust]", "rudder, flaps]"): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
     ("sign: auto", "sign: smooth"): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
     ("vertical: {start", "upward: {start"): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",

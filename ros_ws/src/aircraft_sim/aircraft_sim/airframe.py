@@ -3,7 +3,7 @@
 """Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -83,10 +83,11 @@ class Airframe(Config):
         for key, columns in (("A", n), ("B", m)):
             shape = [len(row) for row in getattr(self, key)]
             require(shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}")
-        require(len(self.outputs) == m, "outputs", f"{len(self.outputs)} of them", f"{m}, as many as inputs")
+        fewer = f"{m} or fewer, as many as inputs or fewer"
+        require(0 < len(self.outputs) <= m, "outputs", f"{len(self.outputs)} of them", fewer)
         for key, unit in (*self._units(), *((f"output_units.{name}", unit) for name, unit in self.output_units.items())):
             quantity(unit, key)
-        self._check_outputs(n, m)
+        self._check_outputs(n, len(self.outputs))
         named = {} if self.C else {f"outputs[{i}]": name for i, name in enumerate(self.outputs)}
         named |= {f"gravity[{i}].into": term.into for i, term in enumerate(self.gravity)}
         named |= {f"gravity[{i}].angle": term.angle for i, term in enumerate(self.gravity)}
@@ -137,7 +138,7 @@ class Airframe(Config):
         return matrix * unit[:, None] / unit[None, :]
 
     def matrix_b(self) -> FloatArray:
-        """B, shape (n, m), SI: B_ij unit_i / unit_j."""
+        """B, shape (n, p), SI: B_ij unit_i / unit_j."""
         row, column = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
         matrix: FloatArray = np.array(self.B)
         return matrix * row[:, None] / column[None, :]
@@ -179,6 +180,13 @@ class Airframe(Config):
         return self.validate_mapping(
             self.model_dump() | values | {"gusts": gusts, "identities": False}, f"airframe {self.name}"
         )
+
+    def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
+        """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order; physics unchecked."""
+        B = self.matrix_b() @ T / _si(self.states.values())[:, None]
+        given = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
+        values = {"inputs": given, "B": B.tolist(), "identities": False}
+        return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def matrix_gusts(self) -> FloatArray:
         """Change of x_dot for 1 m/s of wind along the axes of `gusts`, shape (n, G)."""

@@ -103,22 +103,28 @@ class LatencyMetrics(NamedTuple):
 
 
 def tracking_error(tape: Tape) -> Signal:
-    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of y.
+    """Measured error e = y - y_m at every y inside the time range of y_m, shape (N, m), channels of y that y_m has.
 
     y_m is interpolated linearly. The law sees this error with the sensors' noise.
     """
-    return _minus_reference(tape["y"], tape["y_m"])
+    names = _controlled(tape)
+    return _minus_reference(Signal(tape["y"].stamp_ns, names, _columns(tape["y"], names)), tape["y_m"])
+
+
+def _controlled(tape: Tape) -> tuple[str, ...]:
+    """The channels of y that y_m has: y may have more."""
+    return tuple(name for name in tape["y"].names if name in tape["y_m"].names)
 
 
 def true_error(tape: Tape) -> Signal | None:
-    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m), channels of y.
+    """True error C x - y_m at every sample of `truth` inside the time range of y_m, shape (N, m), channels as above.
 
-    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output" for every channel of y, as in
-    a simulation.
+    Errors of the sensors are excluded, lost samples included. None unless `truth` has "x.output" for every channel, as in a
+    simulation.
     """
     if "truth" not in tape:
         return None
-    truth, names = tape["truth"], tape["y"].names
+    truth, names = tape["truth"], _controlled(tape)
     states = [f"x.{name}" for name in names]
     if not set(states) <= set(truth.names):
         return None

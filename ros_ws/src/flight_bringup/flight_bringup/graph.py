@@ -104,9 +104,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     controller, key = scenario.controller, f"scenario {scenario.name}: controller"
     found = controller.on_deactivate
     require(found == "trim", f"{key}.on_deactivate", repr(found), "'trim' with a bridge, which engages only from a u near trim")
-    lowest, highest = ([sign * float("inf")] * len(controller.inputs) for sign in (-1.0, 1.0))
-    lower, upper = controller.lower or lowest, controller.upper or highest
-    for name, low, high in zip(controller.inputs, lower, upper, strict=True):
+    limits = controller.effector_limits()
+    for name, low, high in zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True):
         if (row := channel_map.inputs.get(name)) is None:
             continue  # another check names the channels that differ
         of_map = f"of {name} in the map {channel_map.name}: what the bridge clips, the law's anti-windup does not know"

@@ -30,7 +30,7 @@ from rise_di.gain_design import check_gains, select_gains
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "phase_margin")
+PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "phase_margin", "mixing")
 """Options of which `select_gains` says what is wrong, beside those of the loop."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
@@ -77,6 +77,9 @@ def gains(
     theorem: Annotated[
         bool, typer.Option("--theorem", help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.")
     ] = False,
+    mixing: Annotated[
+        str, typer.Option(help="diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B.")
+    ] = "diagonal",
     accept: Annotated[
         bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
     ] = False,
@@ -128,6 +131,7 @@ def gains(
                 margin=margin,
                 phase_margin=phase_margin,
                 accept=accept,
+                mixing=mixing,
             )
             engineering, origin = selection.engineering, selection.origin
             answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}

@@ -429,7 +429,8 @@ def _described(scenario: Scenario) -> dict[str, Any]:
     Raises ParameterError where the airframe cannot be read.
     """
     controller, guided = scenario.controller, scenario.guidance
-    bounds = zip(controller.inputs, controller.lower or (), controller.upper or (), strict=False)
+    limits = controller.effector_limits()
+    bounds = zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True)
     waypoints = () if guided is None else guided.waypoints()
     return {
         "scenario": controller.summary(),

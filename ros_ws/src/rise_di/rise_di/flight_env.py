@@ -47,9 +47,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._uncertainty = None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
         controller, channels = scenario.controller, scenario.aircraft.channels()
         require(not (scenario.aircraft.is_jsbsim and uncertainty), "uncertainty", uncertainty, "0: JSBSim has no A and B")
-        self.outputs, self.inputs = controller.outputs, controller.inputs
+        self.outputs, self.inputs = controller.outputs, controller.effectors
         self._units = score_units(self.outputs, channels.outputs)
-        limits = controller.guard().limits
+        limits = controller.effector_limits()
         low, high = (
             np.where(np.isfinite(limit), limit, sign * UNLIMITED) for limit, sign in ((limits.lower, -1), (limits.upper, 1))
         )

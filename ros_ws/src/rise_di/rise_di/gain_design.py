@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.closed_loop.margins import through_allocation
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design import gain_selection
+from flight_analysis.design.effectors import LAW_INPUT, Effectors, design_allocation
 from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import gains_by_rule, gains_of_search, model_for, with_aircraft_observer
@@ -25,6 +27,7 @@ from rise_di_controller.rise_di import RiseDiConfig
 
 OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
 """Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
+DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
@@ -49,6 +52,7 @@ def select_gains(
     margin: float = 0.03,
     phase_margin: float = PHASE_MARGIN,
     accept: bool = False,
+    mixing: str = DIAGONAL,
 ) -> Selection:
     """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
 
@@ -74,12 +78,18 @@ def select_gains(
         phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a sensitivity of at most 2 and
             a damping of 0.4; 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
+        mixing: "diagonal": an input an output; "full": the law has inputs v of its own, an allocation u = T v by the
+            pseudo-inverse of the airframe's C B distributes them. More inputs than outputs always have an allocation.
 
     Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
     """
     chosen, frame = find_scenario(scenario), load_airframe(airframe)
     chosen.rise_di()
-    setting = _with_limits(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame)._replace(
+    require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
+    loop = _with_limits(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame)
+    if mixing == FULL or len(frame.inputs) > len(frame.outputs):
+        loop, frame = _allocated(loop, chosen, frame)
+    setting = loop._replace(
         inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
         feedforward=feedforward,
@@ -87,7 +97,7 @@ def select_gains(
     )
     require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
-    known_model = frame if model is None else load_airframe(model)
+    known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
     selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
     if not observer:
         return selection
@@ -109,7 +119,8 @@ def check_gains(
 
     Raises ParameterError.
     """
-    chosen, frame = find_scenario(scenario), load_airframe(airframe)
+    chosen = find_scenario(scenario)
+    frame = through_allocation(load_airframe(airframe), chosen.controller)
     gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
     return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)
 
@@ -167,6 +178,51 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
             own = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
             limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(own, loop.base.inputs, strict=True))
     return loop._replace(base=loop.base.model_copy(update=limits))
+
+
+def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tuple[LoopSetting, Airframe]:
+    """The loop and the airframe that the law sees through an allocation by the airframe's own C B.
+
+    Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops of the airframe's actuators.
+    """
+    actuators, names = scenario.aircraft.actuators, list(airframe.inputs)
+    own = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
+    stops = own and actuators.lower and actuators.upper
+    require(bool(stops), "scenario", scenario.name, f"a scenario of {airframe.name} with aircraft.actuators, lower and upper")
+    given = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True)) | dict(loop.lag)
+    rate = np.array(actuators.rate or [np.inf] * len(names))
+    lag = np.array([given[name] for name in names])
+    effectors = Effectors(np.array(actuators.lower), np.array(actuators.upper), rate, lag)
+    earlier = loop.base.allocation
+    kept = () if earlier is None or earlier.priority is None else [name.removeprefix(LAW_INPUT) for name in earlier.priority]
+    allocation, law = design_allocation(airframe, effectors, kept)
+    m, slew = len(law.names), dict(zip(law.names, law.slew.tolist(), strict=True))
+    base = {
+        "outputs": airframe.outputs,
+        "inputs": law.names,
+        "allocation": allocation.model_dump(),
+        "lower": law.lower.tolist(),
+        "upper": law.upper.tolist(),
+        "slew": None,
+        "D": [1] * m,
+        "lag": law.lag.tolist(),
+        "k_d": [1.0] * (m - 1),
+        **dict.fromkeys(("Lambda", "beta", "omega", "input_scale"), [1.0] * m),
+        "softening": 1.0,
+        "feedforward": None,
+        "observer": None,
+        "learn": None,
+        "schedule": None,
+    }
+    T = np.reshape(allocation.T, (len(names), m))
+    return (
+        loop._replace(
+            base=RiseDiConfig.validate_mapping(scenario.rise_di().model_dump() | base, "controller"),
+            lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
+            rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
+        ),
+        airframe.through(T, law.names),
+    )
 
 
 def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:

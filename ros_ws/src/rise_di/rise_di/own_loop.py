@@ -48,7 +48,7 @@ class Loop:
             controller = AnyLaw.validate_mapping(controller, "controller")
         self.config = controller
         self._controller = Controller(self.config)
-        self.outputs, self.inputs = self.config.outputs, self.config.inputs
+        self.outputs, self.inputs = self.config.outputs, self.config.effectors
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
         self.output: ControlOutput | None = None  # of the last tick; None where nothing is to be sent
@@ -64,10 +64,11 @@ class Loop:
         return self._controller.names
 
     def step(self, t: float, y: ArrayLike | None, y_m: ArrayLike | None) -> FloatArray:
-        """A tick at t in s: u of (22), shape (m,), SI, deviation from trim, in the order of `inputs`; 0 before the engagement.
+        """A tick at t in s: u, shape (m,), SI, deviation from trim, in the order of `inputs`; 0 before the engagement.
 
-        y and y_m, shape (m,), SI, deviations from trim, belong to t and have the order of `outputs`; None is a lost sample.
-        t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
+        With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations from trim, belong to t and
+        have the order of `outputs`; None is a lost sample. t may jitter; it never goes back. The failsafe of the guard starts
+        where samples are older than `max_age`.
         Raises ParameterError for a t that goes back, for a wrong length and for a value that is not finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
@@ -78,7 +79,7 @@ class Loop:
             if value is not None:
                 take(StampedVector(now_ns, self.vector(value, key)), now_ns)
         self.output = self._controller.tick(now_ns)
-        return self._controller.state.u.copy()
+        return self._controller.state.command.copy()
 
     def retune(self, controller: ControllerConfig) -> None:
         """Replace the parameters before the next tick, without a jump of u. Raises ParameterError as `Controller.retune`."""
@@ -148,7 +149,8 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     import control  # noqa: PLC0415 - an extra
 
     config = Loop(controller).config
-    require(config.feedforward is None, "controller.feedforward", "a model", "none: as_control has the law alone")
+    for key, section in (("feedforward", config.feedforward), ("allocation", config.allocation)):
+        require(section is None, f"controller.{key}", "a section", "none: as_control has the law alone")
     dt, (law, params), m = 1.0 / config.rate, config.tuned_law(), len(config.outputs)
     measured, names = [f"y_{name}" for name in config.outputs], [f"u_{name}" for name in config.inputs]
     if linear:

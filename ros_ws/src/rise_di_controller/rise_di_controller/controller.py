@@ -21,7 +21,7 @@ class ControlOutput(NamedTuple):
     """Output of a tick."""
 
     stamp_ns: int  # of y, the source of u
-    u: FloatArray  # (m,) in the order of the parameters' inputs
+    u: FloatArray  # (p,) in the order of the parameters' effectors
     inputs: guard.TickInputs
     log: Callable[[], FloatArray]
 
@@ -37,7 +37,7 @@ class Controller:
     def __init__(self, parameters: ControllerConfig) -> None:
         as_controller(parameters, "parameters")
         self._law, self._guard = parameters.tuned_law(), parameters.guard()
-        self._state = guard.initial_state(len(parameters.inputs))
+        self._state = guard.initial_state(len(parameters.inputs), self._guard.allocation)
         self.names = internals.names(parameters.logged_groups())
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
@@ -127,9 +127,9 @@ class Controller:
         self._number += self.has_internals
         self._errors = divergence.step(self._errors, inputs.y - inputs.y_m, inputs.dt, first_law=self._first_law)
         age = seconds(now_ns - inputs.stamp_ns)
-        limits, digest = self._guard.limits, self._digest
+        limits, digest = self._guard, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
-        return ControlOutput(inputs.stamp_ns, self._state.u, inputs, log)
+        return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:
         """Instants of further ticks before the tick at `now_ns`, where the last tick is longer ago than the age limit.

@@ -3,6 +3,7 @@
 """Guard of the control law: saturation, engagement, retuning and failsafe. Pure, like the law; for every control law.
 
 - Saturation: magnitude and rate limits of u (`saturation.saturate`). Anti-windup is part of the law (`ControlLaw.limited`).
+- Allocation: u to more effectors than the law has inputs, inside the limits of the effectors (`allocation.allocate`).
 - Watchdog: an input older than `max_age` is stale (`tick`).
 - Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
 - Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first engagement.
@@ -18,6 +19,7 @@ from flight_core.modes import Mode
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray, StampedVector
 from rise_di_controller import feedforward, observer
+from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
@@ -43,6 +45,7 @@ class GuardParams(NamedTuple):
     limits: Limits
     nominal: Nominal | None = None  # None: no feedforward
     history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
+    allocation: Allocation | None = None  # None: the inputs of the law are the effectors
 
 
 # The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full: with half of the ticks
@@ -68,6 +71,13 @@ class ControllerState(NamedTuple):
     hold_ns: int = 0  # times of the present failsafe: new parameters count from the next failsafe on, so that u does not jump
     ramp_ns: int = 0
     history: tuple[PastTick, ...] = ()
+    effectors: FloatArray | None = None  # (p,) commanded, with an allocation; u is the input of the law that they give
+    effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
+
+    @property
+    def command(self) -> FloatArray:
+        """What is published: the effectors, or u without an allocation."""
+        return self.u if self.effectors is None else self.effectors
 
 
 class TickInputs(NamedTuple):
@@ -80,10 +90,11 @@ class TickInputs(NamedTuple):
     dt: float  # step of the law, s; 0 without a step
 
 
-def initial_state(m: int) -> ControllerState:
+def initial_state(m: int, allocation: Allocation | None = None) -> ControllerState:
     """The state before the first sample: u = 0."""
     zero = np.zeros(m)
-    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero)
+    effectors = None if allocation is None else np.zeros(len(allocation.T))
+    return ControllerState(Mode.WAITING, None, None, None, zero, zero, zero, 0, zero, zero, effectors=effectors)
 
 
 def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> FloatArray | None:
@@ -177,15 +188,29 @@ def tick(
         u_trim = u_trim + u_ff
     measured = Measurements(y.value, reference, (reference - state.y_m) / dt, u_trim, state.u)
     after, u_free = control_law.step(law_state, measured, dt, params)
-    u = saturate(u_free, state.u, dt, guard.limits)
+    u, effectors = _within_effectors(saturate(u_free, state.u, dt, guard.limits), state, dt, guard)
     if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
-        after, u_free, u = control_law.limited(law_state, measured, dt, params, guard.limits)
+        limits = guard.limits if guard.allocation is None else reached(u_free, u)
+        after, u_free, u = control_law.limited(law_state, measured, dt, params, limits)
+        u, effectors = _within_effectors(u, state, dt, guard)
     if guard.history:
         lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal)),) * missed
         last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt))
         state = state._replace(history=(*state.history, *lost, last)[-guard.history :])
-    state = state._replace(law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state)
+    state = state._replace(
+        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors
+    )
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def _within_effectors(
+    u: FloatArray, state: ControllerState, dt: float, guard: GuardParams
+) -> tuple[FloatArray, FloatArray | None]:
+    """The u that the effectors give for a u, and the effectors; u and None without an allocation."""
+    if guard.allocation is None or state.effectors is None:
+        return u, None
+    effectors, u = allocate(u, state.effectors, dt, guard.allocation)
+    return u, effectors
 
 
 def retune(
@@ -268,7 +293,13 @@ def _failsafe(
     was_active = state.mode is not Mode.INACTIVE
     if state.mode in {Mode.ENGAGED, Mode.WAITING} or was_active != active:
         hold_ns = guard.hold_ns if active else 0
-        state = state._replace(failsafe_start_ns=now_ns, u_failsafe=state.u, hold_ns=hold_ns, ramp_ns=guard.ramp_ns)
+        state = state._replace(
+            failsafe_start_ns=now_ns,
+            u_failsafe=state.u,
+            effectors_failsafe=state.effectors,
+            hold_ns=hold_ns,
+            ramp_ns=guard.ramp_ns,
+        )
     elapsed_ns = now_ns - state.failsafe_start_ns
     held = not active and guard.deactivation_holds
     scale = 1.0 if held else failsafe_scale(elapsed_ns, state.hold_ns, state.ramp_ns)
@@ -279,4 +310,7 @@ def _failsafe(
     else:
         mode = Mode.RAMP if scale > 0.0 else Mode.TRIM
     u = state.u_failsafe if scale == 1.0 else scale * state.u_failsafe
-    return state._replace(mode=mode, u=u, u_free=u), TickInputs(now_ns, y.value, y_m, 0.0, 0.0)
+    effectors = state.effectors_failsafe
+    if effectors is not None and scale != 1.0:
+        effectors = scale * effectors
+    return state._replace(mode=mode, u=u, u_free=u, effectors=effectors), TickInputs(now_ns, y.value, y_m, 0.0, 0.0)

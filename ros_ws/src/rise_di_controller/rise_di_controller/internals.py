@@ -9,14 +9,14 @@ import numpy as np
 
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, field_names, fields
-from rise_di_controller.guard import ControllerState, TickInputs
-from rise_di_controller.saturation import Limits
+from rise_di_controller.guard import ControllerState, GuardParams, TickInputs
 
 SCALARS = ("mode", "dt", "y_m_offset", "late", "age", "number", "parameters")
 OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
-RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS}) - {"e"}
+EFFECTOR = "effector"  # group of an allocation
+RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, EFFECTOR}) - {"e"}
 """Names reserved by the log, not for the state of a law. e is y - y_m."""
 
 
@@ -29,20 +29,24 @@ class Saturation(IntEnum):
 
 
 def groups(
-    law: ControlLaw, outputs: Sequence[str], inputs: Sequence[str], estimates: Sequence[str]
+    law: ControlLaw,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    estimates: Sequence[str],
+    effectors: Sequence[str] = (),
 ) -> dict[str, tuple[str, ...]]:
     """Groups of channels of `internals` and the names per group, in the order of the log.
 
     By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement), integral_e (units of y times
     s) and Pi (scaled input). By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff
-    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in.
+    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in. Of an allocation: effector, as commanded.
     """
     of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS)]
     grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
     grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
     if "z" in field_names(law):
         grouped |= {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
-    return grouped
+    return grouped | ({EFFECTOR: tuple(effectors)} if effectors else {})
 
 
 def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
@@ -56,16 +60,25 @@ def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 def values(
-    state: ControllerState, inputs: TickInputs, limits: Limits, late: float, age: float, number: int, parameters: int
+    state: ControllerState, inputs: TickInputs, guard: GuardParams, late: float, age: float, number: int, parameters: int
 ) -> FloatArray:
-    """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged."""
+    """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged.
+
+    With an allocation an input is limited by MAGNITUDE where it, or any effector, is at an end.
+    """
     if state.law is None:
         raise ValueError("internals: found a controller that was never engaged, expected an engaged one")
     scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])
-    inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper)
+    limits, at_stop = guard.limits, False
+    if guard.allocation is not None and state.effectors is not None:
+        stops = guard.allocation.limits
+        at_stop = bool(((state.effectors <= stops.lower) | (state.effectors >= stops.upper)).any())
+    inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper) & (not at_stop)
     limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
     of_law = fields(state.law)
     of_law.pop("e", None)
     of_observer = [of_law.pop(group) for group in OBSERVER_GROUPS if group in of_law]
     by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *of_law.values())
-    return np.concatenate([scalars, *by_output, state.u_free, state.u, state.u_trim, limited, state.u_ff, *of_observer])
+    by_input = (state.u_free, state.u, state.u_trim, limited, state.u_ff)
+    effectors = () if state.effectors is None else (state.effectors,)
+    return np.concatenate([scalars, *by_output, *by_input, *of_observer, *effectors])

@@ -50,7 +50,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             for topic, take in ((Y, self._controller.take_y), (Y_M, self._controller.take_y_m))
         )
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
-        self._u_encoder = self.encoder(self.parameters.inputs)
+        self._u_encoder = self.encoder(self.parameters.effectors)
         self._internals_encoder = self.encoder(self._controller.names)
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())

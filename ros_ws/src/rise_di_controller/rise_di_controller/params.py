@@ -29,11 +29,13 @@ from flight_core.parameters import (
     flatten,
     nest,
     require,
+    require_channels,
     require_length,
 )
 from flight_core.rates import divide, nanoseconds, period_ns
 from flight_core.vectors import FloatArray
 from rise_di_controller import internals
+from rise_di_controller.allocation import Allocation, allocation
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, nominal_model, zero_dynamics
@@ -43,6 +45,8 @@ from rise_di_controller.observer import ObserverParams, with_observer
 from rise_di_controller.saturation import Limits
 
 MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop with an observer has to be stable
+
+MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T: that of numbers with ten digits is 1e-9
 
 MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
@@ -111,6 +115,48 @@ class ObserverConfig(Config):
         return Phi, Gamma, H, L, np.reshape(self.F, (m, s))
 
 
+class AllocationConfig(Config):
+    """An allocation of the inputs of the law to as many effectors or more, an extension of the paper. SI, row by row."""
+
+    effectors: Names = Field(description="the channels of u that are published")
+    T: Numbers = Field(description="u = T v: a row an effector, a column an input of the law")
+    effect: Numbers = Field(description="v = effect u: a row an input of the law, a column an effector; effect T = I")
+    lower: Numbers = Field(description="lower end stops of the effectors from trim, units of u")
+    upper: Numbers = Field(description="upper end stops of the effectors from trim, units of u")
+    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
+    priority: Names | None = Field(
+        default=None, description="the inputs of the law, the one that keeps its effect the longest first; absent: their order"
+    )
+
+    def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
+        """The allocation of `inputs` for the same inputs in another order."""
+        places, p = [list(inputs).index(name) for name in wanted], len(self.effectors)
+        T, effect = np.reshape(self.T, (p, -1))[:, places], np.reshape(self.effect, (-1, p))[places]
+        return self.model_copy(update={"T": tuple(T.ravel().tolist()), "effect": tuple(effect.ravel().tolist())})
+
+    def arrays(self, inputs: Sequence[str]) -> Allocation:
+        """The arrays of the allocation. Raises ParameterError for sizes that do not match and for an effect T that is not I."""
+        p, m = len(self.effectors), len(inputs)
+        require(p >= m, "allocation.effectors", ", ".join(self.effectors), f"{m} or more, for {', '.join(inputs)}")
+        require(len(set(self.effectors)) == p, "allocation.effectors", ", ".join(self.effectors), "different names")
+        for key, rows, columns in (("T", p, m), ("effect", m, p)):
+            found = f"{len(getattr(self, key))} values"
+            require(found == f"{p * m} values", f"allocation.{key}", found, f"{p * m}: {rows} rows of {columns}")
+        for key in ("lower", "upper", "slew"):
+            require_length(f"allocation.{key}", getattr(self, key) or self.effectors, self.effectors)
+        for name, low, high in zip(self.effectors, self.lower, self.upper, strict=True):
+            within = low <= 0.0 <= high and low < high
+            require(within, "allocation.lower", f"{low:g} and upper {high:g} of {name}", "a range with trim, 0, inside")
+        priority = self.priority or tuple(inputs)
+        require_channels("allocation.priority", priority, inputs, "the inputs of the law")
+        T, effect = np.reshape(self.T, (p, m)), np.reshape(self.effect, (m, p))
+        error = float(np.abs(effect @ T - np.eye(m)).max())
+        require(error < MAX_INVERSE_ERROR, "allocation.T", f"effect T that is off I by {error:.3g}", "T with effect T = I")
+        slew = (np.inf,) * p if self.slew is None else self.slew
+        limits = Limits(np.array(self.lower), np.array(self.upper), np.array(slew))
+        return allocation(T, effect, [inputs.index(name) for name in priority], limits)
+
+
 class ControllerConfig(NodeConfig):
     """Parameters of the controller node that every control law has. A subclass has those of one law, as fields."""
 
@@ -125,7 +171,7 @@ class ControllerConfig(NodeConfig):
     outputs: Names = Field(
         description="the channels of y in the order of the law; in RISE-DI the last has the smallest gain (22)"
     )
-    inputs: Names = Field(description="the channels of u, paired with the outputs")
+    inputs: Names = Field(description="the channels of u, paired with the outputs; with an allocation the inputs v of the law")
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
     input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
     lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
@@ -141,6 +187,9 @@ class ControllerConfig(NodeConfig):
     start_active: bool = Field(
         default=True,
         description="whether autostart also activates it; if not, u is at trim until another node does, as a bridge",
+    )
+    allocation: AllocationConfig | None = Field(
+        default=None, description="an extension of the paper: distributes the inputs of the law to effectors; off where absent"
     )
     feedforward: FeedforwardConfig | None = Field(
         default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
@@ -180,6 +229,8 @@ class ControllerConfig(NodeConfig):
             require(low <= 0, f"lower[{i}]", low, "at most 0, so that trim is inside the limits")
         for i, high in enumerate(self.upper or ()):
             require(high >= 0, f"upper[{i}]", high, "at least 0, so that trim is inside the limits")
+        if self.allocation is not None:
+            self.allocation.arrays(self.inputs)
         self.check_law()
         self._check_state()
         yield
@@ -274,7 +325,18 @@ class ControllerConfig(NodeConfig):
     def logged_groups(self) -> dict[str, tuple[str, ...]]:
         """Groups of channels of `internals` and the names in each."""
         estimates = () if self.observer is None else self.observer.states
-        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates)
+        effectors = () if self.allocation is None else self.allocation.effectors
+        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors)
+
+    @property
+    def effectors(self) -> tuple[str, ...]:
+        """The channels of u as published: the effectors of an allocation, else the inputs of the law."""
+        return self.inputs if self.allocation is None else self.allocation.effectors
+
+    def effector_limits(self) -> Limits:
+        """The limits of u as published, in the order of `effectors`."""
+        guard = self.guard()
+        return guard.limits if guard.allocation is None else guard.allocation.limits
 
     def history_ticks(self) -> int:
         """Ticks of the last y and u from which an observer that is replaced in flight starts."""
@@ -309,6 +371,7 @@ class ControllerConfig(NodeConfig):
                 np.array(self.slew or unlimited),
             ),
             history=self.history_ticks(),
+            allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=None if self.observer is not None and self.observer.part == 0.0 else self.nominal(),
         )
 

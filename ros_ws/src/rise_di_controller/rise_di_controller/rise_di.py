@@ -91,6 +91,9 @@ class RiseDiConfig(ControllerConfig):
             require(alone, "schedule", "a feedforward or an observer beside it", "neither: their model holds at the trim speed")
         if self.learn is not None:
             require(self.observer is not None, "learn", "no observer", "one, with part 0 if it does not fly yet")
+            require(
+                self.allocation is None, "learn", "an allocation beside it", "none: A and B are those of the inputs of the law"
+            )
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
             spacing = self.learn.spacing()

@@ -21,10 +21,17 @@ def saturate(u: Array, u_before: Array, dt: Array, limits: Limits) -> Array:
     Where u_before is outside of new limits, u moves to the limits at the rate.
     """
     xp = array_namespace(u)
+    low, high = bounds(u_before, dt, limits)
+    return xp.minimum(xp.maximum(u, low), high)
+
+
+def bounds(u_before: Array, dt: Array, limits: Limits) -> tuple[Array, Array]:
+    """The least and the largest u of `saturate`, shapes (m,)."""
+    xp = array_namespace(u_before)
     reach = limits.rate * dt
     low = xp.maximum(xp.minimum(limits.lower, u_before + reach), u_before - reach)
     high = xp.minimum(xp.maximum(limits.upper, u_before - reach), u_before + reach)
-    return xp.minimum(xp.maximum(u, low), high)
+    return low, high
 
 
 def limited_integral(before: Array, after: Array, change: Array, beyond: Array) -> Array:

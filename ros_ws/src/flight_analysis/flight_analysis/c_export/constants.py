@@ -44,6 +44,9 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that are learned or off."""
     require(isinstance(controller, RiseDiConfig), "controller.law", controller.law, "rise_di: C code exists for this law alone")
     assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
+    require(
+        controller.allocation is None, "controller.allocation", "a section", "none: the C code has the inputs of the law alone"
+    )
     require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
     flies = controller.observer is None or controller.observer.part > 0.0
     require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")

@@ -122,6 +122,14 @@ def linear_loop(controller: ControllerConfig, airframe: Airframe, A: FloatArray,
     return LinearLoop(model, controller.inputs, plant, linear_law(controller.tuned_law(), len(rows), loop.period), loop)
 
 
+def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
+    """The airframe that the law of a controller sees: with its inputs v, u = T v; without an allocation as it is."""
+    if (allocation := controller.allocation) is None:
+        return airframe
+    T = np.reshape(allocation.T, (len(allocation.effectors), -1))
+    return airframe.through(T[[allocation.effectors.index(name) for name in airframe.inputs]], controller.inputs)
+
+
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
     """Delay margin of the nominal linear loop, s: u late in every channel, in a single channel by output; the least allowed.
 
@@ -157,7 +165,7 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
-        return load_airframe(aircraft.airframe)
+        return through_allocation(load_airframe(aircraft.airframe), controller)
     if controller.feedforward is not None and set(controller.feedforward.states) == set(controller.outputs):
         names = controller.feedforward.states
         A, B = np.reshape(controller.feedforward.A, (len(names), -1)), np.reshape(controller.feedforward.B, (len(names), -1))
@@ -168,7 +176,10 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
         expected = "a controller with a feedforward, or RISE-DI with its omega"
         raise ParameterError(f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}")
     channels = aircraft.channels()
-    inputs = {name: {"unit": channels.inputs[name], "positive": channels.positive[name]} for name in controller.inputs}
+    inputs = {
+        name: {"unit": channels.inputs.get(name, "1"), "positive": channels.positive.get(name, f"more {name}")}
+        for name in controller.inputs
+    }
     values = {
         "name": f"y_dot = Omega u for {aircraft.airframe}",
         "source": "the controller",

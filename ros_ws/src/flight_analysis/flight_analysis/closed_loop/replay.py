@@ -162,7 +162,7 @@ def _replay(
         require(listed, "changes", short_repr(changes), "a list of changes, each a mapping of dotted names")
     tape, parameters, changes = _recorded(run, parameters, changes)
     ticks = _Ticks(tape, parameters)
-    for key in ("outputs", "inputs"):
+    for key in ("outputs", "inputs", "effectors"):
         wanted, found = getattr(parameters, key), getattr(others or parameters, key)
         require(found == wanted, f"controller.{key}", ", ".join(found), f"{', '.join(wanted)}, as recorded")
     in_force = _ParametersInForce(others or parameters, changes)
@@ -172,7 +172,7 @@ def _replay(
     for k in range(len(ticks.number)):
         if ticks.begins[k]:
             in_force.begin()
-            state = guard.initial_state(ticks.m)
+            state = ticks.begin()
         state = in_force.change(int(ticks.parameters[k]), int(ticks.number[k]), state)
         other_parameters[k] = in_force.digest != ticks.parameters[k]
         if state is None or (ticks.gap[k] and others is None and not ticks.begins[k]):
@@ -182,7 +182,7 @@ def _replay(
             state = ticks.state(k, in_force.limits, in_force.law)
             if others is None:
                 continue
-            state = guard.initial_state(ticks.m)._replace(u=state.u)
+            state = ticks.begin(state)
         state, computed[k] = ticks.tick(k, state, in_force.limits, in_force.law)
         checked[k] = True
         if others is None and computed[k].tobytes() != ticks.values[k].tobytes():
@@ -190,7 +190,7 @@ def _replay(
     notes = (() if others is None else (OPEN_LOOP,)) + tuple(in_force.notes) + tuple(_coverage_notes(ticks, checked))
     # A tick without a y on the topic is computed from the y in `internals`; a u that is not on the topic is not compared.
     missing = np.flatnonzero(~ticks.u_found)
-    computed[missing, -ticks.m :] = ticks.values[missing, -ticks.m :]
+    computed[missing, -ticks.p :] = ticks.values[missing, -ticks.p :]
     published = ticks.u_found & (ticks.y_found | ~ticks.flies)
     return ReplayResult(ticks.names, ticks.number, ticks.t, ticks.values, computed, checked, other_parameters, notes, published)
 
@@ -267,7 +267,7 @@ class _Ticks:
         values = np.column_stack([signal[name] for name in names])
         valid = np.isfinite(values).all() and np.isin(signal["mode"], list(Mode)).all()
         require(bool(valid), "internals", "a value that is not finite, or an unknown mode", "what a controller publishes")
-        self.m = len(parameters.inputs)
+        self.m, self.p, self._allocation = len(parameters.inputs), len(parameters.effectors), parameters.guard().allocation
         # Sort by the instants of the ticks. Stamps may decrease: a late y is older than a failsafe tick before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order = np.argsort(now_ns, kind="stable")
@@ -284,23 +284,30 @@ class _Ticks:
         self._offset_ns = np.round(signal["y_m_offset"] * NANOSECONDS).astype(np.int64)
         self._groups = {name: signal.group(name).values for name in groups}
         self._y, self.y_found = _as_published(tape, "y", parameters.outputs, self.stamp_ns, self._groups["y"])
-        u, self.u_found = _as_published(tape, "u", parameters.inputs, self.stamp_ns, self._groups["u"])
+        commanded = self._groups[internals.EFFECTOR if parameters.allocation is not None else "u"]
+        u, self.u_found = _as_published(tape, "u", parameters.effectors, self.stamp_ns, commanded)
         self.values = np.column_stack([signal.values, u])
-        self.names = (*names, *(f"published.{name}" for name in parameters.inputs))
+        self.names = (*names, *(f"published.{name}" for name in parameters.effectors))
         self._copied = [names.index(name) for name in COPIED_CHANNELS]
+
+    def begin(self, before: ControllerState | None = None) -> ControllerState:
+        """The state of a controller that was configured, with the u of a state before."""
+        state = guard.initial_state(self.m, self._allocation)
+        return state if before is None else state._replace(u=before.u, effectors=before.effectors)
 
     def state(self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None) -> ControllerState:
         """The recorded state after a tick. Values outside the log come from the computed state, if any."""
         row = {name: values[k] for name, values in self._groups.items()}
         of_law = restored(law.control_law, row)
-        mode, u, y_m = Mode(int(self._signal["mode"][k])), row["u"], row["y_m"]
+        mode, u, y_m, effectors = Mode(int(self._signal["mode"][k])), row["u"], row["y_m"], row.get(internals.EFFECTOR)
         if computed is not None and not self.flies[k]:
-            return computed._replace(mode=mode, law=of_law, u=u, u_free=row["u_free"])
+            return computed._replace(mode=mode, law=of_law, u=u, u_free=row["u_free"], effectors=effectors)
         feedforward_state = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
-        return ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
+        logged = ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
+        return logged._replace(effectors=effectors, effectors_failsafe=effectors)
 
     def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
         """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without output."""
@@ -312,7 +319,7 @@ class _Ticks:
             if (offset_ns := int(self._offset_ns[k])) > 0:
                 y_m.append(y_m[0]._replace(stamp_ns=stamp_ns + offset_ns))
         if self._engages[k] and state.mode is Mode.ENGAGED:
-            state = guard.initial_state(self.m)._replace(u=state.u)  # the controller was configured again before this tick
+            state = self.begin(state)  # the controller was configured again before this tick
         # After a gap the log has the feedforward's output but not its state: only the law is computed.
         only_law = limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
         u_ff = self._groups["u_ff"][k] if only_law else None
@@ -320,9 +327,9 @@ class _Ticks:
         if used is None:
             return after, np.full(len(self.names), np.nan)
         late, age = float(self._signal["late"][k]), float(self._signal["age"][k])
-        row = internals.values(after, used, limits.limits, late, age, 0, 0)
+        row = internals.values(after, used, limits, late, age, 0, 0)
         row[self._copied] = self.values[k, self._copied]
-        return after, np.concatenate([row, after.u])
+        return after, np.concatenate([row, after.command])
 
 
 def _as_published(

@@ -233,12 +233,13 @@ def check_together(scenario: Scenario) -> None:
     """Check the channels and rates of the sections together. Raises ParameterError."""
     channels = scenario.aircraft.channels()
     controller, reference = scenario.controller, scenario.reference_model
-    for key, names, expected in (
-        ("controller.outputs", controller.outputs, channels.outputs),
-        ("controller.inputs", controller.inputs, channels.inputs),
-        ("reference_model.outputs", reference.outputs, channels.outputs),
-    ):
-        require_channels(key, names, tuple(expected), f"the channels of the airframe {scenario.aircraft.airframe}")
+    airframe = f"the airframe {scenario.aircraft.airframe}"
+    effectors = "controller.inputs" if controller.allocation is None else "controller.allocation.effectors"
+    require_channels(effectors, controller.effectors, tuple(channels.inputs), f"the channels of {airframe}")
+    unknown = [name for name in controller.outputs if name not in channels.outputs]
+    measured = f"some of the outputs of {airframe}: {', '.join(channels.outputs)}"
+    require(not unknown, "controller.outputs", ", ".join(controller.outputs), measured)
+    require_channels("reference_model.outputs", reference.outputs, controller.outputs, "those of controller.outputs")
     control_ns = period_ns(controller.rate, "controller.rate")
     for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):
         divides = control_ns % period_ns(rate, key) == 0
@@ -250,14 +251,14 @@ def check_together(scenario: Scenario) -> None:
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     """A sentence for each limit of the controller outside the end stops of the actuators: the anti-windup starts too late."""
     controller, actuators = scenario.controller, scenario.aircraft.actuators
-    sentences = []
+    section, sentences = "controller" if controller.allocation is None else "controller.allocation", []
     for key, sign in (("lower", -1.0), ("upper", 1.0)):
         stops = dict(zip(scenario.aircraft.channels().inputs, getattr(actuators, key), strict=bool(getattr(actuators, key))))
-        own = dict(zip(controller.inputs, getattr(controller, key) or (), strict=bool(getattr(controller, key))))
+        own = dict(zip(controller.effectors, getattr(controller.effector_limits(), key).tolist(), strict=True))
         for name, stop in stops.items():
             limit = own.get(name, sign * math.inf)
             if sign * limit > sign * stop + STOP_TOLERANCE * abs(stop):
-                sentences.append(f"controller.{key} of {name}: found {limit:g}, expected the end stop {stop:g} or less far out")
+                sentences.append(f"{section}.{key} of {name}: found {limit:g}, expected the end stop {stop:g} or less far out")
     return tuple(sentences)
 
 

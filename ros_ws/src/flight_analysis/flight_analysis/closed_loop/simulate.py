@@ -101,7 +101,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     flight that diverges or is interrupted (Ctrl-C) ends early.
     """
     require_euler(scenario)
-    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
     reference, controller = Reference(scenario.reference_model), control(scenario.controller)
     guidance = None if scenario.guidance is None else guide(scenario.guidance)
     learning = _learning(scenario.controller, learn, announce)

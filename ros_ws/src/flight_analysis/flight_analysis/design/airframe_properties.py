@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eig, eigvals, qr
 
 from aircraft_sim.airframe import Airframe, airframes, load_airframe
+from flight_analysis.design.effectors import LAW_INPUT
 from flight_core.arguments import FilePath
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
@@ -80,9 +81,13 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     """Poles, zeros, Omega = C B with D, and Assumptions 1 and 3 of an airframe, or of a name or file; SI.
 
     Source: Assumptions 1 and 3, equations (10)-(11) and Remark 1 of Tanyer, Tatlicioglu, Zergeroglu. Zeros are of the linear
-    part (A, B, C): f is left out. A published A may contain gravity.
+    part (A, B, C): f is left out. A published A may contain gravity. More inputs than outputs count as m inputs of the law
+    through the pseudo-inverse of C B, in SI.
     """
     airframe = load_airframe(airframe)
+    if len(airframe.inputs) > len(airframe.outputs):
+        T = np.asarray(np.linalg.pinv(airframe.matrix_c() @ airframe.matrix_b()), dtype=np.float64)
+        airframe = airframe.through(T, [f"{LAW_INPUT}{name}" for name in airframe.outputs])
     A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
     Omega, hidden, (_, unseen, _) = C @ B, np.logical_not(C.any(axis=0)), output_coordinates(C)
     zeros = invariant_zeros(A, B, C)

@@ -55,7 +55,7 @@ from rise_di_controller.decomposition import DecompositionError, coupling, searc
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46}
@@ -415,6 +415,8 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "observer": None,
         }
         values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
+        if setting.base.allocation is not None:
+            values["allocation"] = setting.base.allocation.ordered(base_inputs, channels.inputs).model_dump()
         return RiseDiConfig.validate_mapping(values, "controller")
 
     def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
@@ -696,7 +698,9 @@ def section_yaml(
     """A controller as the section `/**/controller` of a scenario file; the description of a parameter without a comment."""
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
-        for key, value in controller.model_dump(exclude_defaults=True, exclude={"feedforward", "observer"}).items()
+        for key, value in controller.model_dump(
+            exclude_defaults=True, exclude={"allocation", "feedforward", "observer"}
+        ).items()
     ]
     return CONTROLLER_YAML.render(
         airframe=airframe.name,
@@ -727,25 +731,38 @@ def _shown_response(responses: FloatArray) -> str:
 
 
 def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
-    """The sections feedforward and observer where there are any: a comment, and each parameter in flow style."""
+    """The sections allocation, feedforward and observer, if any: a comment, and each parameter in flow style."""
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
-    comments = {"feedforward": along, "observer": corrects}
+    distributes = "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
+    comments = {"allocation": distributes, "feedforward": along, "observer": corrects}
     return {
-        name: (comment, _matrix_rows(section, len(controller.inputs)))
+        name: (comment, _matrix_rows(section, _columns_of(section, len(controller.inputs))))
         for name, comment in comments.items()
         if (section := getattr(controller, name)) is not None
     }
 
 
-def _matrix_rows(section: FeedforwardConfig | ObserverConfig, m: int) -> dict[str, str | list[str]]:
-    """Entries of each parameter in flow style, a matrix in rows. A matrix of the observer has ten digits."""
+def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig, m: int) -> dict[str, int]:
+    """The columns of each matrix of a section."""
+    if isinstance(section, AllocationConfig):
+        return {"T": m, "effect": len(section.effectors)}
+    n = len(section.states)
+    if isinstance(section, FeedforwardConfig):
+        return {"A": n, "B": m, "gravity": n}
+    return {"Phi": n, "Gamma": m, "L": m, "F": n}
+
+
+def _matrix_rows(
+    section: AllocationConfig | FeedforwardConfig | ObserverConfig, columns_of: Mapping[str, int]
+) -> dict[str, str | list[str]]:
+    """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an observer."""
     rows: dict[str, str | list[str]] = {}
     for key, value in section.model_dump(exclude_none=True).items():
         if not isinstance(value, tuple):
             rows[key] = yaml_flow(value)
             continue
-        columns = len(value) if key in {"states", "lead"} else len(value) // (m if key == "F" else len(section.states))
-        digits = 10 if isinstance(section, ObserverConfig) else 6
+        columns = columns_of.get(key, len(value))
+        digits = 6 if isinstance(section, FeedforwardConfig) else 10
         rows[key] = [yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)]
     return rows

@@ -57,7 +57,8 @@ def check_scenario(
 
     `namespace` selects the aircraft of a log with several.
     """
-    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    controller = scenario.controller
+    outputs, inputs = controller.outputs, controller.effectors
     for key, names, expected in (
         (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
         (f"map {channel_map.name}: inputs", tuple(channel_map.inputs), inputs),
@@ -67,8 +68,12 @@ def check_scenario(
         require_channels(key, names, expected, "the channels of the controller")
     Omega = frame.matrix_c() @ frame.matrix_b()
     in_map = Omega[np.ix_(_places(channel_map.outputs, frame.outputs), _places(channel_map.inputs, frame.inputs))]
+    if controller.allocation is not None:
+        require(bag is None, "bag", f"{bag} beside an allocation", "none: a flight does not show the effectors one by one")
+        effect = np.reshape(controller.allocation.effect, (len(outputs), -1))
+        return check_effectors(channel_map, in_map, outputs, inputs, effect)
     measured = None if bag is None else recorded_response(bag, outputs, inputs, namespace)
-    return check(channel_map, in_map, outputs, inputs, scenario.controller.D, measured)
+    return check(channel_map, in_map, outputs, inputs, controller.D, measured)
 
 
 def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...], namespace: str | None = None) -> Response:
@@ -138,6 +143,27 @@ def check(
                 f" ({effect:.3g}, {ratio:.0f} standard errors), the map {channel_map.name} has the opposite sign"
             )
     return SignCheck(tuple(channels), tuple(sentences), tuple(uncertain), 0.0 if measured is None else measured.seconds)
+
+
+def check_effectors(
+    channel_map: ChannelMap, Omega: FloatArray, outputs: tuple[str, ...], effectors: tuple[str, ...], effect: FloatArray
+) -> SignCheck:
+    """The sign of each effector against `effect` of an allocation, (m, p), in the output that the effector moves most.
+
+    `Omega` as in `check`, (m, p). An output counts by the largest effect on it. D of a channel is the sign of its effect.
+    """
+    mapped = through(channel_map, Omega)[np.ix_(_places(outputs, channel_map.outputs), _places(effectors, channel_map.inputs))]
+    largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
+    channels, sentences = [], []
+    for j, (name, i) in enumerate(zip(effectors, largest, strict=True)):
+        found, expected = int(np.sign(mapped[i, j])), int(np.sign(effect[i, j]))
+        channels.append(Channel(outputs[i], name, float(mapped[i, j]), found, expected, None, None))
+        if found != expected:
+            sentences.append(
+                f"with the map {channel_map.name} {name} has {mapped[i, j]:+.3g} on {outputs[i]}_dot, allocation.effect has"
+                f" {effect[i, j]:+.3g}: a positive {name} means {motion_as_channel_grows(channel_map.inputs[name])}"
+            )
+    return SignCheck(tuple(channels), tuple(sentences), (), 0.0)
 
 
 def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:

@@ -147,7 +147,8 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
     """Limits of u by kind and by input: end stops of the actuators where these are simulated, and limits of the controller."""
     actuators, controller = scenario.aircraft.actuators, scenario.controller
-    limits = {"limits of the controller": _limit_pairs(controller.inputs, controller.lower or (), controller.upper or ())}
+    own = controller.effector_limits()
+    limits = {"limits of the controller": _limit_pairs(controller.effectors, own.lower.tolist(), own.upper.tolist())}
     if not _truth_group(tape, "actuator").names:
         return limits
     return {"end stops": _limit_pairs(tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper)} | limits

@@ -45,7 +45,7 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
     return guided | {
         "y": tuple(scenario.aircraft.channels().outputs),
         "y_m": scenario.reference_model.outputs,
-        "u": controller.inputs,
+        "u": controller.effectors,
         "internals": internals.names(controller.logged_groups()),
         "truth": tuple(Simulator(scenario.aircraft).truth_names),
     }
@@ -56,8 +56,8 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
 
     A guided flight has a further tab, of the commands and measurements of guidance.
     """
-    outputs, inputs, wind = channels["y_m"], channels["u"], [name for name in channels["truth"] if name.startswith("gust.")]
-
+    outputs, wind = channels["y_m"], [name for name in channels["truth"] if name.startswith("gust.")]
+    inputs = [name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")]
     integrals = [f"{group}.{name}" for name in outputs for group in ("integral_e", "Pi")]
     integrals = [name for name in integrals if name in channels["internals"]]  # another law may have neither
 

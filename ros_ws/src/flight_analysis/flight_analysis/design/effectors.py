@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Design of an allocation: T for the effectors of an airframe, and the loop that the law sees through T."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+from rise_di_controller.params import AllocationConfig
+
+LAW_INPUT = "v_"  # begin of the name of an input of the law: v_q is that of the output q
+DIGITS = 10  # of T and effect in a file: their product is I to 1e-9
+SMALL = 1e-9  # part of the largest: an effector that gives less of an input of the law does not limit it
+
+
+class Effectors(NamedTuple):
+    """The effectors of an airframe, in its order, deviations from trim, SI: shapes (p,)."""
+
+    lower: FloatArray  # end stops
+    upper: FloatArray
+    rate: FloatArray  # per s, infinite without a limit
+    lag: FloatArray  # s
+
+
+class LawInputs(NamedTuple):
+    """The inputs v of the law through an allocation, one an output; shapes (m,), units of y / s."""
+
+    names: tuple[str, ...]
+    lower: FloatArray  # an input alone takes the first effector to its stop
+    upper: FloatArray
+    slew: FloatArray
+    lag: FloatArray  # s
+
+
+def design_allocation(
+    airframe: Airframe, effectors: Effectors, priority: Sequence[str] = ()
+) -> tuple[AllocationConfig, LawInputs]:
+    """The allocation by the weighted pseudo-inverse of Omega = C B, (m, p), and the inputs of the law: C B T = I.
+
+        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(1 / range_j^2),  effect = Omega
+
+    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of squares of u_j / range_j,
+    range_j half the way between the stops. lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to first order.
+    `priority` are outputs, the one that keeps its input the longest first; the rest follow in their order.
+
+    Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent rows of Omega.
+    Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender, "Control allocation for over-actuated
+    systems", Proc. 14th Mediterranean Conference on Control and Automation, 2006.
+    """
+    Omega, m = airframe.matrix_c() @ airframe.matrix_b(), len(airframe.outputs)
+    names = tuple(airframe.inputs)
+    require(len(names) >= m, f"airframe {airframe.name}: inputs", ", ".join(names), f"{m} or more, as many as outputs or more")
+    for name, low, high in zip(names, effectors.lower.tolist(), effectors.upper.tolist(), strict=True):
+        both = np.isfinite([low, high]).all() and low <= 0.0 <= high and low < high
+        require(bool(both), f"aircraft.actuators of {name}", f"{low:g} to {high:g}", "both end stops: they weigh the effectors")
+    scaled = Omega * (effectors.upper - effectors.lower) / 2.0
+    size = np.abs(scaled).max(axis=1, keepdims=True)
+    independent = bool((size > 0.0).all()) and np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6) == m
+    require(independent, f"airframe {airframe.name}: C B", "rows that depend on each other", "inputs that move each output")
+    T = ((effectors.upper - effectors.lower) / 2.0)[:, None] * np.linalg.pinv(scaled)
+    law = tuple(f"{LAW_INPUT}{name}" for name in airframe.outputs)
+    first = [f"{LAW_INPUT}{name}" for name in priority]
+    config = AllocationConfig.validate_mapping(
+        {
+            "effectors": names,
+            "T": _rounded(T),
+            "effect": _rounded(Omega),
+            "lower": effectors.lower.tolist(),
+            "upper": effectors.upper.tolist(),
+            "slew": effectors.rate.tolist() if np.isfinite(effectors.rate).all() else None,
+            "priority": [*first, *(name for name in law if name not in first)] if first else None,
+        },
+        "allocation",
+    )
+    lag = np.maximum((Omega * T.T) @ effectors.lag, 0.0)
+    lower, upper = (_alone(T, sides) for sides in ((effectors.upper, effectors.lower), (effectors.lower, effectors.upper)))
+    return config, LawInputs(law, -lower, upper, _alone(T, (effectors.rate, effectors.rate)), lag)
+
+
+def _alone(T: FloatArray, sides: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """The largest v_i >= 0 alone inside the ends; `sides`: the ends in the direction -T_ji and +T_ji, of either sign."""
+    against, along = (np.abs(side)[:, None] for side in sides)
+    counts = np.abs(T) > SMALL * np.abs(T).max(axis=0)
+    room = np.where(T > 0.0, along, against) / np.where(counts, np.abs(T), 1.0)
+    return np.asarray(np.where(counts, room, np.inf).min(axis=0))
+
+
+def _rounded(matrix: FloatArray) -> list[float]:
+    small = SMALL * np.abs(matrix).max(axis=0)
+    return [float(f"{value:.{DIGITS}g}") for value in np.where(np.abs(matrix) > small, matrix, 0.0).ravel()]
