@@ -16,7 +16,7 @@ from tests.maps import MAP_FILES, named_map
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
-from flight_bringup.fly import _follow_real_time, _interrupt, _Span
+from flight_bringup.fly import _follow_real_time, _Span, interrupt, last
 from flight_bringup.processes import handle_signals
 from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
@@ -668,7 +668,7 @@ def followed(
     """The outcome of a flight of osprey_gust, 60 s, with an autopilot."""
     scenario = find_scenario("osprey_gust")
     span = _Span(scenario, processes, monitor, begins=False)
-    return _follow_real_time(scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span)
+    return last(_follow_real_time(scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span))
 
 
 @pytest.mark.parametrize(("until", "end"), [(60.0, 60.0), (59.0, 64.0), (None, 60.0)])
@@ -721,7 +721,7 @@ def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatc
 def test_second_signal_does_not_interrupt_clean_up_after_first() -> None:
     """`subprocess` releases a lock in a `finally`; one that stays locked made a flight wait for its nodes without end."""
     before, clean = signal.getsignal(signal.SIGINT), False
-    with suppress(KeyboardInterrupt), handle_signals(_interrupt):
+    with suppress(KeyboardInterrupt), handle_signals(interrupt):
         try:
             signal.raise_signal(signal.SIGINT)
         finally:

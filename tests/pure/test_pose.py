@@ -44,6 +44,16 @@ def test_velocity_over_ground_is_airspeed_turned_from_body_axes_to_north_east_do
     assert pose.velocity(speed, alpha, beta, phi, theta, psi) == pytest.approx((north, east, -down), rel=1e-14)
 
 
+def test_a_start_elsewhere_turns_and_moves_the_flight() -> None:
+    flown = dict.fromkeys(POSE, 0.0) | {"psi": 3.0, "north": 10.0, "east": 2.0, "v_north": 5.0, "v_east": -1.0}
+    moved = pose.over_ground(np.array([*flown.values()]), 0.0, (0.0, 0.0), pose.Start(100.0, -50.0, math.pi / 2.0))
+    found = dict(zip(POSE, moved.tolist(), strict=True))
+    # A quarter turn to the right: what was ahead is east, what was to the right is south.
+    assert (found["north"], found["east"]) == pytest.approx((100.0 - 2.0, -50.0 + 10.0))
+    assert (found["v_north"], found["v_east"]) == pytest.approx((1.0, 5.0))
+    assert found["psi"] == pytest.approx(3.0 + math.pi / 2.0 - 2.0 * math.pi)
+
+
 def euler_rates(x: dict[str, float]) -> dict[str, float]:
     """Derivatives of equation (1) for the osprey with kinematics euler, without input."""
     airframe, aircraft = aircraft_parameters(kinematics="euler").load()

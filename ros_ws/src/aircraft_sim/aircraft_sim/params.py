@@ -186,6 +186,14 @@ class PoseConfig(Config):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
 
 
+class StartConfig(Config):
+    """Where the aircraft is at t = 0."""
+
+    north: Number = Field(default=0.0, description="to the north of the origin, m")
+    east: Number = Field(default=0.0, description="to the east of the origin, m")
+    heading: Number = Field(default=0.0, description="the heading, rad, positive to the right of north")
+
+
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
@@ -203,6 +211,7 @@ class AircraftConfig(NodeConfig):
     start_time: float = Field(
         default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
+    start: StartConfig = Field(default=StartConfig(), description="where the aircraft is at t = 0")
     gusts: dict[str, Gust] = Field(default={}, description="gusts by the axis of the wind: longitudinal, lateral, vertical")
     turbulence: TurbulenceConfig | None = Field(default=None, description="turbulence along all axes of the airframe's gusts")
     bias: dict[str, BiasConfig] = Field(default={}, description="biases on x_dot by state")

@@ -2,12 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose of the aircraft: attitude, position and velocity over ground as absolute values, for guidance and the log.
 
-Position is in a local tangent plane whose origin is below the aircraft at t = 0. A steady wind moves the air mass as a
-whole: the flight relative to the air is as in still air, and the pose alone gets the wind (Galilean invariance).
+Position is in a local tangent plane whose origin is below the aircraft at t = 0, unless it starts elsewhere. A steady wind
+moves the air mass as a whole: the flight relative to the air is as in still air, and the pose alone gets the wind (Galilean
+invariance).
 """
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -46,10 +48,29 @@ def velocity(
     return forward * north - right * east, forward * east + right * north, climb
 
 
-def over_ground(pose: FloatArray, t: float, wind: Sequence[float]) -> FloatArray:
-    """A pose relative to the air mass as a pose over ground after t s of a steady wind (m/s to the north, to the east)."""
+class Start(NamedTuple):
+    """Where the aircraft is at t = 0: to the north and to the east, m, with a heading, rad."""
+
+    north: float = 0.0
+    east: float = 0.0
+    heading: float = 0.0
+
+
+def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start) -> FloatArray:
+    """A pose relative to the air mass as a pose over ground after t s of a steady wind (m/s to the north, to the east).
+
+    The pose is that of a flight from the origin to the north. It is turned by the heading of the start and moved there.
+    """
     moved = pose.copy()
-    for i, speed in enumerate(wind):
-        moved[POSE.index("north") + i] += speed * t
+    if start.heading:
+        sin, cos = math.sin(start.heading), math.cos(start.heading)
+        for first in ("north", "v_north"):
+            i = POSE.index(first)
+            north, east = pose[i], pose[i + 1]
+            moved[i], moved[i + 1] = cos * north - sin * east, sin * north + cos * east
+        psi = POSE.index("psi")
+        moved[psi] = wrapped(float(pose[psi]) + start.heading)
+    for i, (speed, place) in enumerate(zip(wind, (start.north, start.east), strict=True)):
+        moved[POSE.index("north") + i] += place + speed * t
         moved[POSE.index("v_north") + i] += speed
     return np.asarray(moved)

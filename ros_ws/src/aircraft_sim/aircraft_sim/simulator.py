@@ -162,6 +162,7 @@ class Simulator:
             self._model = StateSpaceModel(parameters)
         self._wind, self._gusts, self._speed = parameters.wind, parameters.gusts, channels.speed
         self._drift_section = parameters.drift
+        self._start = pose.Start(**parameters.start.model_dump())
         self._pose_every, self._pose_sensors = parameters.pose_every(), parameters.pose_sensors()
         self._poses: DelayLine = ()
         self._sensors = parameters.sensor_arrays()
@@ -212,7 +213,7 @@ class Simulator:
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
-        return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind)
+        return pose.over_ground(self._model.pose(), seconds(self._number * self.period_ns), self._wind, self._start)
 
     def poses(self) -> DelayLine:
         """The poses that arrive at the instant of the last sample, the oldest first, as measured; stamps are flight time."""

@@ -8,7 +8,7 @@ import re
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -46,8 +46,11 @@ STALL_TIMEOUT = 40.0
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
+Steps = Generator[None, None, str]
+"""A flight that is followed: a step looks at it once. It returns the outcome."""
 
-def _interrupt(number: int, frame: FrameType | None) -> None:
+
+def interrupt(number: int, frame: FrameType | None) -> None:
     """End the flight. A second signal would interrupt the clean-up, in which `subprocess` releases a lock of each process."""
     handle_shutdown(signal.SIG_IGN)
     if number == signal.SIGHUP:  # the terminal is lost: writing to it is an error
@@ -71,7 +74,7 @@ def fly_over_topics(
 ) -> str:
     """Fly over topics, as separate processes, and record the bag into `run`. Returns the outcome.
 
-    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process, in lockstep only.
+    Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process.
     `autopilot` flies in the aircraft's place, in real time only. All nodes are in the `namespace`, as "/uav1". `announce` gets
     a line for each change of engagement and of reason, but not for a changed number. With `engaged_for`, s, the flight ends so
     long after its first engagement, or with it, or without one when too little time is left.
@@ -82,7 +85,7 @@ def fly_over_topics(
 
     try:
         with (
-            handle_signals(_interrupt),
+            handle_signals(interrupt),
             FlightMonitor(scenario.controller.outputs, lockstep=lockstep, namespace=namespace) as monitor,
             FlightProcesses(
                 scenario,
@@ -96,17 +99,44 @@ def fly_over_topics(
         ):
             if reason := processes.begin():
                 processes.outcome = reason
-            elif lockstep:
-                processes.outcome = _follow_lockstep(scenario, processes, monitor, progress)
             else:
-                begins = autopilot is None and scenario.controller.autostart and scenario.controller.start_active
-                span = _Span(scenario, processes, monitor, begins=begins)
-                processes.outcome = _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
+                steps = follow(
+                    scenario, processes, monitor, progress, lockstep=lockstep, announce=announce, engaged_for=engaged_for
+                )
+                processes.outcome = last(steps)
             return processes.outcome
     except KeyboardInterrupt:
         return INTERRUPTED
     except NotReadyError as error:
         return f"{NEVER_FLEW}: {error}"
+
+
+def last(steps: Steps) -> str:
+    """Follow a flight to its end. Returns the outcome."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            return str(end.value)
+        time.sleep(POLL_PERIOD)
+
+
+def follow(
+    scenario: Scenario,
+    processes: FlightProcesses,
+    monitor: "FlightMonitor",
+    progress: Progress,
+    *,
+    lockstep: bool,
+    announce: Callable[[str], None] = lambda line: None,
+    engaged_for: float = math.inf,
+) -> Steps:
+    """Follow a flight that has begun, a step every POLL_PERIOD; as `fly_over_topics`."""
+    if lockstep:
+        return _follow_lockstep(scenario, processes, monitor, progress)
+    begins = processes.autopilot is None and scenario.controller.autostart and scenario.controller.start_active
+    span = _Span(scenario, processes, monitor, begins=begins)
+    return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
 
 
 class _Span:
@@ -148,7 +178,7 @@ def _follow_real_time(
     announce: Callable[[str], None],
     engaged_for: float,
     span: _Span,
-) -> str:
+) -> Steps:
     units, outputs = display_units(scenario), scenario.controller.outputs
     text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
@@ -179,10 +209,10 @@ def _follow_real_time(
             errors = (f"{name} {e * units[name].factor:+.2f}" for name, e in zip(outputs, values, strict=True))
             text = f"{mode}  e: {', '.join(errors)}"
         progress(min(max(t, 0.0), scenario.flight.duration), text)
-        time.sleep(POLL_PERIOD)
+        yield
 
 
-def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> str:
+def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> Steps:
     """The real-time factor counts from the first instant in the log. The flight ends when the log is complete."""
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
     t, last_change, text = 0.0, time.monotonic(), "lockstep, starting"
@@ -200,7 +230,7 @@ def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "F
         elif now > last_change + STALL_TIMEOUT:
             return f"no progress for {STALL_TIMEOUT:g} s at t = {t:g} s"
         progress(t, text)
-        time.sleep(POLL_PERIOD)
+        yield
     return COMPLETED
 
 
@@ -253,8 +283,7 @@ def fly_and_report(
     require(progress is None or callable(progress), "progress", progress, "a function of the flight time in s")
     chosen = find_scenario(scenario)
     run = new_run(chosen, as_path(runs, "runs", "the path of a folder"))
-    if not _is_its_file(chosen):
-        chosen = written(chosen, run / f"{chosen.name}.yaml")
+    chosen = as_file(chosen, run)
     outcome = fly_in_process(chosen, run, lambda t, _: None if progress is None else progress(t), learn)
     return write_report(run, outcome)
 
@@ -265,6 +294,11 @@ def _is_its_file(scenario: Scenario) -> bool:
         return load_scenario(scenario.path) == scenario
     except ParameterError:
         return False
+
+
+def as_file(scenario: Scenario, run: Path) -> Scenario:
+    """The scenario with a file that holds it: its own, or a new one in the folder of the run. Raises ParameterError."""
+    return scenario if _is_its_file(scenario) else written(scenario, run / f"{scenario.name}.yaml")
 
 
 class _DeferredInterrupt:
@@ -278,7 +312,7 @@ class _DeferredInterrupt:
         if self._deferred:
             self._pending = number, frame
         else:
-            _interrupt(number, frame)
+            interrupt(number, frame)
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
@@ -289,4 +323,4 @@ class _DeferredInterrupt:
         finally:
             self._deferred = False
         if self._pending is not None:
-            _interrupt(*self._pending)
+            interrupt(*self._pending)

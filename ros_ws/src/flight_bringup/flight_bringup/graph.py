@@ -34,7 +34,7 @@ GUIDANCE = NodeSpec("flight_guidance", "guidance")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
-# All nodes in one process, for lockstep. Each reads its own section of the scenario.
+# All nodes in one process. Each reads its own section of the scenario.
 ONE_PROCESS = NodeSpec("flight_bringup", "one_process")
 
 # The second stage starts once every node of the first is ready: the log then holds the whole flight, and the aircraft always
@@ -185,6 +185,9 @@ def parameter_overrides(
             "metadata_file": str(files.metadata),
         }
     if one_process:
+        if not lockstep:
+            for node in (*SECOND_STAGE, *(() if guidance is None else (GUIDANCE,))):
+                overrides[node]["start_time"] = start_time
         return {f"{node.executable}:{name}": value for node, values in overrides.items() for name, value in values.items()}
     return overrides[spec] | ({"start_time": start_time} if spec in (*SECOND_STAGE, GUIDANCE) and not lockstep else {})
 

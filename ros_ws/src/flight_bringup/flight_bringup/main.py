@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of a flight in one process, in lockstep over the same topics; guidance where it is given parameters."""
+"""The nodes of a flight in one process, over the same topics; guidance where the arguments name it."""
 
 import sys
 
@@ -9,7 +9,7 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Run them."""
-    guided = any(word.startswith("guidance:") for word in sys.argv)
+    guided = "guidance" in sys.argv
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",

@@ -33,9 +33,9 @@ from flight_bringup.graph import (
     start_instant,
     start_lead,
 )
-from flight_core.files import write_file
+from flight_core.files import dump_yaml, write_file
 from flight_core.outcome import INTERRUPTED, LOST_CONTACT, NEVER_FLEW
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, nest
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
 from flight_log.bag import OUTCOME_FILE
@@ -57,6 +57,11 @@ def end_with_parent() -> list[str]:
     """Prefix of a command: SIGTERM when this process dies. Needs setpriv of util-linux, empty without it."""
     setpriv = shutil.which("setpriv")
     return [setpriv, "--pdeathsig", "TERM"] if setpriv else []
+
+
+def start_instants(lead: float) -> tuple[float, float]:
+    """System time and monotonic time of t = 0, s, `lead` from now."""
+    return start_instant(lead), time.monotonic() + lead
 
 
 @contextmanager
@@ -90,14 +95,22 @@ class NodeProcess:
         self.node = node
         self.lines: deque[str] = deque(maxlen=20)
         module = ["-P", "-m", node.module]  # -P: a package in the working folder must not replace a package of the stack
-        command = [*end_with_parent(), sys.executable, *module, "--ros-args", "--params-file", str(scenario_file)]
+        command = [*end_with_parent(), sys.executable, *module]
+        arguments = ["--ros-args", "--params-file", str(scenario_file)]
         if namespace:
-            command += ["-r", f"__ns:={namespace}"]
+            arguments += ["-r", f"__ns:={namespace}"]
+        if node is ONE_PROCESS:  # `-p node:name` would mean a node without a namespace
+            sections, file = (
+                nest({name.replace(":", ".", 1): value for name, value in overrides.items()}),
+                log.with_suffix(".yaml"),
+            )
+            write_file(file, dump_yaml({f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}))
+            arguments, overrides = [*sections, *arguments, "--params-file", str(file)], {}
         for name, value in overrides.items():
-            command += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
         self._log = log.open("x", encoding="utf-8")
         self.popen = subprocess.Popen(  # noqa: S603 - our own interpreter and modules
-            command,
+            [*command, *arguments],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -131,7 +144,7 @@ class FlightProcesses:
     """All processes of one flight. A context manager: its exit stops them.
 
     `monitor` reports the nodes that are ready, in the same `namespace`. With an autopilot the bridge starts in the aircraft's
-    place. A flight in real time with an aircraft has its t = 0 from `begin`.
+    place. A flight in real time with an aircraft has its t = 0 from `begin`, once `match` has seen it ready.
     """
 
     def __init__(
@@ -146,9 +159,10 @@ class FlightProcesses:
         namespace: str = "",
     ) -> None:
         self._scenario, self._run, self._monitor, self._namespace = scenario, run, monitor, namespace
-        self._lockstep, self._autopilot = lockstep, autopilot
+        self._lockstep, self.autopilot = lockstep, autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
+        self._in_one_process = [spec.executable for spec in (*self._first, *self._second)]
         if one_process:
             self._first, self._second = (), (ONE_PROCESS,)
         self.processes: list[NodeProcess] = []
@@ -167,7 +181,7 @@ class FlightProcesses:
                 time.sleep(DISCOVERY_TIME)
             self._monitor.require_free_domain()
             if not self._on_start:
-                self._set_start(start_lead(time.monotonic() - begin))
+                self._set_start(start_instants(start_lead(time.monotonic() - begin)))
             for node in self._second:
                 self._start(node)
             leave_real_time_priority()  # the nodes have it
@@ -178,11 +192,11 @@ class FlightProcesses:
             raise
         return self
 
-    def _set_start(self, lead: float) -> None:
-        self.start_time, self.started = start_instant(lead), time.monotonic() + lead
+    def _set_start(self, start: tuple[float, float]) -> None:
+        self.start_time, self.started = start
 
-    def begin(self) -> str:
-        """Set t = 0 once each node is ready and each input has a publisher. Returns why the flight cannot begin, else ""."""
+    def match(self) -> str:
+        """Wait until each node is ready and each input has a publisher. Returns why the flight cannot begin, else ""."""
         deadline = time.monotonic() + READY_TIMEOUT
         while self._on_start and (waiting := self._unmatched()):
             if (reason := self.ended_early()) is not None:
@@ -190,14 +204,29 @@ class FlightProcesses:
             if time.monotonic() > deadline:
                 return f"{NEVER_FLEW}: {'; '.join(waiting)} after {READY_TIMEOUT:g} s"
             time.sleep(POLL_PERIOD)
-        if self._on_start:
-            self._set_start(LEAD)
-            self._monitor.start(self.start_time)
         return ""
+
+    def begin(self, start: tuple[float, float] | None = None) -> str:
+        """Set t = 0 after `match`. Returns why the flight cannot begin, else "".
+
+        `start`: system time and monotonic time of t = 0, s, of several flights at once; by default LEAD from now.
+        """
+        if not (reason := self.match()) and self._on_start:
+            self._set_start(start or start_instants(LEAD))
+            self._monitor.start(self.start_time)
+        return reason
+
+    def _names(self, process: NodeProcess) -> list[str]:
+        """Names of the nodes of a process."""
+        return self._in_one_process if process.node is ONE_PROCESS else [process.node.executable]
+
+    def _nodes(self) -> list[tuple[str, int]]:
+        """Names and process ids of the nodes."""
+        return [(name, process.popen.pid) for process in self.processes for name in self._names(process)]
 
     def _unmatched(self) -> list[str]:
         """What the flight waits for before t = 0, by node."""
-        names = [(process.node.executable, process.popen.pid) for process in self.processes]
+        names = self._nodes()
         ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
         without = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
         return [f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}" for name in without]
@@ -210,7 +239,7 @@ class FlightProcesses:
         log.parent.mkdir(parents=True, exist_ok=True)
         start = ON_START if self._on_start else self.start_time
         overrides = parameter_overrides(
-            node, self._scenario, self._run, start, lockstep=self._lockstep, autopilot=self._autopilot
+            node, self._scenario, self._run, start, lockstep=self._lockstep, autopilot=self.autopilot
         )
         if node is BRIDGE:
             overrides = {**overrides, "first_y": FIRST_Y}
@@ -235,23 +264,15 @@ class FlightProcesses:
 
     def waiting(self) -> list[str]:
         """The nodes that are not ready."""
-        return [
-            process.node.executable
-            for process in self.processes
-            if not self._monitor.is_ready(process.node.executable, process.popen.pid)
-        ]
+        return [name for name, pid in self._nodes() if not self._monitor.is_ready(name, pid)]
 
     def is_flying(self) -> bool:
         """Whether the aircraft has taken a u."""
-        return any(
-            self._monitor.is_flying(process.node.executable, process.popen.pid)
-            for process in self.processes
-            if process.node is AIRCRAFT
-        )
+        return any(self._monitor.is_flying(name, pid) for name, pid in self._nodes() if name == AIRCRAFT.executable)
 
     def last_words(self, node: NodeSpec) -> str:
         """The last line of a node on a topic that it waits for, or on a refused sample; empty without one."""
-        lines = [line for process in self.processes if process.node is node for line in process.lines]
+        lines = [line for process in self.processes if node.executable in self._names(process) for line in process.lines]
         line = next((line for line in reversed(lines) if "waiting for" in line or "refused" in line), "")
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 

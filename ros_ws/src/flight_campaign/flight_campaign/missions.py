@@ -16,6 +16,7 @@ from jax import numpy as jnp
 from numpy.typing import NDArray
 
 from aircraft_sim import pose as pose_model
+from aircraft_sim.params import StartConfig
 from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
@@ -123,6 +124,7 @@ def require_mission(scenario: Scenario) -> GuidanceConfig:
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices, which a campaign varies")
     without_feedforward = scenario.controller.guard().nominal is None
     require(without_feedforward, "controller.feedforward", "a model", "none where guidance commands the reference")
+    require(aircraft.start == StartConfig(), "aircraft.start", "another place", "the origin in a campaign of missions")
     require(not guidance.program, "guidance.program", ", ".join(guidance.program), "a route alone in a campaign of missions")
     require(not reference.live.bounds, "reference_model.live.bounds", "bounds", "none in a campaign of missions")
     profile = reference.profile()

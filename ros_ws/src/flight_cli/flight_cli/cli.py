@@ -26,6 +26,7 @@ REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 COMMANDS = MappingProxyType(
     {
         "fly": "Fly a scenario over ROS 2 topics, in real time or in lockstep, or in one process.",
+        "fleet": "Fly several aircraft at once over ROS 2 topics, each in its namespace.",
         "report": "Write the report page of a recorded run again, or one that compares several.",
         "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
         "play": "Publish the topics of a recorded flight again with their timing.",

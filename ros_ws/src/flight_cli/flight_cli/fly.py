@@ -41,6 +41,9 @@ def fly(
         bool, typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.")
     ] = False,
     one_process: Annotated[bool, typer.Option("--one-process", help="Fly in lockstep with all nodes in one process.")] = False,
+    composed: Annotated[
+        bool, typer.Option("--composed", help="Fly with all nodes in one process, in real time: a third of the processor time.")
+    ] = False,
     bridge: Annotated[
         str | None,
         typer.Option(
@@ -74,7 +77,10 @@ def fly(
     """
     chosen = find_scenario(scenario, duration, with_route=route is None)
     require(
-        not (in_process and (lockstep or one_process)), "--in-process", "a flight over topics, in lockstep", "one of the two"
+        not (in_process and (lockstep or one_process or composed)),
+        "--in-process",
+        "a flight over topics, in lockstep",
+        "one of the two",
     )
     require(not (in_process and namespace), "--namespace", "a flight in one process", "a flight over topics, which has nodes")
     namespace = absolute_namespace(namespace)
@@ -82,6 +88,7 @@ def fly(
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
+    require(autopilot is None or not composed, "--composed", "a flight with a bridge", "one process a node")
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     files = route or fence
     for option, value in (("--origin", origin), ("--altitude", altitude), ("--simplify", simplify or None)):
@@ -108,7 +115,7 @@ def fly(
                 run,
                 progress,
                 lockstep=stepping,
-                one_process=one_process,
+                one_process=one_process or composed,
                 autopilot=autopilot,
                 namespace=namespace,
                 announce=announce,

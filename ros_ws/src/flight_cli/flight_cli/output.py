@@ -88,7 +88,8 @@ def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wr
     return table
 
 
-COUNT_COLUMNS = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+NAME_COLUMN = TextColumn("{task.description}")
+COUNT_COLUMNS = (NAME_COLUMN, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 SHOWN_COLUMN = TextColumn("{task.fields[shown]}")
 CLOCK_COLUMNS = (TextColumn("{task.fields[clock]}"), BarColumn(), SHOWN_COLUMN)
 """Columns of progress bars: a count and the time that is left, a text, a clock with a text."""
@@ -99,6 +100,11 @@ def progress_bar(*columns: ProgressColumn, quiet: bool = False) -> Progress:
     return Progress(*columns, console=Console(stderr=True, quiet=quiet))
 
 
+def clock(t: float, duration: float) -> str:
+    """The flight time of a progress bar, s."""
+    return f"t = {t:5.1f} of {duration:g} s"
+
+
 @contextmanager
 def flight_progress(duration: float, *, quiet: bool) -> Iterator[tuple[Callable[[float, str], None], Callable[[str], None]]]:
     """The progress bar of a flight, s: a function for the flight time and the text beside it, and one for a line above."""
@@ -106,7 +112,7 @@ def flight_progress(duration: float, *, quiet: bool) -> Iterator[tuple[Callable[
         task = bar.add_task("flight", total=duration, clock="", shown="")
 
         def progress(t: float, shown: str) -> None:
-            bar.update(task, completed=t, clock=f"t = {t:5.1f} of {duration:g} s", shown=shown)
+            bar.update(task, completed=t, clock=clock(t, duration), shown=shown)
 
         yield progress, lambda line: bar.console.print(line, highlight=False, soft_wrap=True, markup=False)
 

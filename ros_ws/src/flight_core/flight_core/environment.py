@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
 SHARED_MEMORY, LEAST_SHARED_MEMORY = Path("/dev/shm"), 1 << 16  # bytes; rclpy and a flight use 12 kB # noqa: S108
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 

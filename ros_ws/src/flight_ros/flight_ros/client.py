@@ -36,12 +36,14 @@ class Client:
     """
 
     def __init__(self, name: str, namespace: str = "", parent: "Client | None" = None, *, rosout: bool = True) -> None:
+        self._started = parent is None and not rclpy.ok()  # the first client of a process starts and ends the middleware
         if parent is None:
-            start_middleware()
+            if self._started:
+                start_middleware()
             try:
                 node = rclpy.create_node(name, namespace=namespace, start_parameter_services=False, enable_rosout=rosout)
             except (NameValidationException, *ARGUMENT_ERRORS) as error:
-                rclpy.try_shutdown()
+                self._shut_down()
                 key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
                 raise ParameterError(f"{key}: {' '.join(str(error).split())}") from None
             self._node, self._cancelled = node, threading.Event()
@@ -53,7 +55,11 @@ class Client:
 
     def __exit__(self, *_: object) -> None:
         self._node.destroy_node()
-        rclpy.try_shutdown()
+        self._shut_down()
+
+    def _shut_down(self) -> None:
+        if self._started:
+            rclpy.try_shutdown()
 
     def _spin_until(self, condition: Callable[[], bool], message: str, timeout: float = SERVICE_TIMEOUT) -> None:
         begin = time.monotonic()

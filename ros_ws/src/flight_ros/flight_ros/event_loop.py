@@ -56,7 +56,7 @@ class _Stop:
 
 
 def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participant | None = None) -> None:
-    """Run a node, or several in lockstep, until SIGINT, SIGTERM or SIGHUP. The exit status is then 0.
+    """Run a node, or several in one thread, until SIGINT, SIGTERM or SIGHUP. The exit status is then 0.
 
     Other exit statuses: 2 for invalid parameters, 3 for a flight that cannot continue, 1 for an unexpected exception. The
     `early_participant` of flight_ros.startup is destroyed once the nodes exist.
@@ -85,7 +85,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         if node.runs_in_lockstep():
             _run_lockstep(nodes, stop)
         else:
-            _run_real_time(node, stop)
+            _run_real_time(nodes, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(BAD_PARAMETERS)
@@ -169,43 +169,78 @@ def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: boo
         raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
 
 
-def _run_real_time(node: FlightNode[Any], stop: _Stop) -> None:
-    executor = _start([node])
-    while (start_ns := node.start_ns()) is None:
-        if stop.requested:
-            return
-        node.match()
-        _serve(executor, node)
+class _RealTime:
+    """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
+
+    def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
+        if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
+            key = f"{node.get_name()}.start_time"
+            raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
+        begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
+        node.time_offset_ns = start_ns - begin_ns
+        self.node, self._start_ns = node, start_ns
+        self.ticker = Ticker(node.period_ns(), begin_ns, spin=spin)
+        if (lead := start_ns - time.time_ns()) > nanoseconds(60):
+            node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
+        self._report_ns = time.monotonic_ns()
+        self._reports: deque[Callable[[], None]] = deque()
+        self._after_each = 1  # reports after each tick
+
+    def run_due_tick(self) -> bool:
+        """Run the newest tick that is due. Returns whether there was one."""
+        if (tick := self.ticker.due()) is None:
+            return False
+        self.node.run_tick(tick, self._start_ns + tick.number * self.ticker.period_ns)
+        return True
+
+    def report(self) -> None:
+        """Do the next reports. After each tick some of them: all of them together may exceed a period of 2 ms."""
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._report_ns:
+            self._report_ns = now_ns + NANOSECONDS
+            self._reports += (self.node.publish_diagnostics, self.node.check_clock, *self.node.graph_checks())
+            self._after_each = -(-len(self._reports) * self.ticker.period_ns // REPORT_TIME_NS)
+        for _ in range(min(self._after_each, len(self._reports))):
+            self._reports.popleft()()
+
+
+def _start_instants(nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop) -> list[int]:
+    """The start of each node, ns of the system clock, once all are known; none after a signal."""
+    known: dict[FlightNode[Any], int] = {}
+    given = [node for node in nodes if node.waits_for_start()]
+    while not stop.requested:
+        known |= {node: start_ns for node in given if node not in known and (start_ns := node.start_ns()) is not None}
+        if len(known) == len(given):
+            return [known[node] if node in known else node.start_ns() or 0 for node in nodes]
+        for node in nodes:
+            node.match()
+        _serve(executor, nodes[0])
         time.sleep(START_POLL_PERIOD)
-    if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
-        key = f"{node.get_name()}.start_time"
-        raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
-    begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
-    node.time_offset_ns = start_ns - begin_ns
-    ticker = Ticker(node.period_ns(), begin_ns)
-    if (lead := start_ns - time.time_ns()) > nanoseconds(60):
-        node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
-    serve_ns = report_ns = time.monotonic_ns()
-    reports: deque[Callable[[], None]] = deque()
-    after_each = 1  # reports after each tick
+    return []
+
+
+def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
+    """Run nodes in one thread, a tick at a time: of several that are due the first node's, by the order of the nodes."""
+    executor = _start(nodes)
+    starts = _start_instants(nodes, executor, stop)
+    running = [_RealTime(node, start_ns, spin=len(nodes) == 1) for node, start_ns in zip(nodes, starts, strict=False)]
+    serve_ns = time.monotonic_ns()
     disable_timer_slack()
     request_short_slices()
     while not stop.requested:
-        ticker.wait(IDLE_POLL_PERIOD)
-        if (tick := ticker.due()) is not None:
-            node.run_tick(tick, start_ns + tick.number * ticker.period_ns)
+        upcoming = min(running, key=lambda each: each.ticker.remaining())
+        upcoming.ticker.wait(IDLE_POLL_PERIOD)
+        ran = next((each for each in running if each.run_due_tick()), upcoming)
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             # Requests may take half of the time to the next tick.
-            _serve(executor, node, now_ns + nanoseconds(max(ticker.remaining(), 0.0) / 2.0))
-            node.require_peers()
-            node.match()
+            left = min(each.ticker.remaining() for each in running)
+            _serve(executor, nodes[0], now_ns + nanoseconds(max(left, 0.0) / 2.0))
+            for node in nodes:
+                node.require_peers()
+                node.match()
             duration_ns = time.monotonic_ns() - now_ns
-            pause_ns = LATE_REQUEST_PAUSE * duration_ns if ticker.remaining() <= 0.0 else 0
+            late = min(each.ticker.remaining() for each in running) <= 0.0
+            pause_ns = LATE_REQUEST_PAUSE * duration_ns if late else 0
             serve_ns = now_ns + max(nanoseconds(IDLE_POLL_PERIOD), min(pause_ns, LONGEST_PAUSE_NS))
-        if now_ns >= report_ns:
-            report_ns = now_ns + NANOSECONDS
-            reports += (node.publish_diagnostics, node.check_clock, *node.graph_checks())
-            after_each = -(-len(reports) * ticker.period_ns // REPORT_TIME_NS)
-        for _ in range(min(after_each, len(reports))):  # after each tick: all of them together may exceed a period of 2 ms
-            reports.popleft()()
+        ran.report()

@@ -91,6 +91,10 @@ class FlightNode(Node, Generic[P]):
         """Real time: the subscriptions without whose publishers a flight does not begin."""
         return ()
 
+    def waits_for_start(self) -> bool:
+        """Whether the topic `start` gives the instant of tick 0."""
+        return self._start_subscription is not None
+
     def start_ns(self) -> int | None:
         """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic `start`, None before its message.
 

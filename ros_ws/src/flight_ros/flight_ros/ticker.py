@@ -26,11 +26,11 @@ class Tick(NamedTuple):
 
 
 class Ticker:
-    """Deadlines start + k period, in ns of time.monotonic_ns()."""
+    """Deadlines start + k period, in ns of time.monotonic_ns(). Without `spin` a wait does not busy-wait."""
 
-    def __init__(self, period_ns: int, start_ns: int) -> None:
+    def __init__(self, period_ns: int, start_ns: int, *, spin: bool = True) -> None:
         self.period_ns = period_ns
-        self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9)  # s
+        self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9) if spin else 0.0  # s
         self._start_ns = start_ns
         self._last = -1
 

@@ -195,11 +195,13 @@ def write_report(
     return FlightResult(flight, min(bag_files(run), default=folder), folder / REPORT)
 
 
-def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> None:
+def write_empty_summary(run: Path, scenario: Scenario, outcome: str) -> dict[str, Any]:
     """Write summary.json of a flight with an end before the first sample. The log does not change. Raises ParameterError."""
+    summary = empty_summary(scenario, outcome)
     with writing("", run, "a folder that can"):
-        write_file(run / SUMMARY, json.dumps(empty_summary(scenario, outcome), indent=2) + "\n")
+        write_file(run / SUMMARY, json.dumps(summary, indent=2) + "\n")
     link_latest(run)
+    return summary
 
 
 def _folder(run: Path) -> Path:

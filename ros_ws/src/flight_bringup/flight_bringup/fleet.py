@@ -1,0 +1,259 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A fleet: several aircraft at once over topics, each in its namespace with its own nodes, log and report."""
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from flight_analysis.closed_loop.scenario import Scenario, require_euler
+from flight_analysis.report.run_folder import new_run
+from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow, interrupt
+from flight_bringup.graph import LEAD, absolute_namespace
+from flight_bringup.processes import FlightProcesses, handle_signals, start_instants
+from flight_bringup.scenarios import find_scenario, with_route
+from flight_core.arguments import FilePath, as_path
+from flight_core.environment import MAX_PARTICIPANTS, require_ros_environment
+from flight_core.fields import Field
+from flight_core.files import read_yaml
+from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
+from flight_core.parameters import Config, NonNegative, Number, ParameterError, Positive, require
+from flight_guidance.route_file import Origin, read_route
+
+if TYPE_CHECKING:
+    from flight_bringup.monitor import FlightMonitor
+
+BEGIN_TIME = 0.05  # s, in which the nodes of an aircraft receive t = 0, beside those of the others
+A_FLEET = "a file of a fleet (.yaml): aircraft by name"
+Degrees = Annotated[float, Field(ge=-180, le=180)]
+Overrides = dict[str, dict[str, object]]
+
+
+class AircraftOfFleet(Config):
+    """An aircraft of a fleet."""
+
+    scenario: str | None = Field(default=None, description="name or path of a scenario; by default that of the fleet")
+    set: Overrides = Field(default={}, description="parameters in place of those of the scenario, by section")
+    start: dict[str, Number] = Field(default={}, description="where it is at its t = 0: north, east, m, and heading, rad")
+    delay: NonNegative = Field(default=0.0, description="its t = 0 after that of the fleet, s")
+    route: str | None = Field(default=None, description="path of a route file, flown from the start")
+
+
+class FleetConfig(Config):
+    """A fleet as its file has it. Paths are relative to the folder of the file."""
+
+    scenario: str = Field(default="osprey_route", description="scenario of the aircraft that name none")
+    duration: Positive | None = Field(default=None, description="flight time of each aircraft, s; by default its scenario's")
+    lockstep: bool = Field(default=False, description="fly as fast as the machine allows, in lockstep, each by itself")
+    composed: bool = Field(default=False, description="all nodes of an aircraft in one process")
+    set: Overrides = Field(default={}, description="parameters of all aircraft, by section: a shared wind, for instance")
+    origin: Annotated[tuple[Degrees, ...], Field(min_length=2, max_length=2)] | None = Field(
+        default=None, description="latitude and longitude of north = east = 0, degrees; by default the home of each route"
+    )
+    aircraft: Annotated[dict[str, AircraftOfFleet], Field(min_length=1)] = Field(description="the aircraft by name")
+
+
+@dataclass(frozen=True)
+class Member:
+    """An aircraft of a fleet: its name and namespace, its scenario, and its t = 0 after that of the fleet, s."""
+
+    name: str
+    scenario: Scenario
+    delay: float = 0.0
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """A fleet, read and validated."""
+
+    name: str
+    members: tuple[Member, ...]
+    lockstep: bool = False
+    composed: bool = False
+
+    def participants(self) -> int:
+        """The DDS participants of its flight: one of the command, and one a process."""
+        nodes = [1 if self.composed else 4 + (member.scenario.guidance is not None) for member in self.members]
+        return 1 + sum(nodes)
+
+
+def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
+    """Read the file of a fleet; `duration` in s replaces that of the file. Raises ParameterError."""
+    path = as_path(file, "fleet", A_FLEET)
+    content = read_yaml(path, str(path), A_FLEET)
+    require(isinstance(content, Mapping), str(path), "no mapping", A_FLEET)
+    config = FleetConfig.validate_mapping(content, path.stem)
+    members = []
+    for name, aircraft in config.aircraft.items():
+        try:
+            namespace = absolute_namespace(name)
+            require(namespace.count("/") == 1, "name", repr(name), "one word")
+            members.append(Member(name, _scenario(config, aircraft, path.parent, duration), aircraft.delay))
+        except ParameterError as error:
+            raise ParameterError(f"{path.stem}.aircraft.{name}: {error}") from None
+        late = config.lockstep and aircraft.delay > 0.0
+        require(
+            not late, f"{path.stem}.aircraft.{name}.delay", f"{aircraft.delay:g} s", "0 in lockstep, which has no common time"
+        )
+    fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed)
+    cheaper = "" if config.composed else "; composed: true takes one an aircraft"
+    found = f"{fleet.participants()} participants of the middleware"
+    require(fleet.participants() <= MAX_PARTICIPANTS, path.stem, found, f"at most {MAX_PARTICIPANTS}{cheaper}")
+    return fleet
+
+
+def _scenario(config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, duration: float | None) -> Scenario:
+    """The scenario of an aircraft. Raises ParameterError."""
+    name = aircraft.scenario or config.scenario
+    scenario = find_scenario(folder / name if name.endswith(".yaml") else name, with_route=aircraft.route is None)
+    for changes in (config.set, aircraft.set):
+        scenario = scenario.vary(**_nested(scenario, changes))
+    if aircraft.start:
+        scenario = scenario.vary(aircraft={"start": aircraft.start})
+    if (seconds := duration or config.duration) is not None:
+        scenario = scenario.vary(flight={"duration": seconds})
+    if aircraft.route is not None:
+        origin = None if config.origin is None else Origin(*config.origin)
+        scenario = with_route(scenario, read_route(folder / aircraft.route, origin))
+    require_euler(scenario)
+    return scenario
+
+
+def _nested(scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Changes by section in which a mapping changes some keys of a group, and keeps the others."""
+
+    def merged(old: Any, new: Any) -> Any:
+        if not (isinstance(new, Mapping) and isinstance(old, Config)):
+            return new
+        values = {key: getattr(old, key) for key in old.model_fields}
+        return values | {key: merged(values.get(key), value) for key, value in new.items()}
+
+    return {
+        name: {key: merged(getattr(getattr(scenario, name, None), key, None), value) for key, value in section.items()}
+        for name, section in changes.items()
+    }
+
+
+@dataclass
+class _Flight:
+    """The flight of an aircraft of a fleet."""
+
+    member: Member
+    run: Path
+    monitor: "FlightMonitor"
+    progress: Callable[[float, str], None]
+    processes: FlightProcesses | None = None
+    steps: Steps | None = None
+    outcome: str = INTERRUPTED
+    stopping: threading.Thread | None = None
+
+    def start(self, fleet: Fleet) -> None:
+        """Start the processes. In real time wait until they are ready: a host does not start many at once."""
+        self.progress(0.0, "starting")
+        try:
+            self.processes = FlightProcesses(
+                as_file(self.member.scenario, self.run),
+                self.run,
+                self.monitor,
+                lockstep=fleet.lockstep,
+                one_process=fleet.composed,
+                namespace=absolute_namespace(self.member.name),
+            ).__enter__()
+        except ParameterError as error:
+            self.outcome = f"{NEVER_FLEW}: {error}"
+        else:
+            if reason := self.processes.match():
+                self.end(reason)
+            elif fleet.lockstep:
+                self.begin(fleet, (0.0, 0.0))
+
+    def begin(self, fleet: Fleet, start: tuple[float, float]) -> None:
+        """Begin with t = 0 at an instant of the system clock and of the monotonic clock, s; in lockstep it has begun."""
+        if self.processes is None or self.stopping is not None:
+            return
+        if reason := self.processes.begin((start[0] + self.member.delay, start[1] + self.member.delay)):
+            self.end(reason)
+        else:
+            self.steps = follow(self.member.scenario, self.processes, self.monitor, self.progress, lockstep=fleet.lockstep)
+
+    def step(self) -> bool:
+        """Look at the flight once. Returns whether it goes on."""
+        if self.steps is not None:
+            try:
+                next(self.steps)
+            except StopIteration as end:
+                self.end(str(end.value))
+        return self.steps is not None
+
+    def end(self, outcome: str) -> None:
+        """Stop the processes, in another thread: a recorder takes a while to close its log, and the others fly on."""
+        self.outcome, self.steps = outcome, None
+        self.progress(self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome)
+        if self.processes is not None and self.stopping is None:
+            self.processes.outcome = outcome
+            self.stopping = threading.Thread(target=self.processes.stop)
+            self.stopping.start()
+
+    def join(self) -> None:
+        """Wait until the processes have stopped."""
+        if self.stopping is not None:
+            self.stopping.join()
+
+
+@dataclass(frozen=True)
+class Flown:
+    """How the flight of an aircraft of a fleet ended, and the folder of its run."""
+
+    member: Member
+    run: Path
+    outcome: str
+
+
+def fly_fleet(fleet: Fleet, runs: Path, progress: Callable[[str, float, str], None]) -> list[Flown]:
+    """Fly a fleet over topics. `progress` is called with the name of an aircraft, its flight time, s, and a text.
+
+    In real time the aircraft share t = 0, which is set once every node is ready; each may begin later by its delay. An aircraft
+    that ends early, or never begins, leaves the others untouched. Ctrl-C ends all. Raises ParameterError where none can begin.
+    """
+    require_ros_environment()
+    from flight_bringup.monitor import FlightMonitor  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+    flights: list[_Flight] = []
+    with handle_signals(interrupt), ExitStack() as stack:
+        try:
+            for member in fleet.members:
+                run = new_run(member.scenario, runs, f"{member.name}-")
+                outputs, namespace = member.scenario.controller.outputs, absolute_namespace(member.name)
+                monitor = stack.enter_context(FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace))
+                flights.append(_Flight(member, run, monitor, partial(progress, member.name)))
+            for flight in flights:
+                flight.start(fleet)
+            _begin(flights, fleet)
+            while True:
+                going = [flight.step() for flight in flights]
+                if not any(going):
+                    break
+                time.sleep(POLL_PERIOD)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            with handle_signals(signal.SIG_IGN):  # as of FlightProcesses.stop, which runs in other threads
+                for flight in flights:
+                    flight.end(flight.outcome)
+                for flight in flights:
+                    flight.join()
+    return [Flown(flight.member, flight.run, flight.outcome) for flight in flights]
+
+
+def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
+    """Begin all flights in real time with one t = 0."""
+    if not fleet.lockstep:
+        start = start_instants(LEAD + BEGIN_TIME * len(flights))
+        for flight in flights:
+            flight.begin(fleet, start)

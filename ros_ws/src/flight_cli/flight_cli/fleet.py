@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di fleet`: fly several aircraft at once, then show a line an aircraft."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from flight_analysis.report.run_folder import write_empty_summary, write_report
+from flight_bringup.fleet import Flown, fly_fleet, read_fleet
+from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
+from flight_core.environment import require_ros_environment
+from flight_core.files import display_path
+from flight_core.installation import require_package
+from flight_core.modes import Mode
+from flight_core.outcome import COMPLETED, NEVER_FLEW, STATUS_ENDED_EARLY, STATUS_INCOMPLETE, STATUS_INTERRUPTED, exit_status
+from flight_core.parameters import ParameterError
+
+SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
+
+
+def fleet(
+    file: Annotated[Path, typer.Argument(help="File of the fleet (.yaml): docs/fleets.md.")],
+    duration: Annotated[
+        float | None, typer.Option(help="Flight time of each aircraft in s; by default that of the file.")
+    ] = None,
+    runs: Annotated[Path, typer.Option(help="Folder that the run's folder of each aircraft is made in.")] = Path("runs"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summaries as JSON, by name, nothing else.")] = False,
+) -> None:
+    """Fly a fleet: each aircraft in its namespace, with its own nodes, log and report.
+
+    Exit status, the severest of the aircraft: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an
+    incomplete log or a leg missed or not flown, 130 interrupted.
+    """
+    require_package("rclpy", "")
+    require_ros_environment()
+    chosen = read_fleet(file, duration)
+    totals = {member.name: member.scenario.flight.duration for member in chosen.members}
+    with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
+        tasks = {name: bar.add_task(name, total=total, clock="", shown="") for name, total in totals.items()}
+
+        def progress(name: str, t: float, shown: str) -> None:
+            bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=shown)
+
+        flown = fly_fleet(chosen, runs, progress)
+        for each in flown:
+            bar.update(tasks[each.member.name], shown=f"{each.outcome}, report to write")
+        results = {each.member.name: _report(each) for each in flown}
+    if as_json:
+        print_json({name: result.summary for name, result in results.items()})
+    else:
+        _show(chosen.name, flown, results)
+    statuses = [exit_status(result.summary["outcome"]) for result in results.values()]
+    raise typer.Exit(max(statuses, key=SEVEREST.index))
+
+
+class _Result(NamedTuple):
+    """The summary of an aircraft, and the fraction of its ticks with the controller ENGAGED; None without ticks."""
+
+    summary: dict[str, Any]
+    engaged: float | None
+
+
+def _report(flown: Flown) -> _Result:
+    """Write the report of an aircraft."""
+    try:
+        flight = write_report(flown.run, flown.outcome).flight
+    except ParameterError as error:  # before the first sample
+        outcome = f"{NEVER_FLEW}: {error}" if flown.outcome == COMPLETED else flown.outcome
+        return _Result(write_empty_summary(flown.run, flown.member.scenario, outcome), None)
+    internals = flight.tape.signals.get("internals")
+    return _Result(flight.summary, None if internals is None else float(np.mean(internals["mode"] == Mode.ENGAGED)))
+
+
+def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> None:
+    """Print a line an aircraft, the folders of the runs, and what a busy host withheld."""
+    headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
+    table, lines = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",)), []
+    for each in flown:
+        summary, engaged = results[each.member.name]
+        ticks = summary["ticks"]
+        table.add_row(
+            each.member.name,
+            "-" if summary["duration"] is None else f"{summary['duration']:.1f}",
+            "-" if ticks is None else str(ticks["ticks"]),
+            "-" if engaged is None else f"{100.0 * engaged:.4g} %",
+            summary["outcome"],
+        )
+        lines.append(f"{each.member.name}: {display_path(each.run)}")
+        if sentence := (summary["account"] or {}).get("busy"):
+            lines.append(f"  {sentence}")
+    Console().print(table)
+    print(*lines, sep="\n")

@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of fleets: what each aircraft flies, and what is refused."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from flight_bringup.fleet import read_fleet
+from flight_core.environment import MAX_PARTICIPANTS
+from flight_core.parameters import ParameterError
+from flight_ros.transport import LOOPBACK_PROFILE
+
+pytestmark = pytest.mark.package("flight_bringup")
+
+FLEET = """
+duration: 3.0
+set: {aircraft: {wind: [2.0, -1.0], turbulence: {seed: 7}}}
+aircraft:
+  uav1: {}
+  uav2: {start: {north: 50.0, heading: 0.5}, delay: 1.5, set: {controller: {k_g: 2.5}}}
+  uav3: {route: there.yaml}
+"""
+
+
+def fleet_file(folder: Path, text: str) -> Path:
+    file = folder / "fleet.yaml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Path) -> None:
+    (tmp_path / "there.yaml").write_text("route: [[0, 400, 10], [400, 400, 10]]\n", encoding="utf-8")
+    first, second, third = read_fleet(fleet_file(tmp_path, FLEET)).members
+    for member in (first, second, third):
+        assert member.scenario.aircraft.wind == (2.0, -1.0)
+        assert member.scenario.aircraft.turbulence is not None
+        assert (member.scenario.aircraft.turbulence.seed, member.scenario.aircraft.turbulence.wind) == (
+            7,
+            7.7,
+        )  # of osprey_route
+        assert member.scenario.flight.duration == 3.0
+    assert (second.delay, second.scenario.aircraft.start.north, second.scenario.aircraft.start.heading) == (1.5, 50.0, 0.5)
+    assert first.scenario.rise_di().k_g != second.scenario.rise_di().k_g == 2.5
+    assert third.scenario.guidance is not None
+    assert third.scenario.guidance.route is not None
+    assert third.scenario.guidance.route.east == (400.0, 400.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("aircraft: {}", "fleet.aircraft: found 0 values, expected at least 1 value"),
+        ("aircraft: {1a: {}}", "fleet.aircraft.1a: --namespace: found '1a', expected letters"),
+        ("aircraft: {a/b: {}}", "fleet.aircraft.a/b: name: found 'a/b', expected one word"),
+        ("aircraft: {a: {scenari: x}}", r"fleet.aircraft.a.scenari: unknown key, expected scenario perhaps"),
+        ("lockstep: true\naircraft: {a: {delay: 1.0}}", "fleet.aircraft.a.delay: found 1 s, expected 0 in lockstep"),
+        ("aircraft: {a: {set: {aircraft: {winds: 1}}}}", "fleet.aircraft.a: aircraft.winds: unknown key"),
+        (f"aircraft: {{{', '.join(f'a{k}: {{}}' for k in range(20))}}}", "fleet: found 101 participants .* composed: true"),
+    ],
+)
+def test_bad_fleet_is_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=f"^{sentence}"):
+        read_fleet(fleet_file(tmp_path, text))
+
+
+def test_profile_takes_as_many_participants_as_fleet_may_have() -> None:
+    assert ElementTree.parse(LOOPBACK_PROFILE).findtext(".//{*}maxInitialPeersRange") == str(MAX_PARTICIPANTS)
