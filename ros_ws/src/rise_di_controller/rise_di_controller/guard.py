@@ -222,7 +222,7 @@ def retune(
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
     An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
-    the same motion: z is that of the new filter over these ticks, the mean of u becomes trim, and u_o holds the rest.
+    the same motion: z is that of the new filter over these ticks, and u_o takes the part of the law.
     Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Arguments:
     `nominal`, the models of the old and the new feedforward.
     """
@@ -238,14 +238,11 @@ def retune(
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
         if other_model or other_nominal:
-            # The mean of the law's part is trim. The rest passes to u_o, which goes on to -F z at its own rate.
-            mean = np.mean([past.u for past in state.history], axis=0) - change
-            rest = state.u - state.u_trim - state.u_ff - mean
-            limits = new.params.limits
+            # The law's part passes to u_o, which goes on to -F z at its own rate.
+            rest, limits = state.u - state.u_trim - state.u_ff, new.params.limits
             u_o = np.clip(rest, limits.lower, limits.upper)
-            inner = shifted(law.law, rest - u_o - (state.u - state.u_trim - state.u_ff + change - law.u_o), new.params.law)
-            z = observer.estimates_after(state.history, mean + change, new.params)
-            state = state._replace(u_trim=state.u_trim + mean)
+            inner = shifted(law.law, rest - u_o - (rest + change - law.u_o), new.params.law)
+            z = observer.estimates_after(state.history, change, new.params)
             law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
         return state._replace(law=law)
     if other_model and not _same_model(old.params, new.params):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flight_core.arithmetic import product
+from flight_core.arithmetic import inverse, product
 from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits, saturate
@@ -64,20 +64,22 @@ def initial_estimates(e: Array, params: ObserverParams) -> Array:
 def estimates_after(history: tuple[PastTick, ...], change: Array, params: ObserverParams) -> Array:
     """Estimates of the filter over the last ticks, predicted for the next tick.
 
-        z = z + L (e - H z),  z = Phi z + Gamma (u - change)        from H'e of the first tick with a y,
+        z = (I - Phi (I - L H))^-1 (Phi L mean(e) + Gamma mean(u - change))        its steady state at the means
+        z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    A tick without a y has no correction. The products with e and u are those of all ticks together, which takes a third of the
-    time. Arguments: `history` with a y at least; `change` of the feedforward since then, (m,).
+    So the filter knows what the law held, which takes longer than the record to estimate. A tick without a y has no
+    correction. The products with e and u are those of all ticks together, which takes a third of the time. Arguments: `history`
+    with a y at least; `change` of the feedforward since then, (m,).
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
     u = np.array([tick.u - change for tick in history]).T
     gain = product(params.Phi, params.L)
-    added = (product(gain, e) + product(params.Gamma, u)).T
+    by_e, by_u = product(gain, e), product(params.Gamma, u)
     corrected = params.Phi - product(gain, params.H)
-    z = initial_estimates(history[int(np.argmax(known))].e, params)
-    for has_y, addend in zip(known, added, strict=True):
+    z = product(inverse(np.eye(len(corrected)) - corrected), np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1))
+    for has_y, addend in zip(known, (by_e + by_u).T, strict=True):
         z = product(corrected if has_y else params.Phi, z) + addend
     return z
 
