@@ -17,9 +17,18 @@ from tests.damaged import DAMAGES, damage
 from tests.recordings import EPOCH
 from typer.testing import CliRunner
 
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
-from flight_analysis.report.account import Account, Commands, ProcessAccount, TopicAccount, account_of_json
+from flight_analysis.report.account import (
+    Account,
+    Commands,
+    ProcessAccount,
+    TopicAccount,
+    account,
+    account_of_json,
+    final_outcome,
+)
 from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
 from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
@@ -191,6 +200,15 @@ def test_nodes_started_one_by_one_have_outcome_of_their_samples(
     path = written(find_scenario("osprey_gust", 2.0), tmp_path / "short.yaml").path
     part = replace(tape, signals={topic: tape[topic] for topic in topics})
     assert read_flight(write_run(part, tmp_path / "run", LogAttachments(path))).summary["outcome"] == outcome
+
+
+@pytest.mark.parametrize(
+    ("begin", "outcome"), [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")]
+)
+def test_flight_counts_from_its_first_u(begin: float, outcome: str, tape: Tape, osprey_gust: Scenario) -> None:
+    """As of a controller that takes a y after many that were too old."""
+    late = {name: tape[name] for name in ("y", "y_m", "truth")} | {"u": tape["u"].where(tape.time("u") >= begin)}
+    assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(outcome)
 
 
 def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:

@@ -664,16 +664,29 @@ def followed(
     monitor: "FlightMonitor",
     announce: Callable[[str], None] = lambda line: None,
     engaged_for: float = np.inf,
+    begins: bool = False,
 ) -> str:
-    """The outcome of a flight of osprey_gust, 60 s, with an autopilot."""
+    """The outcome of a flight of osprey_gust, 60 s, with an autopilot or else with an aircraft that begins it."""
     scenario = find_scenario("osprey_gust")
-    span = _Span(scenario, processes, monitor, begins=False)
+    span = _Span(scenario, processes, monitor, begins=begins)
     return last(_follow_real_time(scenario, processes, monitor, lambda t, text: None, announce, engaged_for, span))
 
 
-@pytest.mark.parametrize(("until", "end"), [(60.0, 60.0), (59.0, 64.0), (None, 60.0)])
-def test_flight_with_autopilot_ends_once_log_holds_it(until: float | None, end: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """5 s after a log that stopped 1 s before the end. A log without u, of no engagement, is not waited for."""
+@pytest.mark.parametrize(
+    ("begins", "until", "end", "outcome"),
+    [
+        (False, 60.0, 60.0, "completed"),
+        (False, 59.0, 64.0, "completed"),
+        (False, None, 60.0, "completed"),
+        (True, 60.0, 60.0, "completed"),
+        (True, 58.0, 63.0, "ended early: the log holds y, y_m and u up to t = 58.000 of 60 s"),
+        (True, None, 60.0, "ended early: the log does not hold y, y_m and u of 60 s"),
+    ],
+)
+def test_flight_ends_once_log_holds_it(
+    begins: bool, until: float | None, end: float, outcome: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log that stops is waited for for 5 s. With an autopilot (not `begins`) u may end, or never begin."""
     now = [0.0]
 
     def sleep(period: float) -> None:
@@ -684,9 +697,9 @@ def test_flight_with_autopilot_ends_once_log_holds_it(until: float | None, end: 
     def recorded() -> float | None:
         return None if until is None else 1000.0 + min(now[0], until)
 
-    processes = SimpleNamespace(started=0.0, start_time=1000.0, ended_early=lambda: None)
+    processes = SimpleNamespace(started=0.0, start_time=1000.0, ended_early=lambda: None, is_flying=lambda: True)
     monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=recorded)
-    assert followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor)) == "completed"
+    assert followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins) == outcome
     assert now[0] == pytest.approx(end, abs=0.1)
 
 

@@ -289,12 +289,15 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     assert not all_matched(follow, context, FLYING[:-1])
     assert not flown_to(context, follow, time.time() + 5.0)
     assert context.ros_node.published == []
-    all_matched(follow, context, FLYING[-1:])
+    timers = every(TimerAction, all_matched(follow, context, FLYING[-1:]))
     ((topic, message),) = context.ros_node.published
     start = stamp_of(message) / NANOSECONDS
     assert topic == "/start"
     assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # half a second in which `start` reaches the nodes
     assert not flown_to(context, follow, start + 4.9)
+    (give_up,) = every(OpaqueFunction, timers[-1].actions)
+    with pytest.raises(RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"):
+        give_up.function(context)
     flown = flown_to(context, follow, start + 5.0)
     assert ends(flown)
     (leave,) = every(OpaqueFunction, flown)

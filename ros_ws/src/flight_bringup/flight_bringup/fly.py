@@ -25,7 +25,7 @@ from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
 from flight_core.files import writing
-from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.signals import handle_shutdown
@@ -148,16 +148,21 @@ class _Span:
     def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", *, begins: bool) -> None:
         self._duration, self._processes, self._monitor = scenario.flight.duration, processes, monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
-        self._moved = -math.inf  # s, flight time of the last change
-        self._flies = not begins
+        self._moved = 0.0 if begins else -math.inf  # s, flight time of the last change
+        self._flies, self._begins = not begins, begins
         self.engaged = False  # the controller has published
 
-    def complete(self, t: float) -> bool:
-        """Whether the log holds the flight, or is not going to."""
+    def outcome(self, t: float) -> str:
+        """The outcome once the log holds the flight, or is not going to; empty before."""
         if (stamp := self._monitor.recorded()) is not None and stamp - self._processes.start_time > self._until:
             self._until, self._moved = stamp - self._processes.start_time, t
-        held = self._until >= self._duration - STAMP_ERROR
-        return t >= self._duration and (held or (self._flies and t >= self._moved + LOG_TIMEOUT))
+        if t < self._duration:
+            return ""
+        if self._until >= self._duration - STAMP_ERROR:
+            return COMPLETED
+        if not self._flies or t < self._moved + LOG_TIMEOUT:
+            return ""
+        return ended_early(self._until, self._duration) if self._begins else COMPLETED
 
     def failed(self, t: float) -> str:
         """Why the flight has not begun; empty while it may begin, and from the first u on."""
@@ -184,8 +189,8 @@ def _follow_real_time(
     engaged_at = math.inf
     while True:
         t = time.monotonic() - processes.started
-        if span.complete(t):
-            return COMPLETED
+        if outcome := span.outcome(t):
+            return outcome
         if (reason := processes.ended_early()) is not None:
             return reason
         if reason := span.failed(t):

@@ -16,6 +16,13 @@ STATUS_INCOMPLETE = 4  # completed with an incomplete log, or a leg missed or no
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
 
+def ended_early(held: float, duration: float) -> str:
+    """The outcome of a flight of `duration` s whose log holds y, y_m and u up to the flight time `held`, s; -inf: none."""
+    if held < 0.0:
+        return f"ended early: the log does not hold y, y_m and u of {duration:g} s"
+    return f"ended early: the log holds y, y_m and u up to t = {held:.3f} of {duration:g} s"
+
+
 def exit_status(outcome: str) -> int:
     """Exit status of a flight by the outcome."""
     if outcome.startswith(f"{COMPLETED}, "):

@@ -13,7 +13,7 @@ import numpy as np
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.guided import FlownLeg, flown_legs, unflown_legs
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, NOT_FLOWN, UNKNOWN
+from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, NOT_FLOWN, UNKNOWN, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
@@ -87,6 +87,7 @@ class Account(NamedTuple):
     unflown: tuple[int, ...] = ()  # numbers of the legs that were ahead when the flight ended, in order
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
+    late: float | None = None  # s, flight time of the first u of a flight that flew less than half of its time
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -108,7 +109,7 @@ class Account(NamedTuple):
         return {
             "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
             "unflown": list(self.unflown), "processes": {name: of._asdict() for name, of in self.processes.items()},
-            "commands": None if self.commands is None else self.commands._asdict(),
+            "commands": None if self.commands is None else self.commands._asdict(), "late": self.late,
         }  # fmt: skip
 
 
@@ -120,6 +121,8 @@ def final_outcome(outcome: str, account: Account) -> str:
     An early end stays as it is.
     """
     base = SHORTFALL.sub("", outcome)
+    if base == COMPLETED and account.late is not None:
+        return f"{NEVER_FLEW}: the first u came at t = {account.late:.3f} of {account.end:.3f} s"
     if base == COMPLETED and account.unguided:
         return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
     if not base.startswith((COMPLETED, UNKNOWN)):
@@ -147,7 +150,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
     held, planned = min(int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop), scenario.flight.duration
     if held >= tape.start_ns + nanoseconds(planned) - LATE_TICK_NS:
         return COMPLETED
-    return f"ended early: the log holds y, y_m and u up to t = {seconds(held - tape.start_ns):.3f} of {planned:g} s"
+    return ended_early(seconds(held - tape.start_ns), planned)
 
 
 def flown(tape: Tape) -> Tape:
@@ -202,7 +205,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     guided = [topics[name] for name in GUIDED if name in topics]
     unguided = bool(guided) and all(topic.expected and not topic.found and not topic.unset for topic in guided)
     late = {} if scenario is None else _latest(scenario)
-    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end, late.get(name, 0.0)))]
+    first = _late_first_u(topics, scenario) if from_start else None
+    lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end, late.get(name, 0.0), first))]
     busy = [
         f"{topic.unsent} of {topic.expected} {name} were never sent"
         for name, topic in topics.items()
@@ -213,7 +217,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     unflown = unflown_legs(tape, section) if legs and section is not None else ()
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
     return Account(
-        end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown), _processes(tape)
+        end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown), _processes(tape),
+        late=first if first is not None and first > end / 2.0 else None,
     )  # fmt: skip
 
 
@@ -329,9 +334,26 @@ def _latest(scenario: Scenario) -> dict[str, float]:
     return {"y": aircraft.sensors.delay, "pose": aircraft.pose.delay + aircraft.pose_every() / aircraft.rate}
 
 
-def _lack(name: str, topic: TopicAccount, end: float, late: float) -> str:
-    """What a topic lacks, as a sentence without a verb; empty for a whole topic. `late`: of the last sample, s."""
+def _late_first_u(topics: Mapping[str, TopicAccount], scenario: Scenario | None) -> float | None:
+    """Flight time of the first u where it came more than SILENCE after the first y could; None for one in time.
+
+    A controller that a user activates has none in time.
+    """
+    if scenario is None or not (scenario.controller.autostart and scenario.controller.start_active):
+        return None
+    firsts = [first for name in TICKS if name in topics and (first := topics[name].first) is not None]
+    late = min(firsts, default=0.0) - scenario.aircraft.sensors.delay > SILENCE
+    return min(firsts) if late else None
+
+
+def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: float | None) -> str:
+    """What a topic lacks, as a sentence without a verb; empty for a whole topic.
+
+    `late`: of the last sample, s; `first_u`: the flight time of a late first u, s.
+    """
     facts = []
+    if name == "u" and first_u is not None:
+        facts.append(f"begins at t = {first_u:.3f} of {end:.3f} s")
     if topic.step and topic.last is not None:
         facts.append(f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s")
     if topic.unset:
@@ -364,4 +386,5 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     processes = {name: ProcessAccount(**of) for name, of in content.get("processes", {}).items()}
     commands = None if content.get("commands") is None else Commands(**content["commands"])
     lacks = tuple(content["lacks"])
-    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands)
+    late = content.get("late")
+    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands, late)

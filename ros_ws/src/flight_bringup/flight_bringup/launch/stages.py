@@ -35,7 +35,7 @@ from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
 from flight_bringup.graph import AIRCRAFT, LEAD, NodeSpec, start_instant, start_lead
 from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
 from flight_bringup.scenarios import scenarios
-from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
@@ -46,7 +46,6 @@ from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
 SHUTDOWN_DELAY = 0.05  # s
-UNHELD = "flight completed, and the log does not hold the end"
 
 
 class NodeStateEvent(Event):
@@ -204,7 +203,7 @@ def begin_when_matched(
     End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end. A node that does
     not get so far, and an aircraft that takes no u, end the launch with exit status 1.
     """
-    waiting, flying, end_ns = dict.fromkeys(nodes), [], [0]
+    waiting, flying, start_ns, held_ns = dict.fromkeys(nodes), [], [0], [-1]
     publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", STATE).publish
 
     def matched(spec: NodeSpec) -> Sequence[Action]:
@@ -213,7 +212,7 @@ def begin_when_matched(
             return []
         start_time = start_instant(LEAD)
         publish(instant(nanoseconds(start_time)))
-        end_ns[0] = nanoseconds(start_time + duration)
+        start_ns[0] = nanoseconds(start_time)
         return [
             TimerAction(period=LEAD + FIRST_U, actions=[OpaqueFunction(function=require_flight)]),
             TimerAction(period=LEAD + duration + 2.0 * LOG_TIMEOUT, actions=[OpaqueFunction(function=give_up)]),
@@ -226,23 +225,27 @@ def begin_when_matched(
     def require_matched(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in waiting)
-            end(f"{names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
+            end(f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
 
     def require_flight(context: LaunchContext) -> None:
         if not flying and not context.is_shutdown:
-            end(
-                "y did not reach the controller, or u did not reach the aircraft; the lines of the nodes say what they wait for"
-            )
+            lines = "the lines of the nodes say what they wait for"
+            end(f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the aircraft; {lines}")
 
-    def end(reason: str) -> None:
-        leave_outcome(run, f"{NEVER_FLEW}: {reason}")
-        raise RuntimeError(f"{NEVER_FLEW}: {reason}")
+    def give_up(context: LaunchContext) -> None:
+        if not context.is_shutdown:
+            end(ended_early((held_ns[0] - start_ns[0]) / NANOSECONDS, duration))
 
-    def give_up(context: LaunchContext) -> list[Action]:
-        return [] if context.is_shutdown else complete(run, UNHELD)
+    def end(outcome: str) -> None:
+        leave_outcome(run, outcome)
+        raise RuntimeError(outcome)
+
+    def held(stamp_ns: int) -> bool:
+        held_ns[0] = stamp_ns
+        return stamp_ns >= start_ns[0] + nanoseconds(duration) and start_ns[0] > 0
 
     return [
-        _complete_at(context, run, lambda stamp_ns: stamp_ns >= end_ns[0] > 0, by_rosbag2=by_rosbag2),
+        _complete_at(context, run, held, by_rosbag2=by_rosbag2),
         *(on_state(context, spec, NodeState.MATCHED, lambda spec=spec: matched(spec)) for spec in nodes),
         on_state(context, AIRCRAFT, NodeState.FLYING, fly),
         TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_matched)]),
@@ -266,7 +269,7 @@ def end_with_log(
         if context.is_shutdown:
             return []
         moves = time.monotonic() < last[0] + LOG_TIMEOUT
-        return [TimerAction(period=LOG_TIMEOUT, actions=complete(run, UNHELD))] if moves else complete(run)
+        return [TimerAction(period=LOG_TIMEOUT, actions=complete(run))] if moves else complete(run)
 
     timer = TimerAction(period=lead + duration, actions=[OpaqueFunction(function=end)])
     return [timer, _complete_at(context, run, held, by_rosbag2=by_rosbag2)]
