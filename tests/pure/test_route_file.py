@@ -162,6 +162,7 @@ def zipped(**files: str) -> bytes:
 TRACK = "<gx:Track xmlns:gx='http://www.google.com/kml/ext/2.2'><altitudeMode>absolute</altitudeMode>" + "".join(
     f"<when>2026-01-01T00:00:0{k}Z</when><gx:coord>{lon} {lat} {h}</gx:coord>" for k, (lon, lat, h) in enumerate(SQUARE)
 )
+ABSOLUTE = "<altitudeMode>absolute</altitudeMode>"
 RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
 
 
@@ -177,6 +178,7 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
         ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}}),
         ("r.kml", kml(f"<Placemark><MultiGeometry>{RING}</MultiGeometry></Placemark>{KML_POINTS}")),
         ("r.kml", kml(f"<Polygon><outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>")),
+        ("r.kml", kml(f"<Polygon>{ABSOLUTE}<outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>", mode="")),
         ("r.kml", kml(f"<Placemark>{TRACK}</gx:Track></Placemark>{KML_POINTS}")),
         ("r.kml", kml(KML_LINE.replace(",", ", "))),
         ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),

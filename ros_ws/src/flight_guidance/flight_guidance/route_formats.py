@@ -258,16 +258,18 @@ def _read_kml(content: bytes, key: str) -> Places:
     kinds = [(_kind(element), element) for element in root.iter()]
     others = [kind for kind, _ in kinds if kind in KML_OTHERS]
     has_line = any(kind in KML_LINES for kind, _ in kinds)
+    # The altitudeMode of a Polygon is that of its rings.
+    of_polygon = {ring: polygon for kind, polygon in kinds if kind == "Polygon" for ring in polygon.iter()}
     for kind, element in kinds:
         if kind == "Point" and has_line:
             geometries.append(_Geometry(kind, []))  # a mark, at any altitude
         elif kind in (*KML_LINES, "Point"):
-            geometries.append(_Geometry(kind, _kml_places(key, kind, element)))
+            geometries.append(_Geometry(kind, _kml_places(key, kind, element, of_polygon.get(element))))
     return _one_route(key, geometries, others)
 
 
-def _kml_places(key: str, kind: str, element: Element) -> list[Place]:
-    texts = {_kind(child): child.text or "" for child in element}
+def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) -> list[Place]:
+    texts = {_kind(child): child.text or "" for parent in (polygon, element) if parent is not None for child in parent}
     mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
     found = f"a {kind} with the altitudeMode {short_repr(mode)}"
     require(mode in KML_MODES, key, found, "absolute, for the height of the ground is not known")
