@@ -1,65 +1,178 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Uncertain aircraft on a route that leads out of a fence, in wind and turbulence: how many leave the fence, and how far.
+"""Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave the fence, and how far.
 
-    .venv/bin/python -m benchmarks.fence [--aircraft 2000] [--wind 0.3] [--seed 7]
+    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16] [--shapes square ell] [--aircraft 2000] > fence.csv
 
-Every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`), the turbulence is light (MIL-F-8785C, 7.7 m/s at
-20 ft), the steady wind from behind is a share of V0. The fence is a square, the edge ahead is 500 m away, home is the start. A
-route that leaves the fence is refused before a flight; so the fence is put round the mission afterwards. Exit status 1: an
-aircraft left the fence, or diverged.
+A row a shape and a wind. Of the osprey a fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
+An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The
+aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status
+1: an aircraft left the fence, or was lost.
 """
 
 import argparse
+import csv
+import math
+import sys
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+from benchmarks.guidance import aircraft_of, turbulence
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, missions
 from flight_campaign.benchmark_course import build_course
+from flight_core.outcome import COMPLETED
 from flight_guidance.fence import Fence, Zone
+from flight_guidance.params import GuidanceConfig
 
-FENCE = Fence((Zone((-400.0, 500.0, 500.0, -400.0), (-450.0, -450.0, 450.0, 450.0)),))
-DURATION, CHUNK, UNCERTAINTY = 32.0, 250, 0.3
-"""s: the aircraft meets the edge after 9 to 14 s, home follows; aircraft in one flight; share of the entries of A and B."""
+OSPREY = "osprey"
+AIRCRAFT = (OSPREY, "c172p", "f16")
+CHUNK, UNCERTAINTY = 250, 0.3
+"""Aircraft in one flight; share of the entries of A and B."""
+
+HOME = (-1.0, 0.0)  # radii
+SHAPES: Mapping[str, tuple[Zone, ...]] = {
+    "square": (Zone((-2.5, 2.5, 2.5, -2.5), (-2.2, -2.2, 2.2, 2.2)),),
+    "slanting edge": (Zone((-2.5, 1.5, 4.0, -2.5), (-2.5, -2.5, 2.5, 2.5)),),
+    "ell": (Zone((-2.5, 3.0, 3.0, 0.2, 0.2, -2.5), (-2.2, -2.2, 1.4, 1.4, 4.5, 4.5)),),
+    "circle": (Zone((-0.5,), (0.0,), 3.0),),
+    "no-fly zone": (
+        Zone((-2.5, 8.0, 8.0, -2.5), (-5.0, -5.0, 5.0, 5.0)),
+        Zone((2.0, 3.5, 3.5, 2.0), (-1.0, -1.0, 1.0, 1.0), exclude=True),
+    ),
+}
+"""Fences in least radii of the aircraft in the wind."""
+
+WINDS: Mapping[str, tuple[float, float]] = {
+    "calm": (0.0, 0.0),
+    "0.3 V from behind": (0.3, 0.0),
+    "0.3 V across": (0.0, 0.3),
+    "0.3 V from ahead": (-0.3, 0.0),
+}
+"""Where the air moves to: north and east, of V0."""
+
+DURATION = 8.0
+"""Radii at V0: 3 to the fence against the wind, a turn, and the way home."""
+
+
+class Row(NamedTuple):
+    """The flights of an aircraft at a fence in a wind."""
+
+    aircraft: str
+    fence: str
+    wind: str
+    flights: int
+    outside: int  # flights
+    farthest: float  # m beyond the fence
+    turned: int  # flights with a bank of nine tenths of the largest
+    lost: int  # flights
+
+
+def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
+    """Zones in m."""
+
+    def scaled(values: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(radius * value for value in values)
+
+    return tuple(Zone(scaled(zone.north), scaled(zone.east), radius * zone.radius, zone.exclude) for zone in zones)
+
+
+def windy(scenario: Scenario, wind: str) -> tuple[Scenario, GuidanceConfig, float]:
+    """A scenario in a wind, without a route, that flies to the north; its section, and the least radius, m."""
+    if scenario.guidance is None:
+        raise ValueError(f"{scenario.name} has no guidance")
+    speed = scenario.guidance.speed
+    north, east = (share * speed for share in WINDS[wind])
+    section = scenario.guidance.model_copy(update={"wind": math.hypot(north, east)})
+    radius = float(math.ceil(section.least_radius()))
+    varied = scenario.vary(
+        flight={"duration": float(math.ceil(DURATION * radius / speed))},
+        aircraft={"wind": [north, east], "turbulence": turbulence(scenario, 1)},
+        guidance={"wind": section.wind, "route": None, "home": dict(zip(("north", "east"), at(HOME, radius), strict=True))},
+    )
+    return varied, section, radius
+
+
+def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
+    """A place in m."""
+    return place[0] * radius, place[1] * radius
+
+
+def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
+    """The row of uncertain ospreys. The fence is put round the mission afterwards, as guidance refuses a route out of it."""
+    scenario, _, radius = windy(find_scenario("osprey_route"), wind)
+    route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
+    scenario, airframe = scenario.vary(guidance={"route": route}), load_airframe("osprey")
+    course, vehicle = build_course(scenario), fleet.vehicle(scenario)
+    mission = missions.build(scenario, course)
+    fence = Fence(of_radius(SHAPES[shape], radius), at(HOME, radius))
+    mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
+    control_law, params = scenario.controller.tuned_law()
+    beyond, banks, lost = [], [], 0
+    for first in range(0, aircraft, CHUNK):
+        A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
+        directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
+        assembled = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
+        result = fleet.fly(assembled, vehicle, course, control_law, fleet.shared(params), mission)
+        figures = result.mission or {}
+        beyond += np.asarray(figures["max.breach"]).tolist()
+        banks += np.asarray(figures["max.phi"]).tolist()
+        lost += int(np.sum(np.asarray(result.diverged)))
+    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)
+
+
+def fly_alone(name: str, shape: str, wind: str) -> Row:
+    """The row of an aircraft of JSBSim, which flies to the north."""
+    scenario, section, radius = windy(aircraft_of(name), wind)
+    zones = of_radius(SHAPES[shape], radius)
+    fence = {
+        f"zone{k}": {"north": zone.north, "east": zone.east, "radius": zone.radius or None, "exclude": zone.exclude}
+        for k, zone in enumerate(zones)
+    }
+    program = {"course": {"start": [0.1], "value": [0.0]}}
+    tape = simulate(scenario.vary(guidance={"fence": fence, "program": program}))
+    beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
+    bank = float(np.abs(tape["pose"]["phi"]).max())
+    return row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
+
+
+def row_of(name: str, shape: str, wind: str, beyond: list[float], banks: list[float], lost: int, largest: float) -> Row:
+    """A row from the distances beyond the fence, m, and the largest banks of the flights."""
+    outside, turned = sum(distance > 0.0 for distance in beyond), sum(bank > 0.9 * largest for bank in banks)
+    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost)
+
+
+def rows(names: list[str], shapes: list[str], winds: list[str], aircraft: int, seed: int) -> Iterator[Row]:
+    """The rows of aircraft, shapes and winds."""
+    for name in names:
+        for shape in shapes:
+            for wind in winds:
+                yield fly_fleet(shape, wind, aircraft, seed) if name == OSPREY else fly_alone(name, shape, wind)
 
 
 def main() -> int:
-    """Fly the chunks and print the figures."""
+    """Fly and print the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--aircraft", type=int, default=2000)
-    parser.add_argument("--wind", type=float, default=0.3, help="share of V0")
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--only", nargs="*", choices=[*AIRCRAFT, "737"], default=[*AIRCRAFT], help="aircraft")
+    parser.add_argument("--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences")
+    parser.add_argument("--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds")
+    parser.add_argument("--aircraft", type=int, default=2000, help="ospreys in each row")
+    parser.add_argument("--seed", type=int, default=7, help="of the ospreys")
     chosen = parser.parse_args()
-    route = {"north": [0.0, 3000.0], "east": [0.0, 900.0], "altitude": [0.0, 0.0]}
-    scenario, airframe = find_scenario("osprey_route"), load_airframe("osprey")
-    wind = chosen.wind * scenario.aircraft.channels().speed
-    scenario = scenario.vary(
-        flight={"duration": DURATION}, aircraft={"wind": [wind, 0.0]}, guidance={"route": route, "wind": wind}
-    )
-    course, vehicle = build_course(scenario), fleet.vehicle(scenario)
-    mission = missions.build(scenario, course)
-    mission = replace(mission, guidance=mission.guidance._replace(fence=FENCE))
-    control_law, params = scenario.controller.tuned_law()
-    breaches, diverged, reached = [], 0, 0
-    for first in range(0, chosen.aircraft, CHUNK):
-        A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, chosen.seed, first, CHUNK)
-        directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
-        aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
-        result = fleet.fly(aircraft, vehicle, course, control_law, fleet.shared(params), mission)
-        figures = result.mission or {}
-        diverged += int(np.sum(np.asarray(result.diverged)))
-        breaches += np.asarray(figures["max.breach"]).tolist()
-        reached += int(np.sum(np.asarray(figures["max.phi"]) > 0.9 * mission.guidance.limits.bank))
-        print(f"{len(breaches)} aircraft: {sum(breach > 0.0 for breach in breaches)} left the fence", flush=True)
-    left = sum(breach > 0.0 for breach in breaches)
-    print(
-        f"farthest outside {max(breaches):.1f} m; {reached} turned at the largest bank; {diverged} diverged; wind {wind:g} m/s"
-    )
-    return 1 if left or diverged else 0
+    writer, failed = csv.writer(sys.stdout), False
+    writer.writerow(Row._fields)
+    for row in rows(chosen.only, chosen.shapes, chosen.winds, chosen.aircraft, chosen.seed):
+        writer.writerow(row)
+        sys.stdout.flush()
+        failed |= bool(row.outside or row.lost)
+    return int(failed)
 
 
 if __name__ == "__main__":
