@@ -60,8 +60,8 @@ def main() -> None:
         run = flown(servo, folder, "osprey_servo")
         weak = flown(servo.vary(controller={"k_g": 0.5}), folder, "half_the_gain")
         guided = flown(find_scenario("osprey_route"), folder, "osprey_route")
-        save(browser, (run, weak), ENDED, "view_ghost.png", at=f"#t={GHOST_AT}", clicks=["#window"])
-        save(browser, (guided,), ENDED, "view_guided.png", at=f"#t={GUIDED_AT}", clicks=["[data-camera=map]"])
+        save(browser, (run, weak), ENDED, "view_ghost.png", at=f"&t={GHOST_AT}", clicks=["#window"])
+        save(browser, (guided,), ENDED, "view_guided.png", at=f"&t={GUIDED_AT}", clicks=["[data-camera=map]"])
         (folder / "runs").mkdir()
         with flying(folder / "runs", LIVE_AT + 8.0) as (flight, live):
             save(browser, (live,), f"{STATE} === 'LIVE' && {TIME} > {LIVE_AT}", "view_live.png")
