@@ -60,6 +60,7 @@ IMPORTS: dict[str, set[str]] = {
         "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "reference_model",
         "rise_di_controller",
     },
+    "flight_learner": {"flight_analysis.closed_loop", "flight_core", "rise_di", "rise_di_controller"},
     "flight_cli": {
         "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.c_export", "flight_analysis.closed_loop",
         "flight_analysis.design", "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign",

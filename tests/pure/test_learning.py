@@ -16,10 +16,12 @@ from flight_analysis.design.learner import Learner
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
+from flight_view.flight import Flight
 from rise_di.learning import learner
 from rise_di_controller import divergence
 from rise_di_controller.learning import changes
@@ -208,3 +210,10 @@ def test_changes_in_log_are_those_that_the_controller_took(flown: Flown) -> None
     }
     assert learned.observer is not None
     assert learned.observer.part == 0.6
+
+
+def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
+    flight = Flight(flown.run)
+    flight.update()
+    shown = [event for event in flight.events if event.kind == "learning"]
+    assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines

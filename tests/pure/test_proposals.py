@@ -38,7 +38,7 @@ class Flight:
         """A proposal of now."""
         digest = self.controller.digest
         proposal = Proposal(self.now_ns, START.digest(), digest, CHANGE if change is None else change, "model")
-        self.learning.receive(proposal._replace(**replaced), self.now_ns, digest)
+        self.learning.receive(proposal._replace(**replaced), self.controller, self.now_ns)
 
     def step(self, count: int = 20) -> int:
         """Steps until the parameters change; how many it took."""
@@ -133,7 +133,7 @@ def test_second_and_late_proposals_are_refused() -> None:
         "one at a time",
         "",
         "one that ends at least 2.5 s after that of the last proposal",
-        "at most 30 s",
+        "0 to 30 s",
     ]
     flight.now_ns += nanoseconds(5.0)
     flight.receive(CHANGE | {"observer.part": 0.5})

@@ -15,7 +15,7 @@ from tests.ros.peer import Peer
 
 from autopilot_bridge.params import MAVLINK
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.graph import GUIDANCE, ON_START, parameter_overrides
+from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, NodeSpec, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 from flight_bringup.scenarios import find_scenario
 
@@ -103,24 +103,41 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, t
     overrides.append(f"recorder:directory:={tmp_path / 'run'}")
     start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
     lockstep = discovered(peer_node, ROLES)
+    beside_learner = {"controller": Access(frozenset({"/learning"}), frozenset({"/proposal"}), frozenset(), frozenset())}
     for role in ROLES:
-        assert real_time[role].merged(lockstep[role]) == policy[role], role
+        further = beside_learner.get(role, real_time[role])
+        assert real_time[role].merged(lockstep[role]).merged(further) == policy[role], role
 
 
 def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Path, peer_node: Peer) -> None:
-    scenario, found = find_scenario("osprey_route"), Access(*[frozenset()] * 4)
-    for lockstep in (False, True):
-        overrides = parameter_overrides(GUIDANCE, scenario, tmp_path, ON_START, lockstep=lockstep)
-        words = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
-        node = start("flight_guidance.main", "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
-        found = found.merged(discovered(peer_node, ("guidance",))["guidance"])
-        node.interrupt()
-        node.end()
+    found = optional_node(GUIDANCE, "osprey_route", start, tmp_path, peer_node)
     assert found == allowed()["guidance"]
 
 
+def test_policy_allows_exactly_those_of_learner(start: Start, tmp_path: Path, peer_node: Peer) -> None:
+    scenario = find_scenario("osprey_learn")
+    start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario.path)).wait_for("ready")
+    controller = discovered(peer_node, ("controller",))["controller"]
+    assert {"/learning"} <= controller.publish
+    assert {"/proposal"} <= controller.subscribe
+    assert optional_node(LEARNER, "osprey_learn", start, tmp_path, peer_node) == allowed()["learner"]
+
+
+def optional_node(spec: NodeSpec, name: str, start: Start, run: Path, peer_node: Peer) -> Access:
+    """The topics and services of a node that few scenarios have, in real time and in lockstep."""
+    scenario, found = find_scenario(name), Access(*[frozenset()] * 4)
+    for lockstep in (False, True):
+        overrides = parameter_overrides(spec, scenario, run, ON_START, lockstep=lockstep)
+        words = (word for key, value in overrides.items() for word in ("-p", f"{key}:={json.dumps(value)}"))
+        node = start(spec.module, "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
+        found = found.merged(discovered(peer_node, (spec.executable,))[spec.executable])
+        node.interrupt()
+        node.end()
+    return found
+
+
 def test_policy_allows_exactly_those_of_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
-    with FlightMonitor(osprey_gust.controller.outputs, lockstep=False):
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=False, learns=True):
         assert discovered(peer_node, ("monitor",))["monitor"] == allowed()["monitor"]
 
 

@@ -44,6 +44,8 @@ STAMP_ERROR = 1e-5  # s, of a time of day as a float
 STALL_TIMEOUT = 40.0
 """s. A lockstep flight without progress for so long ends; lost contact with a node ends it within three seconds."""
 
+SEARCH_TIMEOUT = 300.0  # s, the same of a flight that waits for a learner: a search takes 5 s of a core
+
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 
 Steps = Generator[None, None, str]
@@ -76,8 +78,9 @@ def fly_over_topics(
 
     Real time, or `lockstep` as fast as the machine allows. `one_process` holds all nodes in one process.
     `autopilot` flies in the aircraft's place, in real time only. All nodes are in the `namespace`, as "/uav1". `announce` gets
-    a line for each change of engagement and of reason, but not for a changed number. With `engaged_for`, s, the flight ends so
-    long after its first engagement, or with it, or without one when too little time is left.
+    a line for each change of engagement and of reason, but not for a changed number, and for what becomes of a proposal of a
+    learner. With `engaged_for`, s, the flight ends so long after its first engagement, or with it, or without one when too
+    little time is left.
     Outcomes: "completed", "interrupted" (Ctrl-C, SIGTERM or SIGHUP), or a sentence that names the process that ended early.
     """
     require_ros_environment()
@@ -86,7 +89,9 @@ def fly_over_topics(
     try:
         with (
             handle_signals(interrupt),
-            FlightMonitor(scenario.controller.outputs, lockstep=lockstep, namespace=namespace) as monitor,
+            FlightMonitor(
+                scenario.controller.outputs, lockstep=lockstep, learns=scenario.learns(), namespace=namespace
+            ) as monitor,
             FlightProcesses(
                 scenario,
                 run,
@@ -133,7 +138,7 @@ def follow(
 ) -> Steps:
     """Follow a flight that has begun, a step every POLL_PERIOD; as `fly_over_topics`."""
     if lockstep:
-        return _follow_lockstep(scenario, processes, monitor, progress)
+        return _follow_lockstep(scenario, processes, monitor, progress, announce)
     begins = processes.autopilot is None and scenario.controller.autostart and scenario.controller.start_active
     span = _Span(scenario, processes, monitor, begins=begins)
     return _follow_real_time(scenario, processes, monitor, progress, announce, engaged_for, span)
@@ -195,6 +200,7 @@ def _follow_real_time(
             return reason
         if reason := span.failed(t):
             return reason
+        _announce_learned(processes, monitor, processes.start_time, announce)
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
             if (kind := NUMBER.sub("", line)) != announced:
@@ -217,10 +223,27 @@ def _follow_real_time(
         yield
 
 
-def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", progress: Progress) -> Steps:
+def _announce_learned(
+    processes: FlightProcesses, monitor: "FlightMonitor", start_time: float, announce: Callable[[str], None]
+) -> None:
+    """Announce what became of proposals since the last call, and the end of the learner."""
+    for instant, sentence in monitor.learned():
+        announce(f"t = {instant - start_time:.2f} s: {sentence}")
+    if ended := processes.learner_ended():
+        announce(f"{ended}: the law flies on with the model that it has")
+
+
+def _follow_lockstep(
+    scenario: Scenario,
+    processes: FlightProcesses,
+    monitor: "FlightMonitor",
+    progress: Progress,
+    announce: Callable[[str], None],
+) -> Steps:
     """The real-time factor counts from the first instant in the log. The flight ends when the log is complete."""
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
     t, last_change, text = 0.0, time.monotonic(), "lockstep, starting"
+    timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
     first: tuple[float, float] | None = None  # monotonic and flight time, s
     while t < end:
         if (reason := processes.ended_early()) is not None:
@@ -232,8 +255,9 @@ def _follow_lockstep(scenario: Scenario, processes: FlightProcesses, monitor: "F
                 first = now, t
             else:
                 text = f"lockstep, {(t - first[1]) / (now - first[0]):.1f} times real time"
-        elif now > last_change + STALL_TIMEOUT:
-            return f"no progress for {STALL_TIMEOUT:g} s at t = {t:g} s"
+        elif now > last_change + timeout:
+            return f"no progress for {timeout:g} s at t = {t:g} s"
+        _announce_learned(processes, monitor, 0.0, announce)
         progress(t, text)
         yield
     return COMPLETED
@@ -259,6 +283,7 @@ def fly_in_process(
     def learned(event: Event) -> None:
         line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.sentence}"
         with interrupt.deferred():
+            writer.write_learning(event.stamp_ns, event.sentence, warns=not event.change)
             if event.change:
                 writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)
             (run / "log").mkdir(exist_ok=True)

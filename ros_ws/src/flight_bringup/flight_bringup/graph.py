@@ -32,6 +32,7 @@ AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 GUIDANCE = NodeSpec("flight_guidance", "guidance")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
+LEARNER = NodeSpec("flight_learner", "learner")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
 # All nodes in one process. Each reads its own section of the scenario.
@@ -46,6 +47,7 @@ SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
 GUIDANCE_VIEWS = ("odometry", "path", "markers")
+LEARNED = ("proposal", "learning")  # what a learner proposes, and what became of it
 
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
@@ -53,7 +55,8 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         AIRCRAFT: ("y", POSE, "truth"),
         REFERENCE_MODEL: ("y_m",),
         GUIDANCE: ("u_m", "guidance", *GUIDANCE_VIEWS),
-        CONTROLLER: ("u", "internals"),
+        CONTROLLER: ("u", "internals", "learning"),
+        LEARNER: ("proposal",),
         BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
         RECORDER: ("recorded",),
     }
@@ -114,14 +117,21 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
 
 
 def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec, ...]:
-    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance of a guided scenario.
+    """The second stage of a scenario: aircraft or bridge, the reference model, and guidance and the learner where it has them.
 
-    Raises ParameterError where guidance cannot fly the simulated aircraft.
+    Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside a learner.
     """
     if not bridge:
         require_euler(scenario)
+    learns = scenario.learns()
+    require(not (bridge and learns), "controller.learn", "a bridge", "a simulated aircraft: no autopilot was flown with it")
     stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE
-    return stage if scenario.guidance is None else (*stage, GUIDANCE)
+    return (*stage, *_optional(scenario))
+
+
+def _optional(scenario: Scenario) -> tuple[NodeSpec, ...]:
+    """The nodes that a scenario may have."""
+    return tuple(node for node, has in ((GUIDANCE, scenario.guidance is not None), (LEARNER, scenario.learns())) if has)
 
 
 ON_START = -1.0  # `start_time` of nodes that wait for t = 0 on the topic `start`
@@ -147,19 +157,25 @@ def parameter_overrides(
     """The parameters of a process beside the section of the scenario file; "node:name" for several nodes.
 
     Real time: the nodes with a t = 0 get the instant, or ON_START. Lockstep: the aircraft gets the rate of u and the duration,
-    controller and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule. The
-    recorder gets the files to attach to the log; this function writes the files into the folder of the run. With an autopilot
-    the bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts inactive.
+    controller and guidance the rate of y, the reference model the rate of u_m. Guidance gets the numbers by rule, the learner
+    the scenario. The recorder gets the files to attach to the log; this function writes the files into the folder of the run.
+    With an autopilot the bridge gets the channel map, the recorder the topics of the autopilot, and the controller starts
+    inactive.
     """
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
-    guidance = scenario.guidance
-    stages = (*FIRST_STAGE, *SECOND_STAGE, *(() if guidance is None else (GUIDANCE,)))
+    guidance, further = scenario.guidance, tuple[str, ...]()
+    stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
     if guidance is not None:
         overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}
-        overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *GUIDANCE_VIEWS]
+        further += GUIDANCE_VIEWS
+    if scenario.learns():
+        overrides[LEARNER]["scenario_file"] = str(scenario.path)
+        further += LEARNED
+    if further:
+        overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further]
     overrides[RECORDER]["directory"] = str(run)
     if autopilot is not None:
         overrides[CONTROLLER]["start_active"] = False  # the bridge activates it: only while engaged
@@ -175,7 +191,6 @@ def parameter_overrides(
             overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
     if spec in (RECORDER, ONE_PROCESS):
         if autopilot is not None:
-            further = () if guidance is None else GUIDANCE_VIEWS
             overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further, *autopilot.topics]
         maps = () if autopilot is None else (autopilot.map_path,)
         files = attachments_for(scenario, run, {node.executable: values for node, values in overrides.items()}, maps)
@@ -186,6 +201,7 @@ def parameter_overrides(
         }
     if one_process:
         if not lockstep:
+            overrides.pop(LEARNER, None)  # which has a process of its own
             for node in (*SECOND_STAGE, *(() if guidance is None else (GUIDANCE,))):
                 overrides[node]["start_time"] = start_time
         return {f"{node.executable}:{name}": value for node, values in overrides.items() for name, value in values.items()}

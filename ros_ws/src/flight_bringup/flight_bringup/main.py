@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes of a flight in one process, over the same topics; guidance where the arguments name it."""
+"""The nodes of a flight in one process, over the same topics; guidance and the learner where the arguments name them."""
 
 import sys
 
@@ -9,12 +9,13 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Run them."""
-    guided = "guidance" in sys.argv
+    guided, learns = "guidance" in sys.argv, "learner" in sys.argv
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",
         *(["flight_guidance.node:GuidanceNode"] if guided else []),
         "rise_di_controller.node:ControllerNode",
+        *(["flight_learner.node:LearnerNode"] if learns else []),
         "flight_recorder.node:RecorderNode",
     )
 

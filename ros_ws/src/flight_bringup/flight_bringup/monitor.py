@@ -9,12 +9,14 @@ from flight_core.parameters import require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError, FloatArray
+from flight_ros import reports
 from flight_ros.client import Client
 from flight_ros.messages import Decoder, instant, stamp_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import (
     ENGAGEMENT,
     INTERNALS,
+    LEARNING,
     LOCKSTEP,
     NEWEST_SAMPLES,
     NODE_STATE,
@@ -34,7 +36,7 @@ MODES = {float(mode): mode.name for mode in Mode}
 class FlightMonitor(Client):
     """Monitors a flight: states of its nodes, internals of the controller, in lockstep the progress of the log."""
 
-    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool, namespace: str = "") -> None:
+    def __init__(self, outputs: tuple[str, ...], *, lockstep: bool, learns: bool = False, namespace: str = "") -> None:
         super().__init__("monitor", namespace)
         self._namespace = self._node.get_namespace().rstrip("/")
         # Each subscription slows a lockstep flight down.
@@ -44,6 +46,7 @@ class FlightMonitor(Client):
         self._states: dict[str, str] = {}  # by process
         self._publish_start = self._node.create_publisher(START.type, START.name, STATE).publish
         self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
+        self._learning = PolledSubscription(self._node, LEARNING, PUBLISH, raw=True) if learns else None
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))
 
     def is_ready(self, node: str, pid: int) -> bool:
@@ -83,6 +86,12 @@ class FlightMonitor(Client):
         """Phases of a bridge with their reasons, in order, since the last call."""
         messages = () if self._engagement is None else self._engagement.take()
         return [(bounded(received.message.key), bounded(received.message.value)) for received in messages]
+
+    def learned(self) -> list[tuple[float, str]]:
+        """What became of proposals of a learner since the last call: instants by the clock of the stamps, s, and sentences."""
+        received = () if self._learning is None else self._learning.take()
+        told = [reports.decode(message.message) for message in received]
+        return [(seconds(report.stamp_ns), bounded(report.sentence)) for report in told]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""

@@ -23,6 +23,7 @@ from flight_bringup.graph import (
     BRIDGE,
     FIRST_STAGE,
     LEAD,
+    LEARNER,
     ON_START,
     ONE_PROCESS,
     RECORDER,
@@ -162,9 +163,10 @@ class FlightProcesses:
         self._lockstep, self.autopilot = lockstep, autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
-        self._in_one_process = [spec.executable for spec in (*self._first, *self._second)]
+        apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()  # a search would delay ticks of its own process
+        self._in_one_process = [spec.executable for spec in (*self._first, *self._second) if spec not in apart]
         if one_process:
-            self._first, self._second = (), (ONE_PROCESS,)
+            self._first, self._second = (), (ONE_PROCESS, *apart)
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # system time of t = 0, s
@@ -255,12 +257,21 @@ class FlightProcesses:
             time.sleep(POLL_PERIOD)
 
     def ended_early(self) -> str | None:
-        """The reason of the first process that has ended, None while all run.
+        """The reason of the first process that has ended, None while all run. In real time the law flies on without a learner.
 
         On a busy host several may have ended since the last call. One that lost contact with another is then not the cause.
         """
-        reasons = [reason for process in self.processes if (reason := _end(process)) is not None]
+        processes = [process for process in self.processes if self._lockstep or process.node is not LEARNER]
+        reasons = [reason for process in processes if (reason := _end(process)) is not None]
         return min(reasons, key=lambda reason: LOST_CONTACT in reason, default=None)
+
+    def learner_ended(self) -> str:
+        """How the learner has ended, told once; else empty."""
+        for process in self.processes:
+            if process.node is LEARNER and (reason := _end(process)) is not None:
+                self.processes.remove(process)
+                return reason
+        return ""
 
     def waiting(self) -> list[str]:
         """The nodes that are not ready."""

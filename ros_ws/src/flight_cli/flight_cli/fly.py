@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 
 from flight_analysis.closed_loop.learning import Learn
-from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, require_euler
+from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
 from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
-from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits
+from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits, second_stage
 from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     flight_progress,
@@ -98,7 +98,7 @@ def fly(
     _require_flyable(chosen, autopilot, in_process=in_process)
     for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
         print(f"warning: {sentence}", file=sys.stderr)
-    learn = None if getattr(chosen.controller, "learn", None) is None else _learner(chosen, in_process=in_process)
+    learn = _learner(chosen)
     run = new_run(chosen, runs)
     if files is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
@@ -157,17 +157,18 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
     if not in_process:
         require_package("rclpy", "; without ROS fly with --in-process")
         require_ros_environment()
-    if autopilot is None:
-        require_euler(scenario)
-    else:
+    second_stage(scenario, bridge=autopilot is not None)
+    if autopilot is not None:
         from flight_analysis.design.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
 
         require_signs(autopilot.channel_map, scenario)
         require_limits(autopilot, scenario)
 
 
-def _learner(scenario: Scenario, *, in_process: bool) -> Learn | None:
+def _learner(scenario: Scenario) -> Learn | None:
+    """The learner of a scenario, for a flight in one process. Raises ParameterError for one that cannot learn."""
+    if not scenario.learns():
+        return None
     from rise_di.learning import learner  # noqa: PLC0415 - loads SciPy, which few flights need
 
-    require(in_process, "controller.learn", "a flight over topics", "--in-process: the learner runs there alone")
     return learner(scenario)

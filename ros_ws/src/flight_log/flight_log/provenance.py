@@ -32,6 +32,7 @@ STACK = (
     "flight_ros",
     "flight_view",
     "flight_guidance",
+    "flight_learner",
     "reference_model",
     "rise_di",
     "rise_di_controller",

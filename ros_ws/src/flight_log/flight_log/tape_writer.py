@@ -12,6 +12,7 @@ from flight_core.files import writing
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_log.bag import OUTCOME, BagChannel, BagWriter, LogAttachments
+from flight_log.learning import DIAGNOSTIC_ARRAY, LEARNING, learning_message
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_event
 
@@ -68,10 +69,17 @@ class TapeWriter:
 
     def write_changes(self, stamp_ns: int, node: str, changes: Mapping[str, Any]) -> None:
         """Write a change of parameters of a node in flight, as the node itself publishes it."""
-        if PARAMETER_EVENTS not in self._channels:
-            self._channels[PARAMETER_EVENTS] = self._bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
-        channel = self._channels[PARAMETER_EVENTS]
-        self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, parameter_event(stamp_ns, node, changes))
+        self._write_message(PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes))
+
+    def write_learning(self, stamp_ns: int, sentence: str, *, warns: bool) -> None:
+        """Write what became of a proposal of a learner, as the controller itself publishes it."""
+        self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, learning_message(stamp_ns, sentence, warns=warns))
+
+    def _write_message(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._bag.add_topic(topic, type_name, "")
+        channel = self._channels[topic]
+        self._bag.write(channel, stamp_ns, stamp_ns, channel.messages + 1, data)
 
     def add_outcome(self, outcome: str) -> None:
         """Store the outcome of the flight in the log."""

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -17,13 +17,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from flight_core.outcome import LOST_CONTACT, FlightEnded
-from flight_core.parameters import NodeConfig, ParameterError
+from flight_core.parameters import NodeConfig, ParameterError, flatten
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
 from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import Encoder, stamp_of
+from flight_ros.messages import MAX_SIZE, Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
 from flight_ros.subscriptions import PolledSubscription
@@ -77,6 +77,7 @@ class FlightNode(Node, Generic[P]):
         given = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
         self._start_subscription = PolledSubscription(self, START, STATE, raw=True) if given else None
         self._matched = False
+        self._adopted: P | None = None
         self._tick_times = TickTimes()
         self.time_offset_ns = 0  # of the time of the ticks from the monotonic clock
         self._clock_step_ns = 0  # of the system clock since the start
@@ -157,10 +158,11 @@ class FlightNode(Node, Generic[P]):
         max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
         qos: QoSProfile | None = None,
+        max_size: int = MAX_SIZE,
     ) -> Receiver[S]:
         """Create a subscription with its `Receiver`. Overruns of this node are no silence of the publisher."""
         subscription = self.subscribe(topic, qos)
-        receiver = Receiver(subscription, self.refusals, decode, take, lock=lock, max_age_ns=max_age_ns)
+        receiver = Receiver(subscription, self.refusals, decode, take, lock=lock, max_age_ns=max_age_ns, max_size=max_size)
         self.receivers.append(receiver)
         return receiver
 
@@ -176,6 +178,20 @@ class FlightNode(Node, Generic[P]):
         """How far the system clock is ahead of the time of the ticks; 0 for less than CLOCK_STEP_NS, which is no step."""
         step_ns = time.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
+
+    def adopt(self, parameters: P) -> None:
+        """Replace the parameters by a valid set that this node chose itself: one parameter event, without another check."""
+        before, after = (dict(flatten(values.model_dump())) for values in (self.parameters, parameters))
+        changes = [
+            Parameter(name, value=list(value) if isinstance(value := after.get(name), tuple) else value)
+            for name in before | after
+            if before.get(name) != after.get(name)
+        ]
+        for change in changes:
+            if not self.has_parameter(change.name):
+                self.declare_parameter(change.name, None, ParameterDescriptor(dynamic_typing=True))
+        self._adopted = parameters
+        self.set_parameters_atomically(changes)
 
     def warn_no_publisher(self, subscription: PolledSubscription) -> None:
         """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s."""
@@ -193,6 +209,9 @@ class FlightNode(Node, Generic[P]):
 
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Accept a change of tunable parameters as a whole, or reject it with a sentence and change nothing."""
+        if self._adopted is not None:
+            self.parameters, self._adopted = self._adopted, None
+            return SetParametersResult(successful=True)
         try:
             parameters = changed(self, self.parameters, changes)
             self.on_parameters(parameters)

@@ -16,7 +16,7 @@ from flight_ros.topics import LIVELINESS
 SHUTDOWN_GRACE_NS = 600_000_000
 """Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another cause sends no report."""
 
-ROLES = ("aircraft", "reference_model", "guidance", "controller", "recorder")
+ROLES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder")
 
 
 class LivelinessMonitor:

@@ -27,7 +27,10 @@ class LockstepInputs:
         period_ns: int,
         receive_y: Callable[[], Iterable[StampedVector | None]],
         receive_other: Callable[[], Iterable[StampedVector | None]],
+        is_ready: Callable[[int], bool] = lambda now_ns: True,
     ) -> None:
+        """`is_ready` tells of an instant of a step whether what else the step needs has arrived."""
+        self._is_ready = is_ready
         self._y_period_ns, self._period_ns = y_period_ns, period_ns
         self._receive_y, self._receive_other = receive_y, receive_other
         self._number = 0  # of the next y
@@ -42,7 +45,7 @@ class LockstepInputs:
         while self._y_due:
             now_ns = self._number * self._y_period_ns
             due = now_ns % self._period_ns == 0
-            if due and not (self._others_due and self._others_due[-1].stamp_ns >= now_ns):
+            if due and not (self._others_due and self._others_due[-1].stamp_ns >= now_ns and self._is_ready(now_ns)):
                 return
             self._number += 1
             others = []

@@ -33,7 +33,8 @@ def read_parameters(node: Node, schema: type[P]) -> P:
         elif value != ():
             node.declare_parameter(name, value, descriptor)
     for name in sorted(tunable):
-        if not node.has_parameter(name):  # an optional parameter without an override, which may be set in flight
+        # an optional parameter without an override, which may be set in flight; a group that has parameters is none itself
+        if not node.has_parameter(name) and not node.get_parameters_by_prefix(name):
             node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
     return parameters
 

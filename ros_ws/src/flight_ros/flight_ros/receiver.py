@@ -12,7 +12,7 @@ from rclpy.node import Node
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, require_not_future, require_not_old
-from flight_ros.messages import require_size, sender_of
+from flight_ros.messages import MAX_SIZE, require_size, sender_of
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
 from flight_ros.topics import Topic
@@ -90,7 +90,8 @@ class Receiver(Generic[S]):
     A message that is too long, or of a conflicting publisher, is refused without decoding names and values: a flood of these
     messages costs no more than as many right ones. `decode` returns None for a vector without channels. `take` gets a sample
     and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
-    the lead over the clock; None is for a sender without the clock of the flight. Refusals are raised as ChannelError.
+    the lead over the clock; None is for a sender without the clock of the flight. `max_size` is in bytes. Refusals are raised
+    as ChannelError.
     """
 
     def __init__(
@@ -102,8 +103,10 @@ class Receiver(Generic[S]):
         *,
         max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
+        max_size: int = MAX_SIZE,
     ) -> None:
         self.subscription, self.lock = subscription, lock
+        self._max_size = max_size
         self._refusals, self._decode, self._take = refusals, decode, take
         self._max_age_ns = max_age_ns
 
@@ -119,7 +122,7 @@ class Receiver(Generic[S]):
     def take_message(self, raw: bytes, now_ns: int) -> bool:
         """Check and take a message. Returns whether the message was valid."""
         try:
-            require_size(raw)
+            require_size(raw, self._max_size)
             if self.lock is not None:
                 if (sender := sender_of(raw)) is None:
                     raise ChannelError("malformed", "a message without a header in plain CDR")
@@ -136,7 +139,7 @@ class Receiver(Generic[S]):
         samples: list[S | None] = []
         for received in self.subscription.take():
             try:
-                require_size(received.message)
+                require_size(received.message, self._max_size)
                 samples.append(self._decode(received.message))
             except ChannelError as error:
                 self._refusals.add(self.subscription, error.reason, str(error))

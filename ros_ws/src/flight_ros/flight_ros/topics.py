@@ -40,6 +40,10 @@ RECORD = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE, durabili
 # For topics of other publishers, which may not keep samples. If a publisher offers less, the recorder requests less.
 RECORD_FOREIGN = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 
+# A proposal is rare, so none may be lost. One from before the start of the controller is void. The depth is as that of
+# NEWEST_SAMPLES.
+PROPOSALS = QoSProfile(depth=128, reliability=ReliabilityPolicy.RELIABLE)
+
 # A late subscriber gets the last state of each node. The queue of a subscriber holds the states of many nodes.
 STATE = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 STATES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -95,6 +99,8 @@ ROSOUT = Topic("/rosout", Log, foreign=True)  # of ROS 2 itself
 CLOCK = Topic("clock", Clock)  # relative: each aircraft in lockstep has its own
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
+PROPOSAL = Topic("proposal", DiagnosticArray)  # of a learner: flight_ros.reports
+LEARNING = Topic("learning", DiagnosticArray)  # what became of a proposal, and fallbacks
 START = Topic("start", Time)  # t = 0 of a flight in real time, once its nodes are matched
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 

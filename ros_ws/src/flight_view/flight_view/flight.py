@@ -34,6 +34,7 @@ from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
+from flight_log.learning import DIAGNOSTIC_ARRAY, LEARNING, told
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
@@ -85,7 +86,7 @@ class Event(NamedTuple):
     """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
 
     stamp_ns: int
-    kind: str  # "mode", "warning", "error", "parameter", "route", "bridge" or "control"
+    kind: str  # "mode", "warning", "error", "parameter", "route", "learning", "bridge" or "control"
     text: str
 
 
@@ -242,7 +243,7 @@ class Flight:
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             return math.inf
         namespace, _, name = topic.rpartition("/")
-        if (name, type_name) == (ROUTE, ROUTE_TYPE):
+        if (name, type_name) in ((ROUTE, ROUTE_TYPE), (LEARNING, DIAGNOSTIC_ARRAY)):
             return math.inf
         if type_name != JOINT_STATE or name not in RATES:
             return 0.0
@@ -350,7 +351,7 @@ class Flight:
         self._mode = modes[-1]
 
     def _take_events(self, messages: Messages) -> None:
-        namespace = messages.topic.removesuffix(ENGAGEMENT).removesuffix(f"/{ROUTE}")
+        namespace = messages.topic.removesuffix(ENGAGEMENT).removesuffix(f"/{ROUTE}").removesuffix(f"/{LEARNING}")
         if messages.topic not in SHARED and not self._shows(namespace):
             return
         store = typestore()
@@ -374,6 +375,9 @@ class Flight:
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
                     self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
+            elif messages.type_name == DIAGNOSTIC_ARRAY:
+                stamp_ns, sentence = told(message)
+                self._add_event(Event(stamp_ns, LEARNING, sentence))
             elif messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
                     continue

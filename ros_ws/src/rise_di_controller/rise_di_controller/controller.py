@@ -42,7 +42,8 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._digest = parameters.digest()
-        self._first, self._first_law = parameters, True
+        self._first = self._parameters = parameters
+        self._first_law = True
         zero = np.zeros(len(parameters.outputs))
         self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
@@ -62,6 +63,11 @@ class Controller:
     def has_internals(self) -> bool:
         """Whether the law has a state to log: from the first engagement on."""
         return self._state.law is not None
+
+    @property
+    def parameters(self) -> ControllerConfig:
+        """The parameters in force."""
+        return self._parameters
 
     @property
     def digest(self) -> int:
@@ -90,7 +96,7 @@ class Controller:
         )
         limits = parameters.guard()
         self._state = guard.retune(self._state, self._law, law, (self._guard.nominal, limits.nominal))
-        self._law, self._guard, self._digest = law, limits, digest
+        self._law, self._guard, self._digest, self._parameters = law, limits, digest, parameters
         self._first_law = self._has_first_model(parameters)
 
     def fallback(self) -> ControllerConfig | None:

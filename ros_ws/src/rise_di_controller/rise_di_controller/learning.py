@@ -23,9 +23,9 @@ class Proposal(NamedTuple):
     """What a learner found in its window, as the controller receives it."""
 
     stamp_ns: int  # the end of the window: the instant of its last tick
-    start: int  # digest of the parameters of the start, which `change` changes
+    start: int  # digest of the parameters of the start, for which the learner was started
     flown: int  # digest of the parameters that flew at the end of the window
-    change: Mapping[str, Any]  # by dotted name, None for a parameter that is gone; empty where no model is proposed
+    change: Mapping[str, Any]  # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
     sentence: str  # what was learned, or why there is no model
 
 
@@ -67,7 +67,6 @@ class Learning:
         assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
         self._start, self._digest, self._settings = parameters, parameters.digest(), parameters.learn
         self._announce, self._simulated = announce, simulated
-        self._flown: ControllerConfig = parameters
         self._updates = Updates(parameters.learn)
         self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
@@ -86,15 +85,15 @@ class Learning:
         """In simulated time: whether the tick at `now_ns` waits for a proposal."""
         return any(self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due)
 
-    def receive(self, proposal: Proposal, now_ns: int, flown: int) -> None:
-        """Take a proposal, or refuse it with an event. `flown` is the digest of the parameters in force."""
-        if refusal := self._refusal(proposal, now_ns, flown):
+    def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
+        """Take a proposal, or refuse it with an event."""
+        if refusal := self._refusal(proposal, now_ns, controller.digest):
             self._announce(Event(now_ns, {}, f"refused: {refusal}"))
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
         else:
             self._last_ns = proposal.stamp_ns
-            self._begin(proposal, now_ns)
+            self._begin(proposal, controller, now_ns)
 
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify, let the proposals act that are due, and fall back where the law diverges.
@@ -103,7 +102,7 @@ class Learning:
         """
         taken = None
         while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
-            self._begin(self._received.pop(self._due.popleft()), now_ns)
+            self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
             taken = self._certify(controller, now_ns) or taken
         if not self._simulated:
             taken = self._certify(controller, now_ns)
@@ -123,8 +122,8 @@ class Learning:
         if self._simulated:
             known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
             return "" if known else f"found {window}, expected that of an identification that is due, once"
-        if now_ns - proposal.stamp_ns > nanoseconds(self._settings.window):
-            return f"found {window}, expected at most {self._settings.window:g} s"
+        if not 0 <= now_ns - proposal.stamp_ns <= nanoseconds(self._settings.window):
+            return f"found {window}, expected 0 to {self._settings.window:g} s"
         if self._certificate is not None:
             return f"found {window} while another proposal is certified, expected one at a time"
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
@@ -132,9 +131,9 @@ class Learning:
             return f"found {window}, expected {later}"
         return _race(proposal, flown)
 
-    def _begin(self, proposal: Proposal, now_ns: int) -> None:
+    def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
-            self._certificate = proposal, _certificate(self._start, proposal.change)
+            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
         else:
             self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
 
@@ -152,7 +151,7 @@ class Learning:
             refusal = _race(proposal, controller.digest)
             if not refusal:
                 self._take(controller, now_ns, end.value, f"flies {proposal.sentence}")
-                return self._flown
+                return controller.parameters
         except ArithmeticError as error:
             refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
         except ValueError as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
@@ -164,9 +163,9 @@ class Learning:
         return None
 
     def _take(self, controller: Controller, now_ns: int, new: ControllerConfig, sentence: str) -> None:
+        change = changes(controller.parameters, new)
         controller.retune(new)
-        self._announce(Event(now_ns, changes(self._flown, new), sentence))
-        self._flown = new
+        self._announce(Event(now_ns, change, sentence))
 
 
 def _race(proposal: Proposal, flown: int) -> str:
@@ -176,11 +175,13 @@ def _race(proposal: Proposal, flown: int) -> str:
     return f"found a proposal beside the parameters {proposal.flown}, expected {flown}: they changed meanwhile"
 
 
-def _certificate(start: RiseDiConfig, change: Mapping[str, Any]) -> Generator[None, None, RiseDiConfig]:
-    """The parameters of the start with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
+def _certificate(
+    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
+) -> Generator[None, None, RiseDiConfig]:
+    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
-    proposed = RiseDiConfig.validate_mapping(start.changed(change), "controller", check=False)
+    proposed = RiseDiConfig.validate_mapping(flown.changed(change), "controller", check=False)
     yield
     require(proposed.observer is not None, "proposal", "no observer", "one")
     assert proposed.observer is not None  # noqa: S101 - for the type checker
@@ -199,6 +200,15 @@ def _certificate(start: RiseDiConfig, change: Mapping[str, Any]) -> Generator[No
     except ParameterError as error:
         raise ParameterError(f"controller.{error}") from None
     return proposed
+
+
+def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """All of DESIGNED of a new set by dotted name; None for what an old set has besides."""
+    before, after = (
+        {name: value for name, value in flatten(parameters.model_dump()) if name.split(".")[0] in DESIGNED}
+        for parameters in (old, new)
+    )
+    return dict.fromkeys(before) | after
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:

@@ -11,18 +11,25 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from flight_core.modes import Mode
+from flight_core.parameters import require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
+from flight_core.text import bounded
+from flight_core.vectors import ChannelError
+from flight_ros import reports
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.rclpy_private import answer_invalid_transitions
+from flight_ros.reports import MAX_REPORT_SIZE, Report
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import INTERNALS, Y_M, U, Y
+from flight_ros.topics import INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
+from rise_di_controller.learning import Event, Learning, Proposal
 from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
 BEHIND_NS = 1_000_000
 """From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have
@@ -52,6 +59,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.effectors)
         self._internals_encoder = self.encoder(self._controller.names)
+        self._learning = self._new_learning()
         if self.parameters.lockstep:
             self._empty_encoder = self.encoder(())
             self._inputs = LockstepInputs(
@@ -59,6 +67,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 self.period_ns(),
                 self._y.receive,
                 self._y_m.receive,
+                self._has_proposal,
             )
         self._last_ns = 0  # of the last tick
         if self.parameters.autostart:
@@ -72,8 +81,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """Reset the law. The parameters were validated when they were set."""
         self._controller.restart()  # keeps u, so that a node that is configured again transfers without a bump
         self.get_logger().info(self.parameters.summary())
-        if getattr(self.parameters, "learn", None) is not None:
-            self.get_logger().warning("learn: no learner runs beside this node: the models stay as loaded")
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -90,6 +97,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def on_parameters(self, parameters: ControllerConfig) -> None:
         """Replace the parameters between two ticks, all at once and without a jump of u."""
+        require(self._adopting is None, "controller", "a change in the tick of a learned model", "one after it: set it again")
         self._controller.retune(parameters)
 
     def period_ns(self) -> int:
@@ -112,6 +120,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._y.poll(now_ns)
         self._y_m.poll(now_ns)
         self._step(now_ns, tick.late_ns)
+        self._learn(now_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
@@ -133,6 +142,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """One tick of the controller; whether it had an output to publish."""
         before = self._controller.mode
         output = self._controller.tick(now_ns, late_ns, active=self._active)
+        if self._learning is not None and output is not None and self._controller.has_internals:
+            self._learning.ticked(now_ns)
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
         if output is None or not self._publishes:
@@ -151,13 +162,87 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 self._y.accept(y, now_ns)
             for sample in y_m:
                 self._y_m.accept(sample, now_ns)
+            if due:
+                self._learn(now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
         return advanced
 
     def awaited_topic(self) -> str:
+        if self._waits_for_proposal:
+            return self._proposals.name
         return (self._y_m if self._inputs.has_y else self._y).name
+
+    # With a learner
+
+    def _new_learning(self) -> Learning | None:
+        """The proposals of a learner, for parameters that learn; None for others."""
+        self._adopting: ControllerConfig | None = None  # parameters in force that are no parameters of the node yet
+        self._decoded = self._waits_for_proposal = False
+        parameters = self.parameters
+        if not isinstance(parameters, RiseDiConfig) or parameters.learn is None:
+            return None
+        # The first identification of a learner that was started again comes after the first of `updates`.
+        timeouts_ns = nanoseconds(parameters.learn.updates[0]), nanoseconds(2.0 * parameters.learn.window)
+        self._proposals = self.receive(
+            PROPOSAL,
+            self._decode_proposal,
+            self._take_proposal,
+            max_age_ns=None,  # `Learning` bounds it
+            lock=None if parameters.lockstep else PublisherLock(lambda: timeouts_ns),
+            qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
+            max_size=MAX_REPORT_SIZE,
+        )
+        self._publish_learning = self.advertise(LEARNING)
+        return Learning(parameters, self._say, simulated=parameters.lockstep)
+
+    def _learn(self, now_ns: int) -> None:
+        """Take the proposals, between two ticks. In real time the parameters of the node follow a tick later: 3 ms."""
+        if self._learning is None:
+            return
+        if self._adopting is not None:
+            self.adopt(self._adopting)
+            self._adopting = None
+            return
+        self._decoded = False
+        self._proposals.poll(now_ns)
+        self._adopting = self._learning.step(self._controller, now_ns)
+        if self._adopting is not None and self.parameters.lockstep:
+            self.adopt(self._adopting)
+            self._adopting = None
+
+    def _has_proposal(self, now_ns: int) -> bool:
+        """Lockstep: whether the proposal has arrived for which the step of an instant waits, if any."""
+        if self._learning is None:
+            return True
+        self._proposals.poll(now_ns)
+        self._waits_for_proposal = self._learning.waits(now_ns)
+        return not self._waits_for_proposal
+
+    def _decode_proposal(self, raw: bytes) -> Report:
+        if self._decoded and not self.parameters.lockstep:
+            raise ChannelError("rate", "a second proposal in a tick, expected one")
+        self._decoded = True
+        return reports.decode(raw)
+
+    def _take_proposal(self, report: Report, now_ns: int) -> None:
+        change = dict(report.values)
+        start, flown = change.pop("start", None), change.pop("flown", None)
+        if not isinstance(start, int) or not isinstance(flown, int):
+            raise ChannelError("malformed", "a proposal without the digests start and flown")
+        assert self._learning is not None  # noqa: S101 - the receiver was made beside it
+        self._learning.receive(Proposal(report.stamp_ns, start, flown, change, report.sentence), self._controller, now_ns)
+
+    def _say(self, event: Event) -> None:
+        """Log and publish what became of a proposal."""
+        sentence = bounded(event.sentence)
+        if event.change or not sentence.startswith("refused"):
+            self.get_logger().info(sentence)
+        else:
+            self.get_logger().warning(sentence)
+        report = Report(event.stamp_ns, self.instance, sentence, warns=not event.change)
+        self._publish_learning(reports.encode(report, "learning"))
 
     def _warn_stale_inputs(self, now_ns: int) -> None:
         stale = self._controller.stale(now_ns)

@@ -48,6 +48,9 @@ MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop wi
 
 MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T: that of numbers with ten digits is 1e-9
 
+OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
+"""Parameters that concern only the node: neither the law nor its guard depends on them."""
+
 MAX_STABLE_STEP = 2.5
 """Largest product of dt and the fastest zero. A Runge-Kutta step is stable up to 2.78; dt is the longest that the law takes."""
 
@@ -351,7 +354,7 @@ class ControllerConfig(NodeConfig):
 
         BLAKE2b of names and values. It changes with any bit of any gain. Parameters that concern only the node are left out.
         """
-        content = self.model_dump(exclude={"lockstep", "y_rate", "autostart", "start_active"})
+        content = self.model_dump(exclude=OF_NODE)
         if content["law"] == "rise_di":  # logs of versions that had no other law have no name either
             del content["law"]
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")

@@ -94,6 +94,7 @@ class RiseDiConfig(ControllerConfig):
             require(
                 self.allocation is None, "learn", "an allocation beside it", "none: A and B are those of the inputs of the law"
             )
+            require(self.allocation is None, "learn", "an allocation beside it", "none: a learner knows the inputs of the law")
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
             spacing = self.learn.spacing()

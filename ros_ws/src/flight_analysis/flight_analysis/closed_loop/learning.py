@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.learning import Event, Learning, changes
+from rise_di_controller.learning import Event, Learning, designed
 from rise_di_controller.learning import Proposal as ReceivedProposal
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -35,7 +35,7 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 def as_received(proposal: Proposal, start: RiseDiConfig, end_ns: int, flown: int) -> ReceivedProposal:
     """A proposal as the controller receives it: with the end of its window, and the digest of what flew then."""
-    change = {} if proposal.controller is None else changes(start, proposal.controller)
+    change = {} if proposal.controller is None else designed(start, proposal.controller)
     return ReceivedProposal(end_ns, start.digest(), flown, change, proposal.sentence)
 
 
@@ -57,6 +57,5 @@ class LearningLoop:
         if controller.mode is Mode.ENGAGED:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u)
         if self._learning.ticked(now_ns):
-            flown = controller.digest
-            proposal = as_received(self._learner.propose(), self._parameters, now_ns, flown)
-            self._learning.receive(proposal, now_ns, flown)
+            proposal = as_received(self._learner.propose(), self._parameters, now_ns, controller.digest)
+            self._learning.receive(proposal, controller, now_ns)

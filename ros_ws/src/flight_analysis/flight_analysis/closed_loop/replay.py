@@ -25,7 +25,7 @@ from rise_di_controller import feedforward, guard, internals
 from rise_di_controller.control_law import TunedLaw, restored
 from rise_di_controller.guard import ControllerState, GuardParams
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.params import ControllerConfig, as_controller
+from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
 
 COPIED_CHANNELS = ("y_m_offset", "number", "parameters")
 """Channels of `internals` that are copied, for a tick does not compute them."""
@@ -205,7 +205,8 @@ def _recorded(
         return run, as_controller(own, "parameters"), run.changes if changes is None else changes
     own = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
     if changes is None and run.path is not None:
-        changes = parameter_changes(run.path, f"{run.namespace}/controller", type(own).model_fields)
+        known = {name: field for name, field in type(own).model_fields.items() if name not in OF_NODE}
+        changes = parameter_changes(run.path, f"{run.namespace}/controller", known)
     return run.tape, own, changes or ()
 
 

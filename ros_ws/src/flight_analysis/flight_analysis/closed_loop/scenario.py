@@ -108,6 +108,10 @@ class Scenario:
             raise ParameterError(f"{self.name}: found the law {self.controller.law}, expected {expected}")
         return self.controller
 
+    def learns(self) -> bool:
+        """Whether the models of the controller are learned in flight."""
+        return isinstance(self.controller, RiseDiConfig) and self.controller.learn is not None
+
     def gust_windows(self) -> dict[str, tuple[float, float]]:
         """Start and stop of the gusts, s: entry and entry + 2 H / V0."""
         speed = self.aircraft.channels().speed

@@ -1,0 +1,27 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What became of the proposals of a learner: messages of the topic `learning`, written and read without ROS."""
+
+from typing import Any
+
+from flight_core.rates import NANOSECONDS
+from flight_log.named_vectors import typestore
+
+LEARNING, DIAGNOSTIC_ARRAY = "learning", "diagnostic_msgs/msg/DiagnosticArray"
+OK, WARN = 0, 1  # levels of diagnostic_msgs/msg/DiagnosticStatus
+
+
+def learning_message(stamp_ns: int, sentence: str, *, warns: bool) -> bytes:
+    """A message of LEARNING, as the controller itself publishes it."""
+    store = typestore()
+    types = {name: store.types[f"diagnostic_msgs/msg/{name}"] for name in ("DiagnosticArray", "DiagnosticStatus")}
+    stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
+    header = store.types["std_msgs/msg/Header"](stamp, "in_process")
+    status = types["DiagnosticStatus"](WARN if warns else OK, LEARNING, sentence, "", [])
+    return bytes(store.serialize_cdr(types["DiagnosticArray"](header, [status]), DIAGNOSTIC_ARRAY))
+
+
+def told(message: Any) -> tuple[int, str]:
+    """Stamp, ns, and sentence of a message of LEARNING; "" for one without."""
+    stamp = message.header.stamp
+    return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(status.message for status in message.status)

@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Reports as messages: diagnostic_msgs/DiagnosticArray with a stamp, a sentence and named values, which are JSON."""
+
+import json
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.serialization import deserialize_message, serialize_message
+
+from flight_core.publisher_lock import publisher_of
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import ChannelError
+from flight_ros.rclpy_private import DeserializationError
+
+MAX_REPORT_SIZE = 65_536  # bytes; a model of eight states with its observer has 10,000
+
+
+class Report(NamedTuple):
+    """A message with a sentence."""
+
+    stamp_ns: int
+    sender: str  # the publisher
+    sentence: str
+    values: Mapping[str, Any] = {}
+    warns: bool = False  # level WARN, else OK
+
+
+def encode(report: Report, name: str) -> bytes:
+    """The message of a report; `name` is that of its status."""
+    message = DiagnosticArray()
+    message.header.stamp = Time(sec=report.stamp_ns // NANOSECONDS, nanosec=report.stamp_ns % NANOSECONDS)
+    message.header.frame_id = report.sender
+    level = DiagnosticStatus.WARN if report.warns else DiagnosticStatus.OK
+    values = [KeyValue(key=key, value=json.dumps(value)) for key, value in report.values.items()]
+    message.status = [DiagnosticStatus(level=level, name=name, message=report.sentence, values=values)]
+    return serialize_message(message)
+
+
+def decode(raw: bytes) -> Report:
+    """The report of a message. Raises ChannelError, reason "malformed"."""
+    try:
+        message = deserialize_message(raw, DiagnosticArray)
+        (status,) = message.status
+        values = {item.key: json.loads(item.value) for item in status.values}
+    except (DeserializationError, ValueError, RecursionError) as error:  # ValueError: of json, or not one status
+        raise ChannelError("malformed", " ".join(str(error).split())) from None
+    stamp = message.header.stamp
+    sender = publisher_of(message.header.frame_id)
+    warns = status.level != DiagnosticStatus.OK
+    return Report(stamp.sec * NANOSECONDS + stamp.nanosec, sender, status.message, values, warns)

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The learner's node beside the controller: lockstep, proposals of others, and a learner that is killed and started again."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+from rcl_interfaces.srv import GetParameters
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer, peer
+
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_bringup.fly import fly_over_topics
+from flight_bringup.scenarios import find_scenario, written
+from flight_core.rates import nanoseconds
+from flight_log.tape_reader import read_run
+from flight_ros import reports
+from flight_ros.reports import Report
+from flight_ros.topics import LEARNING, PROPOSAL, PUBLISH
+from rise_di.learning import learner
+from rise_di_controller.learning import Event, designed
+
+pytestmark = pytest.mark.package("flight_learner")
+
+
+def scenario(folder: Path, **learn: object) -> Scenario:
+    """osprey_learn at 100 Hz, with an aircraft that is that of the file: its search is the shortest."""
+    chosen = find_scenario("osprey_learn").vary(
+        flight={"duration": 11.0},
+        aircraft={"rate": 100.0, "step": 0.005, "uncertainty": {"A": 0.0, "B": 0.0}},
+        reference_model={"rate": 100.0},
+        controller={"learn": {"updates": [10.0], "latency": 0.5} | learn},
+    )
+    return written(chosen, folder / "learn.yaml")
+
+
+def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(tmp_path: Path) -> None:
+    chosen, events, lines = scenario(tmp_path), list[Event](), list[str]()
+    run = tmp_path / "run"
+    flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
+    assert flown == "completed"
+    tape = simulate(chosen, learn=learner(chosen), announce=events.append)
+    assert [bool(event.change) for event in events] == [True]
+    assert lines == [f"t = 10.50 s: {events[0].sentence}"]
+    recorded = read_run(run).tape
+    for name, signal in tape.signals.items():
+        assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
+        assert signal.values.tobytes() == recorded[name].values.tobytes(), name
+    result = replay(run)
+    assert result.equal()
+    assert result.whole.all()
+
+
+class Proposer:
+    """A peer that proposes the model of the file to a controller of osprey_learn."""
+
+    def __init__(self, peer_node: Peer) -> None:
+        self.peer, self.start = peer_node, find_scenario("osprey_learn").rise_di()
+        self.change = designed(self.start, find_scenario("osprey_observer").rise_di())
+        self.told: list[str] = []
+        self._publish = peer_node.node.create_publisher(PROPOSAL.type, PROPOSAL.name, PUBLISH).publish
+        peer_node.node.create_subscription(LEARNING.type, LEARNING.name, self._take, PUBLISH, raw=True)
+
+    def _take(self, raw: bytes) -> None:
+        self.told.append(reports.decode(raw).sentence)
+
+    def propose(self, sender: str = "learner#1", change: Mapping[str, object] = MappingProxyType({})) -> None:
+        """Publish a proposal whose window ended a tick or more ago."""
+        values = {"start": self.start.digest(), "flown": self.start.digest(), **self.change, **change}
+        self._publish(reports.encode(Report(time.time_ns() - nanoseconds(0.05), sender, "model", values), "proposal"))
+
+    def answer(self, propose: Callable[[], None]) -> str:
+        """What the controller says next, with y and y_m meanwhile."""
+        count = len(self.told)
+        propose()
+        self.peer.until(lambda: len(self.told) > count, each=self.peer.send)
+        return self.told[count]
+
+
+def test_controller_refuses_lies_and_storms_and_flies_a_certified_model(start: Start) -> None:
+    with peer() as peer_node:
+        scenario_file = find_scenario("osprey_learn").path
+        controller = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario_file), "-p", "max_age:=2.0")
+        proposer = Proposer(peer_node)
+        proposer.start = proposer.start.model_copy(update={"max_age": 2.0})
+        peer_node.until(lambda: peer_node.modes()[-1:] == [1], each=peer_node.send)
+        flipped = [-value for value in proposer.change["observer.F"]]
+        assert "spectral radius" in proposer.answer(lambda: proposer.propose(change={"observer.F": flipped}))
+        time_of_refusal = time.monotonic()
+        assert "after that of the last proposal" in proposer.answer(proposer.propose)
+        peer_node.until(lambda: time.monotonic() > time_of_refusal + 2.5, each=peer_node.send)  # half of the least spacing
+        assert proposer.answer(proposer.propose) == "flies model"
+        peer_node.until(lambda: get(peer_node) == 0.6, each=peer_node.send)
+        assert "sender" not in controller.output
+
+        def storm() -> None:
+            for _ in range(200):
+                proposer.propose("second#2")
+            proposer.propose(change={"start": 1})
+
+        assert "found a proposal for the parameters 1" in proposer.answer(storm)
+        peer_node.until(lambda: peer_node.counted("refused proposal: sender", 100), each=peer_node.send)
+        missed = [message for message in peer_node.received["/diagnostics"] if "overrun" in str(message)]
+        assert not missed
+
+
+def get(peer_node: Peer) -> float:
+    """The bound of the observer, as the controller's parameter."""
+    names = GetParameters.Request(names=["observer.part"])
+    answer = peer_node.call(GetParameters, "controller/get_parameters", names, each=peer_node.send)
+    return float(answer.values[0].double_value)
+
+
+def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
+    chosen = scenario(tmp_path, updates=[1.0], window=6.0, latency=0.0)
+    command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
+    command.wait_for("no model: record: found")
+    command.child("flight_learner.main").kill()
+    command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
+    said = command.output.count("no model: record")
+    start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
+    command.until(lambda: command.output.count("no model: record") > said)
+    assert command.interrupt().end() == 130
+    assert "ENGAGED -> " not in (tmp_path / "runs" / "latest" / "log" / "controller.log").read_text(encoding="utf-8")
+
+
+def test_learner_refuses_a_scenario_that_does_not_learn(start: Start) -> None:
+    node = start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={find_scenario('osprey_servo').path}")
+    assert node.end() == 2
+    assert "error: learner.scenario_file: found a scenario without controller.learn" in node.output
