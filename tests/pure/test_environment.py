@@ -3,6 +3,7 @@
 """Environments in which no node can start: each is one sentence with the mend, from every command and from a node."""
 
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -52,6 +53,8 @@ def test_right_environment_passes_in_a_millisecond() -> None:
         ({"ROS_DOMAIN_ID": "abc"}, r"ROS_DOMAIN_ID: found 'abc'"),
         ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID: found '-1'"),
         ({"ROS_DOMAIN_ID": "1.5"}, r"ROS_DOMAIN_ID: found '1.5'"),
+        ({"RCUTILS_LOGGING_USE_STDOUT": "5"}, r"^RCUTILS_LOGGING_USE_STDOUT: found '5', expected 0, 1, or none$"),
+        ({"RCUTILS_COLORIZED_OUTPUT": "on"}, r"^RCUTILS_COLORIZED_OUTPUT: found 'on'"),
         ({"RMW_IMPLEMENTATION": "rmw_nope"}, r"RMW_IMPLEMENTATION: found 'rmw_nope', expected one of .*rmw_fastrtps_cpp"),
     ],
 )
@@ -66,6 +69,12 @@ def test_variable_without_use_is_named(variables: dict[str, str], sentence: str,
 def test_right_domain_passes(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
     require_ros_environment()
+
+
+def test_limit_of_open_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (12, 4096))
+    with pytest.raises(ParameterError, match=r"^ulimit -n: found 12 open files, expected 128 or more: ulimit -n 1024$"):
+        require_ros_environment()
 
 
 def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:

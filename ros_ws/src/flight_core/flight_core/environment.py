@@ -7,6 +7,7 @@ Without the check rclpy ends with a traceback, with a bus error, or after a time
 
 import os
 import re
+import resource
 import socket
 import sys
 from contextlib import suppress
@@ -16,6 +17,7 @@ from typing import NoReturn
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
 SHARED_MEMORY, LEAST_SHARED_MEMORY = Path("/dev/shm"), 1 << 16  # bytes; rclpy and a flight use 12 kB # noqa: S108
+LEAST_FILES = 128  # open at once in a process
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 
 
@@ -24,7 +26,9 @@ def require_ros_environment() -> None:
     _require_domain()
     _require_middleware()
     _require_shared_memory()
+    _require_files()
     _require_log_folder()
+    _require_log_settings()
     if PROFILE_VARIABLE not in os.environ:
         _require_loopback()
 
@@ -56,6 +60,20 @@ def _require_shared_memory() -> None:
     if state.f_blocks > 0 and free < LEAST_SHARED_MEMORY:
         mend = "remove files there, or start a container with --shm-size=64m"
         _refuse(f"{SHARED_MEMORY}: found {free} bytes free, expected {LEAST_SHARED_MEMORY} or more: {mend}")
+
+
+def _require_files() -> None:
+    """A node has some 50 files and sockets open."""
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    if most < LEAST_FILES:
+        _refuse(f"ulimit -n: found {most} open files, expected {LEAST_FILES} or more: ulimit -n 1024")
+
+
+def _require_log_settings() -> None:
+    """Of rcutils/logging.h. With another value each line of a log is an error on the terminal."""
+    for variable in ("RCUTILS_LOGGING_USE_STDOUT", "RCUTILS_LOGGING_BUFFERED_STREAM", "RCUTILS_COLORIZED_OUTPUT"):
+        if (value := os.environ.get(variable, "")) not in {"", "0", "1"}:
+            _refuse(f"{variable}: found {value!r}, expected 0, 1, or none")
 
 
 def log_folder() -> Path | None:
