@@ -26,7 +26,7 @@ from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import FlightEnded, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
@@ -270,11 +270,18 @@ def test_the_ground_ends_a_flight() -> None:
         fly(cessna(condition=CESSNA._replace(altitude=15.0)), command(elevator=0.3), 10.0)
 
 
+def test_soft_touch_of_wheels_is_landing() -> None:
+    """0.7 m above its wheels the aircraft sinks with less thrust, and touches before it sinks fast."""
+    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p landed at t = \d.* s, with a sink of [01]\.\d\d m/s$") as ended:
+        fly(cessna(condition=CESSNA._replace(altitude=2.0)), command(throttle=-0.2), 10.0)
+    assert exit_status(str(ended.value)) == 0
+
+
 def test_an_engine_that_stops_ends_a_flight() -> None:
     model = cessna()
     for i in range(2):
         model._fdm[f"propulsion/tank[{i}]/contents-lbs"] = 0.0
-    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p: engine 1 stopped at t = \d"):
+    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p: engine 1 stopped at t = \d.* s, out of fuel$"):
         fly(model, command(), 1.0)
 
 

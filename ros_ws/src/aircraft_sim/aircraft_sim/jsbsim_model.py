@@ -13,11 +13,12 @@ from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import LANDED, FlightEnded
 from flight_core.rates import divide, seconds
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
+CLIMB = "velocities/h-dot-fps"
 POSE = (
     ("attitude/phi-rad", 1.0),
     ("attitude/theta-rad", 1.0),
@@ -25,10 +26,16 @@ POSE = (
     ("position/h-sl-ft", FOOT),
     ("velocities/v-north-fps", FOOT),
     ("velocities/v-east-fps", FOOT),
-    ("velocities/h-dot-fps", FOOT),
+    (CLIMB, FOOT),
     ("aero/beta-rad", 1.0),
 )
 """Properties of the pose other than the position, with the SI value of their units."""
+
+SOFT = 7.0 * FOOT
+"""Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14 CFR 23.473(d), 7 ft/s."""
+
+LEAST_FUEL = 1.0
+"""lb, of all tanks: an engine that stops with less is out of fuel."""
 
 
 class JsbsimModel:
@@ -63,6 +70,8 @@ class JsbsimModel:
         # the number and the flag of the engines that can stop: an electric engine has no flag
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
         self._engines = {number: node for number, node in running.items() if node.get_double_value()}
+        self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
+        self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
         self._actuator_model, self._wind_model = actuator_model, wind_model
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
@@ -81,9 +90,10 @@ class JsbsimModel:
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
         """From t to t + duration with the command u held, shape (4,), deviations from trim.
 
-        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground.
+        Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground: landed on the wheels with a
+        sink of at most SOFT, else the aircraft has hit the ground.
         """
-        step_ns, model = self.condition.step_ns, self._actuator_model
+        step_ns, model, sink = self.condition.step_ns, self._actuator_model, -FOOT * self._climb.get_double_value()
         dt, steps = seconds(step_ns), divide(duration_ns, step_ns, "step", "the duration")
         filters = self._wind_model.turbulence
         normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
@@ -110,9 +120,13 @@ class JsbsimModel:
         self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (before + self._velocity)
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
-            raise FlightEnded(f"{self.condition.title} hit the ground {now}")
+            on_wheels = not any(node.get_double_value() for node in self._structure)
+            if on_wheels and sink <= SOFT:
+                raise FlightEnded(f"{self.condition.title}{LANDED}{now}, with a sink of {sink:.2f} m/s")
+            raise FlightEnded(f"{self.condition.title} hit the ground {now}, with a sink of {sink:.2f} m/s")
         if stopped := [str(number) for number, node in self._engines.items() if not node.get_double_value()]:
-            raise FlightEnded(f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}")
+            why = ", out of fuel" if self._fuel.get_double_value() < LEAST_FUEL else ""
+            raise FlightEnded(f"{self.condition.title}: engine {', '.join(stopped)} stopped {now}{why}")
 
     def y(self) -> FloatArray:
         """[q, V, p, r], deviations from trim, shape (4,)."""

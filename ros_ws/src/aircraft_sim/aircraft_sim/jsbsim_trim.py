@@ -30,6 +30,7 @@ from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 HEADING, HEIGHT, CONTACT = "attitude/psi-rad", "position/h-agl-ft", "forces/fbz-gear-lbs"
+FUEL = "propulsion/total-fuel-lbs"
 
 WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
 
@@ -165,6 +166,13 @@ def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
 def engine_count(fdm: jsbsim.FGFDMExec) -> int:
     """Number of engines."""
     return int(fdm.get_propulsion().get_num_engines())
+
+
+def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
+    """The properties that are 1 while a part of the structure, not a wheel, touches the ground."""
+    found = fdm.query_property_catalog("contact/unit")
+    lines = found.splitlines() if isinstance(found, str) else found
+    return [line.split()[0] for line in lines if "/WOW" in line]
 
 
 def running_property(engine: int) -> str:

@@ -72,8 +72,8 @@ def fly(
 ) -> None:
     """Fly a scenario: aircraft, reference model, controller, recorder, guidance as processes over ROS 2 topics, in real time.
 
-    Exit status: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a leg missed or
-    not flown, 130 interrupted.
+    Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a leg
+    missed or not flown, 130 interrupted.
     """
     chosen = find_scenario(scenario, duration, with_route=route is None)
     require(

@@ -9,9 +9,10 @@ INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
 NOT_FLOWN = "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
+LANDED = " landed "  # in an outcome, between the aircraft and the time
 NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
-STATUS_INTERRUPTED, STATUS_ENDED_EARLY = 130, 3  # exit statuses of a flight, 0 completed
+STATUS_INTERRUPTED, STATUS_ENDED_EARLY = 130, 3  # exit statuses of a flight, 0 completed or landed
 STATUS_INCOMPLETE = 4  # completed with an incomplete log, or a leg missed or not flown
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
@@ -27,6 +28,8 @@ def exit_status(outcome: str) -> int:
     """Exit status of a flight by the outcome."""
     if outcome.startswith(f"{COMPLETED}, "):
         return STATUS_INCOMPLETE
+    if LANDED in outcome:
+        return 0
     return {COMPLETED: 0, INTERRUPTED: STATUS_INTERRUPTED}.get(outcome, STATUS_ENDED_EARLY)
 
 
