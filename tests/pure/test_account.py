@@ -29,7 +29,7 @@ from flight_analysis.report.account import (
     account_of_json,
     final_outcome,
 )
-from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
+from flight_analysis.report.run_folder import SUMMARY, FlightResult, read_flight, write_report
 from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.processes import leave_outcome
@@ -119,6 +119,22 @@ def test_every_command_says_what_log_lacks(
     assert any(note.startswith(f"the log lacks {topic} ") for note in result["notes"])
     if topic in {"u", "internals"}:
         assert result["checked"] < result["expected"] == 201
+
+
+@pytest.fixture(scope="module")
+def guided(tmp_path_factory: pytest.TempPathFactory) -> FlightResult:
+    """The first two seconds of a guided flight in one process."""
+    return fly_and_report(find_scenario("osprey_route", 2.0), tmp_path_factory.mktemp("guided"))
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize("topic", ["guidance", "u_m"])
+def test_report_says_what_log_lacks_of_guidance(topic: str, name: str, guided: FlightResult, tmp_path: Path) -> None:
+    log = damage(guided.mcap, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name])
+    summary = read_flight(log).summary
+    assert f"log incomplete: {topic} " in summary["outcome"]
+    if json.dumps(summary["guidance"]) != json.dumps(guided.flight.summary["guidance"]):
+        assert taken_over(summary, "guidance").startswith(", over ")
 
 
 def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -376,7 +376,7 @@ class _Log:
         """The notes. `end` is the flight time of the last sample in s, None without samples."""
         where = "" if end is None else f", t = {end:.3f} s"
         missing = seconds(self.known_end_ns - self.last_ns)
-        more = f"; {missing:.3f} s are missing after it" if missing > 0 else ""
+        more = f"; {missing:.3f} s are missing after it" if missing > 0 and self.last_ns else ""
         truncated = [f"{name} is truncated: read up to its last complete chunk{where}{more}" for name in self.truncated]
         lost = [f"{topic}: the recorder lost {count} messages" for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()]
         silent = [f"{topic}: the recorder received nothing {text}" for topic, text in self.metadata.get(SILENCES, {}).items()]

@@ -137,21 +137,20 @@ def final_outcome(outcome: str, account: Account) -> str:
 
 
 def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
-    """The outcome of a flight that left none, as one of nodes that were started one by one; empty for a part of a log.
+    """The outcome of a flight that left none, as one of nodes that were started one by one; empty for a part of a flight.
 
     The flight is completed where the log holds y, y_m and u for the duration in the log, else that of the scenario. An
     autopilot may end the last engagement, and with it u, before.
     """
-    if _lost_parts(tape.notes, planned=False):
-        return ""
+    is_part = bool(_lost_parts(tape.notes, planned=False)) or any(of.step_ns for of in tape.recording.values())
     if simulated and not {*TICKS} & {*tape.signals}:
-        return f"{NEVER_FLEW}: the controller never engaged"
+        return "" if is_part else f"{NEVER_FLEW}: the controller never engaged"
     loop = [tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape]
     held = min(int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop)
     planned = scenario.flight.duration if tape.duration is None else tape.duration
     if held >= tape.start_ns + nanoseconds(planned) - LATE_TICK_NS:
         return COMPLETED
-    return ended_early(seconds(held - tape.start_ns), planned)
+    return "" if is_part else ended_early(seconds(held - tape.start_ns), planned)
 
 
 def flown(tape: Tape) -> Tape:

@@ -193,7 +193,7 @@ def _duration(tape: Tape, of: Account) -> float | None:
     """Flight time of the last y, s; of a log that lacks y, the end of the flight."""
     if not len(tape["y"].stamp_ns):
         return None
-    return max(float(tape.time("y")[-1]), of.end) if of.over("y") else float(tape.time("y")[-1])
+    return of.end if of.over("y") else float(tape.time("y")[-1])
 
 
 FIGURES = {
