@@ -31,7 +31,7 @@ BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
 
 PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
 
-SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep
+SERVICE_POLL_PERIOD = 0.1  # s, between two checks of liveliness and service calls in lockstep, and of several nodes
 
 LATE_REQUEST_PAUSE = 10
 """Time without requests after one that delayed a tick, over its duration. The middleware blocks for 0.1 s before a reply whose
@@ -225,6 +225,7 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     starts = _start_instants(nodes, executor, stop)
     running = [_RealTime(node, start_ns, spin=len(nodes) == 1) for node, start_ns in zip(nodes, starts, strict=False)]
     serve_ns = time.monotonic_ns()
+    period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()
     request_short_slices()
     while not stop.requested:
@@ -242,5 +243,5 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
             duration_ns = time.monotonic_ns() - now_ns
             late = min(each.ticker.remaining() for each in running) <= 0.0
             pause_ns = LATE_REQUEST_PAUSE * duration_ns if late else 0
-            serve_ns = now_ns + max(nanoseconds(IDLE_POLL_PERIOD), min(pause_ns, LONGEST_PAUSE_NS))
+            serve_ns = now_ns + max(period_ns, min(pause_ns, LONGEST_PAUSE_NS))
         ran.report()
