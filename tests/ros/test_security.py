@@ -251,3 +251,16 @@ def test_second_host_has_access_with_network_profile(
     node = aircraft(start_node, within=(*hosts.first, *on_network))
     assert received(start("tests.ros.attacker", "30", within=(*hosts.second, *on_network))) > 0
     node.wait_for("receiving u from /controller#1")
+
+
+def test_hosts_receive_one_another_by_profile_of_network(start: Start, hosts: Hosts) -> None:
+    """Each says so of the other; hosts of one computer share the clock."""
+    arguments = ("flight_cli.cli", "network", "--peers", "10.77.0.1,10.77.0.2", "--check")
+    first, second = (
+        start(*arguments, "--write", f"{k}.xml", within=(*place, *environment()))
+        for k, place in enumerate((hosts.first, hosts.second))
+    )
+    for host, peer_address in ((first.succeed(), "10.77.0.2"), (second.succeed(), "10.77.0.1")):
+        (found,) = (line for line in host.lines if line.startswith(f"{peer_address}: "))
+        assert "received, receives this host; delay" in found
+        assert "its clock is 0.00" in found

@@ -49,7 +49,7 @@ LIMITS = {
 }
 """Age limits, s, by node and topic."""
 LOCKSTEP_UNBOUNDED = {"target"}  # an operator has the system clock, not the flight time
-WITHOUT_STAMP = {"/clock", "recorded", "route"}  # the flight time, the end of the log, a plan
+WITHOUT_STAMP = {"clock", "recorded", "route"}  # the flight time, the end of the log, a plan
 NAMES = {
     "y": SCENARIO.controller.outputs,
     "y_m": SCENARIO.controller.outputs,

@@ -44,6 +44,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._applied = AppliedInput(len(self._u), held_ns, nanoseconds(self.parameters.ramp))
         self._publisher_lock = PublisherLock(self._timeouts_ns)
         self._timeout_logged = False
+        self._ages_of_u: list[int] = []  # ns, since the last diagnostics, by the own clock: a u has the stamp of its y
         decode = Decoder(self._simulator.inputs).decode
         self._u_receiver = self.receive(U, decode, self._accept_u, max_age_ns=self._max_u_age_ns, lock=self._publisher_lock)
         self._publish_y, self._publish_truth = self.advertise(Y), self.advertise(TRUTH)
@@ -148,6 +149,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def _accept_u(self, sample: StampedVector, now_ns: int) -> None:
         self._u, self._timeout_logged = sample.value, False
+        if not self.parameters.lockstep:
+            self._ages_of_u.append(now_ns - sample.stamp_ns)
 
     def _max_u_age_ns(self) -> int:
         """Age limit of a u by the stamp, the instant of the y from which the controller computed u.
@@ -176,4 +179,9 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return DiagnosticStatus.WARN, "no u received yet: flying in trim", {}
         if not self.parameters.lockstep and self._timed_out(self.now_ns()):
             return DiagnosticStatus.ERROR, self._failsafe_message, {}
-        return DiagnosticStatus.OK, bounded(f"receiving u from {self._publisher_lock.publisher}"), {}
+        ages, self._ages_of_u = self._ages_of_u, []
+        figures: dict[str, object] = {}
+        if ages:
+            mean, largest = seconds(round(sum(ages) / len(ages))), seconds(max(ages))
+            figures = {"age of u mean (s)": f"{mean:.4f}", "age of u max (s)": f"{largest:.4f}"}
+        return DiagnosticStatus.OK, bounded(f"receiving u from {self._publisher_lock.publisher}"), figures

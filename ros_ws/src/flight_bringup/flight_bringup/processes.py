@@ -186,7 +186,6 @@ class FlightProcesses:
                 self._set_start(start_instants(start_lead(time.monotonic() - begin)))
             for node in self._second:
                 self._start(node)
-            leave_real_time_priority()  # the nodes have it
         except BaseException as error:
             if isinstance(error, ParameterError):
                 self.outcome = f"{NEVER_FLEW}: {error}"
@@ -213,6 +212,7 @@ class FlightProcesses:
 
         `start`: system time and monotonic time of t = 0, s, of several flights at once; by default LEAD from now.
         """
+        leave_real_time_priority()  # the nodes have it
         if not (reason := self.match()) and self._on_start:
             self._set_start(start or start_instants(LEAD))
             self._monitor.start(self.start_time)

@@ -198,7 +198,12 @@ class _RealTime:
         now_ns = time.monotonic_ns()
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + NANOSECONDS
-            self._reports += (self.node.publish_diagnostics, self.node.check_clock, *self.node.graph_checks())
+            self._reports += (
+                self.node.compare_clocks,
+                self.node.publish_diagnostics,
+                self.node.check_clock,
+                *self.node.graph_checks(),
+            )
             self._after_each = -(-len(self._reports) * self.ticker.period_ns // REPORT_TIME_NS)
         for _ in range(min(self._after_each, len(self._reports))):
             self._reports.popleft()()

@@ -21,6 +21,7 @@ from flight_core.parameters import NodeConfig, ParameterError, flatten
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
+from flight_ros.clocks import PeerClocks
 from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import MAX_SIZE, Encoder, stamp_of
@@ -67,7 +68,8 @@ class FlightNode(Node, Generic[P]):
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
-        self.refusals, self.endpoints = Refusals(self), EndpointMonitor(self)
+        self.clocks = None if self.parameters.lockstep else PeerClocks(self, self.instance)
+        self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
@@ -193,6 +195,10 @@ class FlightNode(Node, Generic[P]):
         self._adopted = parameters
         self.set_parameters_atomically(changes)
 
+    def clock_of(self, sender: str) -> str:
+        """The end of a sentence on the stamp of a node whose clock differs; else empty."""
+        return "" if self.clocks is None else self.clocks.told_of(sender)
+
     def warn_no_publisher(self, subscription: PolledSubscription) -> None:
         """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s."""
         now_ns = time.monotonic_ns()
@@ -257,6 +263,13 @@ class FlightNode(Node, Generic[P]):
             self.get_logger().error(f"the system clock was set by {seconds(step_ns - self._clock_step_ns):+.3f} s: {advice}")
             self._clock_step_ns = step_ns
 
+    def compare_clocks(self) -> None:
+        """Exchange the clocks of the nodes. Log a warning for each that begins to differ from this one, and once it agrees."""
+        if self.clocks is not None:
+            self.clocks.exchange(time.time_ns() - self.now_ns())
+            for sentence in self.clocks.news():
+                self.get_logger().warning(sentence)
+
     def graph_checks(self) -> list[Callable[[], None]]:
         """Checks of the graph, a topic each: to ask the middleware for all topics takes about a period of 2 ms.
 
@@ -298,7 +311,8 @@ class FlightNode(Node, Generic[P]):
         if conflict := self.refusals.conflict():
             level, sentence = DiagnosticStatus.ERROR, conflict
         refused = {f"refused {reason}": count for reason, count in self.refusals.counts.items()}
-        report: dict[str, object] = {**self._tick_times.report(), **refused, **further}
+        clocks = {} if self.clocks is None else self.clocks.report()
+        report: dict[str, object] = {**self._tick_times.report(), **refused, **further, **clocks}
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.instance

@@ -45,7 +45,8 @@ class Source(Protocol):
 class Refusals:
     """The refused samples of a node."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, clock_of: Callable[[str], str] = lambda sender: "") -> None:
+        self.clock_of = clock_of  # the end of a sentence on the stamp of a sender whose clock differs
         self.counts: Counter[str] = Counter()  # by "topic: reason"
         self.last: dict[str, tuple[int, str]] = {}  # by full topic: instant on the monotonic clock, and sentence
         self._node = node
@@ -158,8 +159,11 @@ class Receiver(Generic[S]):
             self.lock.check(sample.sender, now_ns)
         if self._max_age_ns is not None:
             max_age_ns = self._max_age_ns()
-            require_not_future(sample.stamp_ns, now_ns, max_age_ns)
-            require_not_old(sample.stamp_ns, now_ns, max_age_ns)
+            try:
+                require_not_future(sample.stamp_ns, now_ns, max_age_ns)
+                require_not_old(sample.stamp_ns, now_ns, max_age_ns)
+            except ChannelError as error:
+                raise ChannelError(error.reason, f"{error}{self._refusals.clock_of(sample.sender)}") from None
         self._take(sample, now_ns)
         if self.lock is not None:
             self.lock.refresh(sample.sender, now_ns)

@@ -98,6 +98,7 @@ DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
 ROSOUT = Topic("/rosout", Log, foreign=True)  # of ROS 2 itself
 CLOCK = Topic("clock", Clock)  # relative: each aircraft in lockstep has its own
 RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the log is complete
+CLOCKS = Topic("clocks", JointState)  # of each other node: the least (own clock at reception) - (its clock at sending), s
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 PROPOSAL = Topic("proposal", DiagnosticArray)  # of a learner: flight_ros.reports
 LEARNING = Topic("learning", DiagnosticArray)  # what became of a proposal, and fallbacks

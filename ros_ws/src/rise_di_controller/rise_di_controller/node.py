@@ -250,8 +250,9 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             if receiver.subscription.topic.name in stale:
                 self.warn_no_publisher(receiver.subscription)
         if not stale:
-            pair = f"no {self._y_m.name} at the stamp of {self._y.name}"
-            self.get_logger().warning(f"{pair}: check for a delay and for different clocks", throttle_duration_sec=2.0)
+            publisher = None if self._y.lock is None else self._y.lock.publisher
+            why = self.clock_of(publisher or "") or ": check for a delay and for different clocks"
+            self.get_logger().warning(f"no {self._y_m.name} at the stamp of {self._y.name}{why}", throttle_duration_sec=2.0)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         mode = self._controller.mode

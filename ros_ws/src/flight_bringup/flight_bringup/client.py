@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The network between hosts: its profile, and a client that says which hosts are received and receive, with delay and clock."""
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import psutil
+
+from flight_core.environment import PROFILE_VARIABLE
+from flight_core.files import write_file, writing
+from flight_ros.client import Client
+from flight_ros.clocks import ClockOfPeer, PeerClocks
+from flight_ros.network import addresses, network_profile, own_address, ports
+from flight_ros.transport import DISCOVERY_VARIABLE
+
+EXCHANGE_PERIOD = 0.1  # s
+SETTLE_TIME = 2.0  # s, of exchanges after every host has been received: the least delay of many counts
+
+
+def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping[str, str]]:
+    """Write the profile of this host to a file. Raises ParameterError.
+
+    Returns the address of this host, those of all hosts, and the environment that selects the profile.
+    """
+    hosts = addresses(peers)
+    local = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
+    own = own_address(hosts, {address for address in local if address.count(".") == 3 and address != "127.0.0.1"})
+    with writing("--write", file, "the path of a file"):
+        write_file(file, network_profile(own, hosts))
+    return own, hosts, {PROFILE_VARIABLE: str(file.absolute()), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
+
+
+def domain_ports() -> tuple[int, int]:
+    """The first and the last UDP port of the domain of this shell."""
+    return ports(int(os.environ.get("ROS_DOMAIN_ID") or 0))
+
+
+class NetworkClient(Client):
+    """Exchanges clocks with the same command on the other hosts."""
+
+    def __init__(self, own: str, peers: Sequence[str]) -> None:
+        super().__init__("network", rosout=False)
+        self._instances = {_instance(address): address for address in peers if address != own}
+        self._clocks = PeerClocks(self._node, _instance(own))
+
+    def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
+        """Exchange until every host is received and receives, at most `timeout` s.
+
+        Returns the hosts that are received, and of those that also receive this host the clocks.
+        """
+        received: set[str] = set()
+        clocks: dict[str, ClockOfPeer] = {}
+        end = time.monotonic() + timeout
+        while (now := time.monotonic()) < end:
+            self._clocks.exchange(0)
+            received |= {self._instances[name] for name in self._clocks.received() if name in self._instances}
+            known = self._clocks.clocks().items()
+            new = {self._instances[name]: clock for name, clock in known if name in self._instances}
+            if len(clocks) < len(new) == len(self._instances):
+                end = min(end, now + SETTLE_TIME)
+            clocks |= new
+            time.sleep(EXCHANGE_PERIOD)
+        return received, clocks
+
+
+def _instance(address: str) -> str:
+    return f"/network#{address}"

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Clocks of the other nodes of an aircraft, which may run on other hosts: offset and delay of each, measured both ways.
+
+Each node publishes once a second, on `clocks`, the least difference D_ij = (own clock at the reception) - (clock of the sender)
+of the messages of each other node j. With the delay d of a message and theta_j, the clock of j less that of i,
+
+    D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2   where d_ij = d_ji.
+
+Half of the difference of the two delays is the error. Source: D. L. Mills et al., RFC 5905 (2010), section 8.
+"""
+
+import time
+from collections import deque
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from rclpy.node import Node
+
+from flight_core.rates import NANOSECONDS
+from flight_core.text import bounded
+from flight_core.vectors import ChannelError
+from flight_ros.messages import Encoder, NamedDecoder, require_size
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import CLOCKS, NEWEST_SAMPLES
+
+WINDOW = 8  # differences of a node, of which the least has the least delay
+PEERS = 100  # nodes at most: names can be forged
+FORGET_NS = 5 * NANOSECONDS  # a node that is silent so long is forgotten
+DIFFERS = 0.005
+"""s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a local network. A larger offset
+is told: it is in every age, and of a clock ahead it delays u."""
+
+
+class ClockOfPeer(NamedTuple):
+    """Clock of another node less the own one, and the mean delay of a message, s."""
+
+    offset: float
+    delay: float
+
+    def __str__(self) -> str:
+        return f"{abs(self.offset):.3f} s {'ahead of' if self.offset > 0.0 else 'behind'} this one"
+
+
+class Peers:
+    """The differences of clocks that a node has seen, and those that the other nodes report of it. Times in s and ns."""
+
+    def __init__(self, own: str) -> None:
+        self._own = own
+        self._seen: dict[str, deque[float]] = {}
+        self._reported: dict[str, float] = {}
+        self._heard_ns: dict[str, int] = {}
+
+    def receive(self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]) -> None:
+        """Take a message of another node, with the instants on both clocks."""
+        for name in [name for name, heard_ns in self._heard_ns.items() if received_ns - heard_ns > FORGET_NS]:
+            self.forget(name)
+        if sender == self._own or (sender not in self._seen and len(self._seen) >= PEERS):
+            return
+        self._heard_ns[sender] = received_ns
+        self._seen.setdefault(sender, deque(maxlen=WINDOW)).append((received_ns - sent_ns) / NANOSECONDS)
+        if self._own in reported:
+            self._reported[sender] = reported[self._own]
+
+    def forget(self, name: str) -> None:
+        """Forget a node."""
+        for known in (self._seen, self._reported, self._heard_ns):
+            known.pop(name, None)
+
+    def differences(self) -> dict[str, float]:
+        """The least difference of each other node, to be reported."""
+        return {name: min(seen) for name, seen in self._seen.items()}
+
+    def clocks(self) -> dict[str, ClockOfPeer]:
+        """The clocks of the nodes that have reported."""
+        seen = self.differences()
+        return {
+            name: ClockOfPeer((reported - seen[name]) / 2.0, (reported + seen[name]) / 2.0)
+            for name, reported in self._reported.items()
+        }
+
+
+class PeerClocks:
+    """Measures the clocks of the other nodes over `clocks`."""
+
+    def __init__(self, node: Node, instance: str) -> None:
+        self._peers, self._instance = Peers(instance), instance
+        self._told: dict[str, float] = {}
+        self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, NEWEST_SAMPLES).publish
+        self._subscription, self._decoder = PolledSubscription(node, CLOCKS, NEWEST_SAMPLES, raw=True), NamedDecoder()
+
+    def exchange(self, ahead_ns: int) -> None:
+        """Take what the others have sent, and send; once a second. `ahead_ns`: the system clock less the time of the node."""
+        for received in self._subscription.take():
+            try:
+                require_size(received.message)
+                sample = self._decoder.decode(received.message)
+            except ChannelError:
+                continue
+            self._peers.receive(sample.sender, sample.stamp_ns, received.received_ns - ahead_ns, sample.channels)
+        differences = self._peers.differences()
+        encoder = Encoder([*differences], self._instance)
+        self._publish(encoder.encode(time.time_ns() - ahead_ns, np.array([*differences.values()])))
+
+    def received(self) -> list[str]:
+        """The other nodes that are received."""
+        return [*self._peers.differences()]
+
+    def clocks(self) -> dict[str, ClockOfPeer]:
+        """The clocks of the other nodes."""
+        return self._peers.clocks()
+
+    def told_of(self, sender: str) -> str:
+        """The end of a sentence on a stamp of a node whose clock differs; empty for one that agrees, or is unknown."""
+        clock = self.clocks().get(sender)
+        return bounded(f": the clock of {sender} is {clock}") if clock is not None and abs(clock.offset) > DIFFERS else ""
+
+    def report(self) -> dict[str, object]:
+        """For the diagnostics."""
+        report: dict[str, object] = {}
+        for name, clock in sorted(self.clocks().items()):
+            report |= {f"clock of {name} (s)": f"{clock.offset:+.4f}", f"delay of {name} (s)": f"{clock.delay:.4f}"}
+        return report
+
+    def news(self) -> list[str]:
+        """A sentence for each clock that has begun to differ, by another amount than told, or that agrees again."""
+        sentences = []
+        for name, clock in self.clocks().items():
+            offset = clock.offset if abs(clock.offset) > DIFFERS else 0.0
+            if abs(offset - self._told.get(name, 0.0)) > DIFFERS:
+                self._told[name] = offset
+                agrees = "agrees with this one" if offset == 0.0 else f"is {clock}: synchronise the hosts, as by chrony or PTP"
+                sentences.append(bounded(f"the clock of {name} {agrees}"))
+        return sentences

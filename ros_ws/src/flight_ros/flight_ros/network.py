@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Profile of the middleware for nodes on several hosts: unicast over UDP between the addresses of the hosts alone."""
+
+import ipaddress
+import re
+from collections.abc import Collection, Sequence
+
+from flight_core.parameters import ParameterError, require
+from flight_ros.transport import LOOPBACK_PROFILE
+
+PEER_RANGE = 20  # participants of each host that are found
+ANNOUNCEMENT_NS = 500_000_000
+"""A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the loopback profile five nodes
+would send 1000 packets a second to each host."""
+FIRST_PORT, PORTS_A_DOMAIN = 7400, 250  # DDSI-RTPS 2.3, section 9.6.1.1
+
+
+def addresses(text: str) -> tuple[str, ...]:
+    """The addresses of the hosts, from "10.0.0.1,10.0.0.2". Raises ParameterError."""
+    found = tuple(part.strip() for part in text.split(","))
+    for address in found:
+        try:
+            own = ipaddress.IPv4Address(address)
+        except ValueError:
+            raise ParameterError(f"--peers: found {address!r}, expected IPv4 addresses, as in 10.0.0.1,10.0.0.2") from None
+        usable = not (own.is_unspecified or own.is_multicast or own.is_loopback)
+        require(usable, "--peers", repr(address), "the address of a host on the network")
+    require(
+        len(set(found)) == len(found) >= 2, "--peers", repr(text), "two or more addresses, each once, this host's among them"
+    )
+    return found
+
+
+def own_address(peers: Sequence[str], local: Collection[str]) -> str:
+    """The address of this host among the peers, by the addresses of its interfaces. Raises ParameterError."""
+    own = [address for address in peers if address in local]
+    named = ", ".join(sorted(local)) or "none"
+    require(
+        len(own) == 1, "--peers", f"{len(own)} addresses of this host ({named})", "one of them, and those of the other hosts"
+    )
+    return own[0]
+
+
+def network_profile(own: str, peers: Sequence[str]) -> str:
+    """The loopback profile with the address of this host in place of 127.0.0.1, and the hosts as initial peers."""
+    text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
+    locators = "".join(f"<locator><udpv4><address>{address}</address></udpv4></locator>" for address in peers)
+    about = (
+        f"<!-- Fast DDS over UDP, unicast alone, bound to {own}, for hosts {', '.join(peers)}; written by rise-di network. -->"
+    )
+    for pattern, value in (
+        (r"<!--.*?-->", about),
+        (r"(?s)(?<=<initialPeersList>).*?(?=</initialPeersList>)", locators),
+        (r"(?s)(?<=<interfaceWhiteList>).*?(?=</interfaceWhiteList>)", f"<address>{own}</address>"),
+        (r"(?<=<maxInitialPeersRange>)\d+", str(PEER_RANGE)),
+        (r"(?s)(?<=<leaseAnnouncement>)(\s*<sec>0</sec>\s*<nanosec>)\d+", rf"\g<1>{ANNOUNCEMENT_NS}"),
+        ("udp_loopback", "udp_network"),
+        ('profile_name="loopback"', 'profile_name="network"'),
+    ):
+        text, count = re.subn(pattern, value, text, flags=re.DOTALL)
+        require(count > 0, str(LOOPBACK_PROFILE), f"no {pattern}", "the profile of this version")
+    return text
+
+
+def ports(domain: int) -> tuple[int, int]:
+    """The first and the last UDP port of a domain."""
+    first = FIRST_PORT + PORTS_A_DOMAIN * domain
+    return first, first + PORTS_A_DOMAIN - 1
