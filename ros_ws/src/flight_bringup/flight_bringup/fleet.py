@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from flight_analysis.closed_loop.scenario import Scenario, require_euler
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow, interrupt
-from flight_bringup.graph import LEAD, absolute_namespace
+from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
 from flight_bringup.processes import FlightProcesses, handle_signals, start_instants
 from flight_bringup.scenarios import find_scenario, with_route
 from flight_core.arguments import FilePath, as_path
@@ -79,8 +79,10 @@ class Fleet:
 
     def participants(self) -> int:
         """The DDS participants of its flight: one of the command, and one a process."""
-        nodes = [1 if self.composed else 4 + (member.scenario.guidance is not None) for member in self.members]
-        return 1 + sum(nodes)
+        scenarios = [member.scenario for member in self.members]
+        if self.composed:
+            return 1 + sum(1 + scenario.learns() for scenario in scenarios)  # a learner has a process of its own
+        return 1 + sum(len(FIRST_STAGE) + len(second_stage(scenario)) for scenario in scenarios)
 
 
 def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
