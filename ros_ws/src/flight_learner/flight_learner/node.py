@@ -38,7 +38,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
     """Takes y and u of each tick from `internals`, and publishes a proposal for each identification that is due.
 
     While a search runs, the samples wait in the queue of the subscription: the record of a search does not change, and in
-    lockstep the proposals are those of the loop in one process.
+    lockstep the proposals are those of the loop in one process. In real time a search begins with the newest sample: of
+    identifications that became due meanwhile the last is made.
     """
 
     def __init__(self) -> None:
@@ -63,7 +64,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         )
         self._publish = self.advertise(PROPOSAL)
         self._search: threading.Thread | None = None
-        self._proposal, self._end_ns, self._flown = Proposal(None, ""), 0, 0
+        self._proposal, self._end_ns, self._flown, self._is_due = Proposal(None, ""), 0, 0, False
         self._said = "no model yet"
 
     def period_ns(self) -> int:
@@ -98,18 +99,25 @@ class LearnerNode(FlightNode[LearnerConfig]):
             advanced = True
         while self._search is None and self._internals.poll(now_ns, 1):
             advanced = True
+            if self.parameters.lockstep:
+                self._begin_search()
+        self._begin_search()
         return advanced
+
+    def _begin_search(self) -> None:
+        """Begin the search that is due, if any, on the record so far."""
+        if self._is_due and self._search is None:
+            self._is_due = False
+            self._search = threading.Thread(target=self._propose, daemon=True)  # it does not delay the end of the node
+            self._search.start()
 
     def _take(self, sample: StampedVector, now_ns: int) -> None:
         mode, age, flown = sample.value[:3].tolist()
         y, u = np.split(sample.value[3:], 2)
         if mode == Mode.ENGAGED:
             self._learner.take(sample.stamp_ns, y, u)
-        tick_ns = sample.stamp_ns + round(age * NANOSECONDS)
-        if self._updates.due(tick_ns):
-            self._end_ns, self._flown = tick_ns, int(flown)
-            self._search = threading.Thread(target=self._propose, daemon=True)  # it does not delay the end of the node
-            self._search.start()
+        self._end_ns, self._flown = sample.stamp_ns + round(age * NANOSECONDS), int(flown)
+        self._is_due = self._updates.due(self._end_ns) or self._is_due
 
     def _propose(self) -> None:
         if not self.parameters.lockstep:

@@ -14,6 +14,7 @@ from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
 from rise_di_controller import divergence, guard, internals
+from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig, as_controller
 
 
@@ -31,17 +32,31 @@ class ControlOutput(NamedTuple):
         return self.log()
 
 
+class Prepared(NamedTuple):
+    """What a controller makes of parameters before they are in force: a third of the time of a change in flight."""
+
+    parameters: ControllerConfig
+    law: TunedLaw
+    guard: guard.GuardParams
+    digest: int
+    names: tuple[str, ...]  # of the channels of `internals`
+
+
+def prepared(parameters: ControllerConfig) -> Prepared:
+    """The parameters with what a controller makes of them."""
+    names = internals.names(parameters.logged_groups())
+    return Prepared(parameters, parameters.tuned_law(), parameters.guard(), parameters.digest(), names)
+
+
 class Controller:
     """`guard.tick` with state and the last samples of y and y_m."""
 
     def __init__(self, parameters: ControllerConfig) -> None:
         as_controller(parameters, "parameters")
-        self._law, self._guard = parameters.tuned_law(), parameters.guard()
+        _, self._law, self._guard, self._digest, self.names = prepared(parameters)
         self._state = guard.initial_state(len(parameters.inputs), self._guard.allocation)
-        self.names = internals.names(parameters.logged_groups())
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
-        self._digest = parameters.digest()
         self._first = self._parameters = parameters
         self._first_law = True
         zero = np.zeros(len(parameters.outputs))
@@ -79,25 +94,23 @@ class Controller:
         if self._state.mode is Mode.ENGAGED:
             self._state = self._state._replace(mode=Mode.WAITING)
 
-    def retune(self, parameters: ControllerConfig) -> None:
+    def retune(self, parameters: "ControllerConfig | Prepared") -> None:
         """Replace the parameters between two ticks without a jump of u (bumpless transfer). Equal parameters change nothing.
 
         Raises ParameterError for parameters with a different state: of a different law, or with an observer added.
         """
-        law, digest = parameters.tuned_law(), parameters.digest()
-        if digest == self._digest:
+        new = parameters if isinstance(parameters, Prepared) else prepared(parameters)
+        if new.digest == self._digest:
             return
-        names = internals.names(parameters.logged_groups())
         require(
-            names == self.names,
+            new.names == self.names,
             "controller.law",
-            parameters.law,
+            new.parameters.law,
             "the law and the observer that fly: these change at a restart",
         )
-        limits = parameters.guard()
-        self._state = guard.retune(self._state, self._law, law, (self._guard.nominal, limits.nominal))
-        self._law, self._guard, self._digest, self._parameters = law, limits, digest, parameters
-        self._first_law = self._has_first_model(parameters)
+        self._state = guard.retune(self._state, self._law, new.law, (self._guard.nominal, new.guard.nominal))
+        self._law, self._guard, self._digest, self._parameters = new.law, new.guard, new.digest, new.parameters
+        self._first_law = self._has_first_model(new.parameters)
 
     def fallback(self) -> ControllerConfig | None:
         """The parameters of the start where a law with a model that was learned in flight diverges; else None."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from flight_core.parameters import ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
-from rise_di_controller.controller import Controller
+from rise_di_controller.controller import Controller, Prepared, prepared
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
@@ -70,7 +70,7 @@ class Learning:
         self._updates = Updates(parameters.learn)
         self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
-        self._certificate: tuple[Proposal, Generator[None, None, RiseDiConfig]] | None = None
+        self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
 
@@ -107,7 +107,7 @@ class Learning:
         if not self._simulated:
             taken = self._certify(controller, now_ns)
         if (fallback := controller.fallback()) is not None:
-            self._take(controller, now_ns, fallback, "falls back to the law of the start: it diverges")
+            self._take(controller, now_ns, prepared(fallback), "falls back to the law of the start: it diverges")
             taken = fallback
         return taken
 
@@ -162,8 +162,8 @@ class Learning:
         self._announce(Event(now_ns, {}, f"refused: {refusal}"))
         return None
 
-    def _take(self, controller: Controller, now_ns: int, new: ControllerConfig, sentence: str) -> None:
-        change = changes(controller.parameters, new)
+    def _take(self, controller: Controller, now_ns: int, new: Prepared, sentence: str) -> None:
+        change = changes(controller.parameters, new.parameters)
         controller.retune(new)
         self._announce(Event(now_ns, change, sentence))
 
@@ -175,9 +175,7 @@ def _race(proposal: Proposal, flown: int) -> str:
     return f"found a proposal beside the parameters {proposal.flown}, expected {flown}: they changed meanwhile"
 
 
-def _certificate(
-    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig
-) -> Generator[None, None, RiseDiConfig]:
+def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
     """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
@@ -199,7 +197,9 @@ def _certificate(
         yield from proposed.checks()
     except ParameterError as error:
         raise ParameterError(f"controller.{error}") from None
-    return proposed
+    ready = prepared(proposed)
+    yield
+    return ready
 
 
 def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:

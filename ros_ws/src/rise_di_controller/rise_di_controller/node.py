@@ -11,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from flight_core.modes import Mode
-from flight_core.parameters import require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.text import bounded
@@ -97,7 +96,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def on_parameters(self, parameters: ControllerConfig) -> None:
         """Replace the parameters between two ticks, all at once and without a jump of u."""
-        require(self._adopting is None, "controller", "a change in the tick of a learned model", "one after it: set it again")
         self._controller.retune(parameters)
 
     def period_ns(self) -> int:
@@ -178,7 +176,6 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def _new_learning(self) -> Learning | None:
         """The proposals of a learner, for parameters that learn; None for others."""
-        self._adopting: ControllerConfig | None = None  # parameters in force that are no parameters of the node yet
         self._decoded = self._waits_for_proposal = False
         parameters = self.parameters
         if not isinstance(parameters, RiseDiConfig) or parameters.learn is None:
@@ -198,19 +195,13 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         return Learning(parameters, self._say, simulated=parameters.lockstep)
 
     def _learn(self, now_ns: int) -> None:
-        """Take the proposals, between two ticks. In real time the parameters of the node follow a tick later: 3 ms."""
+        """Take the proposals, between two ticks."""
         if self._learning is None:
-            return
-        if self._adopting is not None:
-            self.adopt(self._adopting)
-            self._adopting = None
             return
         self._decoded = False
         self._proposals.poll(now_ns)
-        self._adopting = self._learning.step(self._controller, now_ns)
-        if self._adopting is not None and self.parameters.lockstep:
-            self.adopt(self._adopting)
-            self._adopting = None
+        if (taken := self._learning.step(self._controller, now_ns)) is not None:
+            self.adopt(taken)
 
     def _has_proposal(self, now_ns: int) -> bool:
         """Lockstep: whether the proposal has arrived for which the step of an instant waits, if any."""
