@@ -43,10 +43,12 @@ from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
+from rise_di_controller.internals import Saturation
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
 
@@ -277,6 +279,22 @@ def test_guidance_with_sideslip_feedback_flies_holds_and_turns_of_f15(f15: Ident
     assert log["pose.psi"][-1] == pytest.approx(math.pi / 2.0, abs=math.radians(2.0))  # the band of a settled heading
     assert log["pose.altitude"][-1] == pytest.approx(4572.0 + 100.0, abs=5.0)  # that of a settled altitude
     assert np.max(np.abs(log["pose.beta"])) < math.radians(2.0)  # measured 1.4; it diverges without the feedback
+
+
+def test_flight_with_surface_at_stop_says_so() -> None:
+    stamps, zeros = np.arange(100, dtype=np.int64) * 10_000_000, np.zeros((100, 1))
+    limited = np.zeros((100, 2))
+    limited[:20, 0] = Saturation.MAGNITUDE
+    limited[:50, 1] = Saturation.RATE  # a slow surface is not at its stop
+    tape = Tape(
+        {
+            "internals": Signal(stamps, ("limited.elevator", "limited.rudder"), limited),
+            "u": Signal(stamps, ("elevator",), zeros),
+            **{name: Signal(stamps, ("q",), zeros) for name in ("y", "y_m")},
+        },
+        outcome=COMPLETED,
+    )
+    assert manoeuvre_result(tape).text == "completed, elevator at its stop 20%"
 
 
 def test_without_sideslip_feedback_the_f15_is_lost(f15: IdentifiedAircraft) -> None:

@@ -395,7 +395,7 @@ def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
     largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left=("flight",))
     for title, flight in found.flights.items():
         errors = [f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
-        flights.add_row(title, *errors, flight.outcome)
+        flights.add_row(title, *errors, flight.text)
         largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
     console.print(flights)
     console.print(largest)

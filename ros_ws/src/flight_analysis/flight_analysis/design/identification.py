@@ -29,7 +29,7 @@ from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, M
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import with_extended_state_observer
 from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
-from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
@@ -201,12 +201,22 @@ def moderate_turbulence(altitude: float) -> dict[str, Any]:
 # Identification
 
 
+LEAST_SHARE = 0.01
+"""Of the ticks: 0.6 s of a flight of a minute, more than the begin of a step takes."""
+
+
 class ManoeuvreResult(NamedTuple):
     """Result of a simulation of the manoeuvre in one process."""
 
     outcome: str
     rms: dict[str, float]  # of the error by output, SI
     largest: dict[str, float]  # abs(u) by input
+    at_stop: dict[str, float]  # by input, the share of the ticks with the input at its limit, from LEAST_SHARE on
+
+    @property
+    def text(self) -> str:
+        """The outcome, and the inputs that were at their limits."""
+        return ", ".join([self.outcome, *(f"{name} at its stop {share:.0%}" for name, share in self.at_stop.items())])
 
 
 class IdentifiedAircraft(NamedTuple):
@@ -349,11 +359,13 @@ def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None
 
 
 def manoeuvre_result(tape: Tape) -> ManoeuvreResult:
-    """Rms errors and the largest commands of a tape."""
+    """Rms errors, the largest commands and the inputs at their limits of a tape."""
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     largest = {name: float(np.max(np.abs(tape["u"][name]), initial=0.0)) for name in tape["u"].names}
-    return ManoeuvreResult(tape.outcome, rms, largest)
+    shares = {name: kinds["magnitude"] for name, kinds in saturation_shares(tape).items()}
+    at_stop = {name: share for name, share in shares.items() if share >= LEAST_SHARE}
+    return ManoeuvreResult(tape.outcome, rms, largest, at_stop)
 
 
 def without_beta(scenario: Scenario) -> Scenario:
