@@ -89,6 +89,13 @@ def test_in_real_time_message_is_due_when_it_was_sent_not_when_it_was_received(t
     assert [round(playback.t(message.due_ns), 6) for message in playback.messages] == [2.001, 2.003, 2.006]
 
 
+def test_message_without_stamp_is_due_when_it_was_sent(tmp_path: Path) -> None:
+    """Of a driver that forgets the header: no sample has a stamp."""
+    sent = [(topic, EPOCH + k * NANOSECONDS, 0, 0.0) for k in range(3) for topic in ("/truth", "/y_m")]
+    playback = read_playback(bag_of(tmp_path / "run", sent))
+    assert [playback.t(message.due_ns) for message in playback.messages] == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+
+
 def test_in_lockstep_message_is_due_at_stamp_but_not_before_those_sent_before_it(tmp_path: Path) -> None:
     # The host sent all of it within 3 ms; the second y is 20 ms late, and /other carries the host's time.
     sent = [

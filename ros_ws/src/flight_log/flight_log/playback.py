@@ -3,7 +3,7 @@
 """Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_bringup.player` sends."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,7 +67,7 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
     wanted = {full for name in topics for full in _matching(name, known, str(run))} if topics else set(known) - set(SHARED)
     require(bool(wanted), str(run), f"no message{f' to play among {listed(skipped)}' if skipped else ''}", A_FLIGHT)
     begins_stamped = {topic: begins_with_stamp(_definition(message)) for topic, message in known.items()}
-    votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE]
+    votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE and stamp_of(message.data)]
     lockstep = 2 * sum(votes) > len(votes)
     messages, now_ns = [], 0
     for message in stored:
@@ -79,7 +79,7 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
             now_ns = max(now_ns, stamp_of(message.data))
         if message.topic in wanted:
             messages.append(ScheduledMessage(now_ns, message.topic, message.data, stamped))
-    start_ns = _start_ns(stored, messages[0].due_ns)
+    start_ns = _start_ns((message for message in stored if _is_flight_time(message) is lockstep), messages[0].due_ns)
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
     require(begin_ns <= messages[-1].due_ns, "start", f"{start:g} s", f"a flight time before the end of the log, {end:g} s")
@@ -124,7 +124,7 @@ def _is_flight_time(stored: StoredMessage) -> bool:
     return abs(stamp_of(stored.data) - _sent_ns(stored)) > MAX_CLOCK_OFFSET_NS
 
 
-def _start_ns(stored: Sequence[StoredMessage], otherwise: int) -> int:
+def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
     """Stamp of flight time 0, by the first `truth` or else the first `y_m`; `otherwise` without both."""
     first: dict[str, StoredMessage] = {}
     for message in stored:

@@ -23,12 +23,12 @@ STYLES = {"recording": "bold green", "no data": "bold red", "interrupted": "bold
 
 
 def show(flight: Flight) -> None:
-    """Show a flight until the end of the recording, or Ctrl-C. Raises as `Flight.update`."""
+    """Show a flight until the recording ends or is interrupted, or Ctrl-C. Raises as `Flight.update`."""
     with Live(picture(flight), refresh_per_second=REFRESH, transient=False) as live:
         while True:
             flight.update()
             live.update(picture(flight))
-            if flight.state() == "ended":
+            if flight.state() in {"ended", "interrupted"}:
                 flight.update()
                 flight.counted()
                 live.update(picture(flight))
