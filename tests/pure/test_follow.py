@@ -19,6 +19,7 @@ from tests.joint_states import JOINT_STATE, STORE, vector
 
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from flight_log.bag import BagChannel, BagWriter
 from flight_log.disk import is_locked, try_lock
 from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import decoder, tables
@@ -92,6 +93,23 @@ def test_logs_without_message_indexes_or_chunks_read(options: dict[str, object],
     whole, follower = list(Follower(path, all_of).read()), Follower(path, all_of)
     assert [data for record in whole if isinstance(record, Messages) for data in record.data] == sent
     assert [next(iter(follower.read())) for _ in whole] == whole  # an iteration that is left is continued here, too
+
+
+def write_chunk(bag: BagWriter, channel: BagChannel, number: int) -> None:
+    bag.write(channel, number, number, number, vector(number, ["q"], [float(number)]))
+    bag.flush()
+
+
+def test_topic_whose_first_message_comes_after_the_chunk_with_its_channel_is_read(tmp_path: Path) -> None:
+    with BagWriter(tmp_path) as bag:
+        write_chunk(bag, early := bag.add_topic("/y", JOINT_STATE, ""), 1)
+        late = bag.add_topic("/late", JOINT_STATE, "")
+        write_chunk(bag, early, 2)
+        write_chunk(bag, late, 3)
+    follower = Follower(tmp_path, all_of)
+    found = [record for record in follower.read() if isinstance(record, Messages)]
+    assert follower.damaged == 0
+    assert [stamp for topic in ("/y", "/late") for stamp in vectors(found, topic)[0].tolist()] == [1, 2, 3]
 
 
 def test_all_files_of_split_bag_read_in_order(tmp_path: Path) -> None:

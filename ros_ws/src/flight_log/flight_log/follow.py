@@ -13,6 +13,7 @@ import os
 import struct
 from collections import deque
 from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, NamedTuple
@@ -32,6 +33,7 @@ from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE_INDEX, RECOR
 HEAD = struct.Struct("<BQ6xQQ")  # of RECORD and MESSAGE: opcode, length, log time, publish time
 # As plain numbers: of a log of one hour 400,000 records are compared.
 CHUNK, MESSAGE, INDEX = int(Opcode.CHUNK), int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
+SCHEMA, CHANNEL = int(Opcode.SCHEMA), int(Opcode.CHANNEL)
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
 READ_BYTES = 1 << 20  # read from the file at once
 
@@ -79,6 +81,7 @@ class Follower:
         self._channels: dict[int, _Channel] = {}
         self._chunk = b""  # the last chunk
         self._indexed = True  # at least one message index of it has been read
+        self._unread: list[tuple[int, int]] = []  # place and length of the chunks whose schemas and channels were not read
         self._finished: Iterator[object] | None = None  # records of a file of another storage, or of a packed file
 
     @property
@@ -181,6 +184,7 @@ class Follower:
                 return
             self._take_unindexed()
             if opcode == CHUNK:
+                self._unread.append((self._position - len(content), len(content)))
                 self._chunk = decompress(content)
                 self._indexed = False
                 return
@@ -201,8 +205,7 @@ class Follower:
             raise McapError("a message index longer than its chunk")
         self._indexed = True
         if identity not in self._channels:
-            for record in split(self._chunk):
-                self._learn(record)
+            self._learn_from_chunks()
         if (channel := self._channels.get(identity)) is None:
             raise McapError("messages without their channel")
         if size == 0 or channel.rate <= 0.0:
@@ -216,6 +219,18 @@ class Follower:
             places = places[skipped::step]
         if places:
             self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
+
+    def _learn_from_chunks(self) -> None:
+        """Schemas and channels of the chunks so far: that of a topic may be in a chunk without a message of it."""
+        places, self._unread = self._unread, []
+        if self.path is None:
+            return
+        with self.path.open("rb") as stream:
+            for place, length in places:
+                stream.seek(place)
+                with suppress(*DECODE_ERRORS):  # counted when the chunk itself was read
+                    for record in split(decompress(stream.read(length)), (SCHEMA, CHANNEL)):
+                        self._learn(record)
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
         """Times of sending, else of receipt, in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""

@@ -8,7 +8,7 @@ import threading
 import zlib
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from io import BytesIO
@@ -281,8 +281,8 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
         yield from (future.result() for future in ahead)
 
 
-def split(data: bytes) -> Iterator[McapRecord]:
-    """The records in a sequence of bytes. Raises DECODE_ERRORS."""
+def split(data: bytes, only: Container[int] | None = None) -> Iterator[McapRecord]:
+    """The records in a sequence of bytes, `only` those of some opcodes. Raises DECODE_ERRORS."""
     position = 0
     while position < len(data):
         opcode, length = RECORD.unpack_from(data, position)
@@ -290,7 +290,9 @@ def split(data: bytes) -> Iterator[McapRecord]:
         end = position + length
         if end > len(data):
             raise McapError("a record longer than its container")
-        if opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # here, for nearly all records are messages
+        if only is not None and opcode not in only:
+            pass
+        elif opcode == Opcode.MESSAGE and length >= MESSAGE.size:  # here, for nearly all records are messages
             channel, sequence, log_time, publish_time = MESSAGE.unpack_from(data, position)
             yield Message(channel, log_time, data[position + MESSAGE.size : end], publish_time, sequence)
         else:
