@@ -29,6 +29,7 @@ from flight_campaign.law_margins import has_margins
 from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, LICENCE, new_table, parse_numbers, progress_bar, write_text
+from flight_core.files import display_path
 from flight_core.parameters import require
 from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig
@@ -135,7 +136,7 @@ def compare(
         console.print(f"without tuned gains (--tune finds them): {missing}")
     if write is not None:
         _write(write, names[0], aims[0], tuned[names[0]][aims[0]], benchmark)
-        console.print(f"controller: {write}")
+        console.print(f"controller: {display_path(write)}")
     if to_json is not None:
         rows = [_as_json(result, entries[result.law], chosen) for result in results]
         figures = {"scenario": chosen.name, "aircraft": aircraft, "seed": seed, "wind": effect}

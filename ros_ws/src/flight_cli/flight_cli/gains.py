@@ -23,7 +23,7 @@ from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import LICENCE, new_table, options, parse_numbers, print_json, write_text
-from flight_core.files import writing
+from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
 from rise_di.gain_design import check_gains, select_gains
@@ -151,7 +151,7 @@ def gains(
             console.print(origin, highlight=False, soft_wrap=True)
         for key, path in (("gains", write), ("page", page)):
             if path is not None:
-                console.print(f"{key}: {path}", highlight=False, soft_wrap=True)
+                console.print(f"{key}: {display_path(path)}", highlight=False, soft_wrap=True)
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
 

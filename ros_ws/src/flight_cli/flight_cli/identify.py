@@ -36,6 +36,7 @@ from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
 from flight_cli.log_options import scenario_file, warn_of_lacks
 from flight_cli.output import COUNT_COLUMNS, new_table, options, print_json, progress_bar, write_text
+from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
@@ -190,7 +191,7 @@ def _identify_by_steps(
         print_json(_as_json(found, path))
     else:
         _show(console, found)
-        console.print(f"scenario: {path}", highlight=False)
+        console.print(f"scenario: {display_path(path)}", highlight=False)
     if found.failure:
         print(f"error: {found.condition.title} does not fly: {found.failure}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY)
@@ -230,7 +231,7 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         write_text("--write", write, model_yaml(found, str(source.log)))
         page = write.with_suffix(".html")
         write_text("--write", page, page_html(_innovation_page(found, source.log.name)))
-        console.print(f"model: {write}, innovations: {page}", highlight=False)
+        console.print(f"model: {display_path(write)}, innovations: {display_path(page)}", highlight=False)
     again = None
     if refly_margin is not None:
         with console.status("flying with the model"):

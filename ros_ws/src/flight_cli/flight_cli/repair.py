@@ -26,7 +26,8 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP
     repaired = repair_bag(run)
     for file in repaired.files:
         if file.damaged is not None:
-            print(f"{file.path.name} had {file.faults}: {file.kept} messages kept; the damaged file is {file.damaged.name}")
+            damaged = f"the damaged file is {printable(file.damaged.name)}"
+            print(f"{printable(file.path.name)} had {file.faults}: {file.kept} messages kept; {damaged}")
     if repaired.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
     elif not any(file.damaged for file in repaired.files) and not repaired.missing:

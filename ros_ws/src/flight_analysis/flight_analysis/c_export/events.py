@@ -16,6 +16,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_core.text import printable
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_log.tape_reader import RecordedRun
 from rise_di_controller import guard
@@ -269,4 +270,4 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.u.tobytes() == groups["u"][k].tobytes()
-    return [controller], recorder.recording(f"the log {run.path}"), equal
+    return [controller], recorder.recording(f"the log {printable(str(run.path))}"), equal
