@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.srv import GetParameters, SetParametersAtomically
+from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
@@ -290,6 +290,20 @@ def test_invalid_change_rejected_with_reason_and_has_no_effect(
     unchanged = peer_node.call(GetParameters, "controller/get_parameters", request).values
     assert [value.double_value for value in unchanged] == [1.0, 100.0]
     wait_for_messages(peer_node, "u", 5, each=lambda: peer_node.send(0.01))
+
+
+def test_parameters_of_several_nodes_set_none(start_node: Start, peer_node: Peer) -> None:
+    """`ros2 param load` joins the sections of a file: max_age may then be that of the aircraft."""
+    start_node("rise_di_controller").wait_for("ready")
+    request = SetParameters.Request()
+    request.parameters = [
+        Parameter(name, value=value).to_parameter_msg() for name, value in (("max_age", 0.7), ("step", 0.002))
+    ]
+    results = peer_node.call(SetParameters, "controller/set_parameters", request).results
+    assert [result.successful for result in results] == [False, False]
+    assert results[0].reason == "found step, expected parameters of /controller alone; nothing is set"
+    request = GetParameters.Request(names=["max_age"])
+    assert peer_node.call(GetParameters, "controller/get_parameters", request).values[0].double_value == 0.1
 
 
 def test_waits_for_configure_and_activate_without_autostart(start_node: Start, peer_node: Peer) -> None:

@@ -44,6 +44,8 @@ def test_node_without_parameters_names_missing_one_and_ends_with_status_2(packag
         (["-p", "max_agee:=1.0"], "error: controller.max_agee: unknown key, expected max_age perhaps"),
         (["-p", "beta:=[1.0,2.0]"], "error: controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
         (["-p", "D:=[1,1,1,0]"], "error: controller.D[3]: found 0, expected 1 or -1"),
+        (["-p", "use_sim_time:=true"], "error: controller.use_sim_time: found true, expected false: in real time a node ticks"),
+        (["-r", "__node:=rise"], "error: rise: found no parameters, expected a section for /rise in a file of --params-file"),
         (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
     ],
 )
@@ -52,6 +54,12 @@ def test_an_invalid_parameter_is_one_sentence(arguments: list[str], sentence: st
     assert node.end() == 2
     assert any(line.startswith(sentence) for line in node.lines), node.output
     assert "Traceback" not in node.output
+
+
+def test_node_shows_usage_without_middleware(start: Start) -> None:
+    node = start("rise_di_controller.main", "--help")
+    node.succeed()
+    assert node.lines[0].startswith("usage: ")
 
 
 @pytest.mark.parametrize(("package", "waits_for"), [("rise_di_controller", "/y"), ("aircraft_sim", "/u")])

@@ -523,7 +523,7 @@ class Flight:
     def diagnostics(self, role: str, begin: float) -> list[tuple[float, str, dict[str, str]]]:
         """The 1 Hz diagnostics of a node: when received, the instance, and the values by key."""
         return [
-            (arrival.at, status.hardware_id, {value.key: value.value for value in status.values})
+            (arrival.at, arrival.message.header.frame_id, {value.key: value.value for value in status.values})
             for arrival in self.probe.since("/diagnostics", begin)
             for status in arrival.message.status
             if status.name == f"/{role}"

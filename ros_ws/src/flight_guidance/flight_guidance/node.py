@@ -4,13 +4,16 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Point, PoseStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped
 from nav_msgs.msg import Odometry, Path
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -51,6 +54,10 @@ from flight_ros.topics import (
     publisher_qos,
 )
 
+# Of a full ROS 2, or of `make messages`
+TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs") else None
+
+TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as tf2_ros has it
 MAX_TARGETS = 16  # messages of target a tick; later messages wait, so that a storm delays no u_m
 MAX_ROUTE_SIZE = 65_536  # bytes, 900 waypoints: decoding takes 0.14 ms a waypoint
 ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
@@ -100,6 +107,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self.create_publisher(topic.type, topic.name, publisher_qos(period))
             for topic, period in ((ODOMETRY, ODOMETRY_PERIOD_NS), (PATH, PATH_PERIOD_NS), (MARKERS, PATH_PERIOD_NS))
         )
+        # REP 105: with several aircraft, each body frame has a prefix, and they share the map
+        self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
+        self._broadcast = None if TFMessage is None else self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
+        if self._broadcast is None:
+            self.get_logger().info("no transforms on /tf: the package tf2_msgs is not installed")
         self._flown: deque[PoseStamped] = deque(maxlen=PATH_LENGTH)
         for kind, name, answer in (
             (SetBool, "engage", self._engage),
@@ -166,6 +178,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if now_ns % ODOMETRY_PERIOD_NS < step:
             odometry = self._odometry_of(now_ns)
             self._odometry.publish(odometry)
+            if self._broadcast is not None:
+                self._broadcast(TFMessage(transforms=[_transform(odometry)]))
             if now_ns % PATH_PERIOD_NS < step:
                 self._publish_path(odometry)
 
@@ -236,7 +250,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     def _odometry_of(self, now_ns: int) -> Odometry:
         pose, y = self._guidance.pose(), self._guidance.y()
         message = Odometry()
-        message.header.stamp, message.header.frame_id, message.child_frame_id = _stamp(now_ns), MAP, BODY
+        message.header.stamp, message.header.frame_id, message.child_frame_id = _stamp(now_ns), MAP, self._body
         placed = message.pose.pose
         placed.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
         for key, value in zip("xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True):
@@ -281,6 +295,15 @@ def _service(answer: Callable[[Any], bool | str], called: Callable[[], None]) ->
         return response
 
     return callback
+
+
+def _transform(odometry: Odometry) -> TransformStamped:
+    """The transform from the map to the body frame."""
+    transform = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+    place, moved = odometry.pose.pose, transform.transform
+    moved.translation.x, moved.translation.y, moved.translation.z = place.position.x, place.position.y, place.position.z
+    moved.rotation = place.orientation
+    return transform
 
 
 def _stamp(time_ns: int) -> Time:

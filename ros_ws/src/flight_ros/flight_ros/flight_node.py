@@ -17,7 +17,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from flight_core.outcome import LOST_CONTACT, FlightEnded
-from flight_core.parameters import NodeConfig, ParameterError, flatten
+from flight_core.parameters import NodeConfig, ParameterError, flatten, require
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
@@ -26,6 +26,7 @@ from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import MAX_SIZE, Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
+from flight_ros.rclpy_private import refuse_foreign_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick, TickTimes
@@ -53,6 +54,9 @@ WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without s
 
 MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
+SIM_TIME = "use_sim_time"
+NO_SIM_TIME = "false: in real time a node ticks by the system clock; a flight in simulated time is one in lockstep"
+
 CLOCK_STEP_NS = NANOSECONDS // 20  # slewing moves a clock by less than 0.01 s in the second between two checks
 
 
@@ -62,8 +66,10 @@ class FlightNode(Node, Generic[P]):
     def __init__(self, name: str, schema: type[P]) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         self.parameters = read_parameters(self, schema)
-        if self.parameters.tunable():
-            self.add_on_set_parameters_callback(self._change_parameters)
+        if not self.parameters.lockstep:
+            require(not self.get_parameter(SIM_TIME).value, f"{name}.{SIM_TIME}", "true", NO_SIM_TIME)
+        self.add_on_set_parameters_callback(self._change_parameters)
+        refuse_foreign_parameters(self)
         self.peers = LivelinessMonitor(self, name) if self.parameters.lockstep else None
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
@@ -219,6 +225,8 @@ class FlightNode(Node, Generic[P]):
             self.parameters, self._adopted = self._adopted, None
             return SetParametersResult(successful=True)
         try:
+            sim_time = any(change.name == SIM_TIME and change.value for change in changes)
+            require(not sim_time or self.parameters.lockstep, f"{self.get_name()}.{SIM_TIME}", "true", NO_SIM_TIME)
             parameters = changed(self, self.parameters, changes)
             self.on_parameters(parameters)
         except ParameterError as error:
@@ -321,7 +329,7 @@ class FlightNode(Node, Generic[P]):
                 level=level,
                 name=self.get_fully_qualified_name(),
                 message=sentence,
-                hardware_id=self.instance,
+                hardware_id=self.get_fully_qualified_name(),  # stable: an aggregator sees one device after a restart
                 values=[KeyValue(key=key, value=str(value)) for key, value in report.items()],
             )
         ]

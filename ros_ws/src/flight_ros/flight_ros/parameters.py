@@ -9,7 +9,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from flight_core.parameters import NodeConfig, flatten, nest
+from flight_core.parameters import NodeConfig, ParameterError, flatten, nest
 
 P = TypeVar("P", bound=NodeConfig)
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
@@ -20,7 +20,14 @@ def read_parameters(node: Node, schema: type[P]) -> P:
 
     Then every parameter of the set is declared with its description, read-only unless it is tunable.
     """
-    parameters = schema.validate_mapping(nest(_overrides(node)), node.get_name())
+    given = nest(_overrides(node))
+    try:
+        parameters = schema.validate_mapping(given, node.get_name())
+    except ParameterError as error:
+        if given:
+            raise
+        expected = f"a section for {node.get_fully_qualified_name()} in a file of --params-file"
+        raise ParameterError(f"{node.get_name()}: found no parameters, expected {expected}: {error}") from None
     tunable = parameters.tunable()
     descriptions = {name: field.description or "" for name, field in type(parameters).model_fields.items()}
     for name, value in flatten(parameters.model_dump()):

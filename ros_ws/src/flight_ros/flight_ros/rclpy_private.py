@@ -5,6 +5,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
@@ -74,6 +75,27 @@ def answer_invalid_transitions(node: Node) -> None:
             node.get_logger().error(bounded(f"request rejected: {' '.join(str(error).split())}"))
             response.success = False
             return response
+
+    service.callback = answer
+
+
+def refuse_foreign_parameters(node: Node) -> None:
+    """Let a node refuse a request to set parameters of which it lacks one, as a whole.
+
+    `ros2 param load` joins the sections of all nodes of a file. Without the refusal a node takes the values of names that it
+    shares with another node, such as an age limit.
+    """
+    (service,) = (service for service in node.services if service.srv_name.endswith("/set_parameters"))
+    set_parameters = service.callback
+
+    def answer(request: Any, response: Any) -> Any:
+        foreign = [parameter.name for parameter in request.parameters if not node.has_parameter(parameter.name)]
+        if not foreign:
+            return set_parameters(request, response)
+        owner = node.get_fully_qualified_name()
+        reason = bounded(f"found {', '.join(foreign)}, expected parameters of {owner} alone; nothing is set")
+        response.results = [SetParametersResult(successful=False, reason=reason) for _ in request.parameters]
+        return response
 
     service.callback = answer
 

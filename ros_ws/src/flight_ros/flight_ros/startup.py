@@ -23,6 +23,11 @@ from flight_ros import transport
 if TYPE_CHECKING:
     from flight_ros.rclpy_private import Participant
 
+USAGE = """usage: {program} --ros-args --params-file SCENARIO.yaml [-p NAME:=VALUE ...] [-r __ns:=/NAMESPACE] [-r NAME:=TOPIC]
+
+A node of a flight. SCENARIO.yaml has a section for each node, by its name; -p replaces a parameter of it. The parameters are in
+docs/reference/parameters.md, the topics in docs/interfaces.md. `rise-di fly` starts all nodes of a scenario."""
+
 BAD_ENVIRONMENT = 2  # exit status, as of invalid parameters
 
 
@@ -32,6 +37,9 @@ def start_nodes(*nodes: str, early: bool = True, lower_by: int = 0) -> None:
     `early`: create a DDS participant before the imports. `lower_by`: levels of real-time priority, more for
     nodes of a longer period.
     """
+    if {"--help", "-h"} & {*sys.argv[1:]}:
+        print(USAGE.format(program=os.path.basename(sys.argv[0])))  # noqa: PTH119 - pathlib takes as long to import as the rest
+        return
     try:
         require_ros_environment()
     except ValueError as error:  # a ParameterError, whose module a node loads later
