@@ -46,6 +46,7 @@ def test_node_without_parameters_names_missing_one_and_ends_with_status_2(packag
         (["-p", "D:=[1,1,1,0]"], "error: controller.D[3]: found 0, expected 1 or -1"),
         (["-p", "use_sim_time:=true"], "error: controller.use_sim_time: found true, expected false: in real time a node ticks"),
         (["-r", "__node:=rise"], "error: rise: found no parameters, expected a section for /rise in a file of --params-file"),
+        (["-p", "rate:=0100"], "error: rate: found '0100' in line 1, expected a number without a 0 before it"),
         (["--params-file", "nowhere.yaml"], "error: failed to initialize rcl: Couldn't parse params file"),
     ],
 )

@@ -40,6 +40,9 @@ FLOAT = re.compile(r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)
 The same section has no 1:00, which is 60 by YAML 1.1, and no 1_000. These are strings here, so no number is guessed."""
 
 
+LEADING_ZERO = re.compile(r"[-+]?0[0-9]+")
+
+
 class _Loader(Composer, yaml.CSafeLoader):
     """Reads numbers as YAML 1.2, rejects duplicate keys and an expansion of aliases to more than MAX_YAML_NODES values.
 
@@ -187,6 +190,17 @@ def parse_yaml(content: bytes | str, key: str, expected: str) -> Any:
     except NOT_YAML as error:
         what = " ".join(str(error).split()) or type(error).__name__
         raise ParameterError(f"{key}: not valid YAML ({what}), expected {expected}") from None
+
+
+def require_no_octal(content: bytes | str, key: str) -> None:
+    """Raise ParameterError for YAML with a number that begins with 0: rcl reads 0100 as 64, by strtoll with base 0."""
+    numbers = []
+    with suppress(*NOT_YAML):  # rcl has its own sentence for it
+        scalars = (token for token in yaml.scan(content, yaml.CSafeLoader) if isinstance(token, yaml.ScalarToken))
+        numbers = [scalar for scalar in scalars if scalar.plain and LEADING_ZERO.fullmatch(scalar.value)]
+    if numbers:
+        found = f"{numbers[0].value!r} in line {numbers[0].start_mark.line + 1}"
+        raise ParameterError(f"{key}: found {found}, expected a number without a 0 before it")
 
 
 @contextmanager

@@ -2,13 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS parameters of a node as a validated set. The overrides are validated as a whole; then each parameter is declared."""
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from flight_core.files import require_no_octal
 from flight_core.parameters import NodeConfig, ParameterError, flatten, nest
 
 P = TypeVar("P", bound=NodeConfig)
@@ -20,6 +24,7 @@ def read_parameters(node: Node, schema: type[P]) -> P:
 
     Then every parameter of the set is declared with its description, read-only unless it is tunable.
     """
+    _require_no_octal(sys.argv)
     given = nest(_overrides(node))
     try:
         parameters = schema.validate_mapping(given, node.get_name())
@@ -44,6 +49,15 @@ def read_parameters(node: Node, schema: type[P]) -> P:
         if not node.has_parameter(name) and not node.get_parameters_by_prefix(name):
             node.declare_parameter(name, None, ParameterDescriptor(description=descriptions.get(name, ""), dynamic_typing=True))
     return parameters
+
+
+def _require_no_octal(arguments: Sequence[str]) -> None:
+    for option, value in pairwise(arguments):
+        if option == "--params-file":
+            require_no_octal(Path(value).read_bytes(), value)  # rcl has read it
+        elif option in {"-p", "--param"}:
+            name, _, number = value.partition(":=")
+            require_no_octal(number, name)
 
 
 def changed(node: Node, parameters: P, changes: list[Parameter]) -> P:
