@@ -270,7 +270,11 @@ REFUSED: dict[str, tuple[Any, dict[str, Any], str]] = {
     "not finite": (control.ss(np.where(A == 1.0, np.inf, A), B, np.eye(4), np.zeros((4, 1))), {}, "not finite"),
     "output of no state": (SYSTEM, {"outputs": "q, airspeed"}, "'airspeed', expected"),
     "sum of no state": (SYSTEM, {"outputs": "q, V = 0.99 u + 0.1 alpha"}, "expected states: u, w, q, theta"),
-    "too few outputs": (SYSTEM, {"outputs": "q"}, "outputs: found q, expected 2, as many as inputs"),
+    "too many outputs": (
+        SYSTEM,
+        {"outputs": "q, u, w"},
+        "outputs: found q, u, w, expected 2 or fewer, as many as inputs or fewer",
+    ),
     "states exchanged": (
         SYSTEM,
         {"states": "w: ft/s, u: ft/s, q: rad/s, theta: rad"},

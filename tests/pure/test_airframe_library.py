@@ -25,7 +25,9 @@ from rise_di_controller.decomposition import coupling
 
 pytestmark = pytest.mark.package("aircraft_sim")
 
-NAMES = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
+ALL = tuple(sorted(file.stem for file in LIBRARY.glob("*.yaml")))
+SPLIT = {"osprey_twin": "osprey", "osprey_vtail": "osprey", "x8_elevons": ""}  # more inputs than outputs, and what was split
+NAMES = tuple(name for name in ALL if name not in SPLIT)
 
 
 class Published(NamedTuple):
@@ -70,7 +72,7 @@ def airframe(request: pytest.FixtureRequest) -> Airframe:
 
 def test_library_is_nine_airframes_of_table() -> None:
     assert tuple(PUBLISHED) == NAMES
-    assert tuple(facts.name for facts in library()) == NAMES  # each file carries its own name
+    assert tuple(facts.name for facts in library()) == ALL  # each file carries its own name
 
 
 def test_every_airframe_states_source_and_signs(airframe: Airframe) -> None:
@@ -135,6 +137,34 @@ def test_every_airframe_is_in_theorem_with_zero_dynamics_that_only_outer_loop_bo
 
 
 @pytest.mark.equation(5, 6, 7, 8, 9)
+@pytest.mark.parametrize("name", SPLIT)
+def test_more_inputs_than_outputs_give_d_equal_to_one_through_the_pseudo_inverse(name: str) -> None:
+    facts = airframe_facts(name)
+    np.testing.assert_allclose(facts.Omega, np.eye(len(facts.outputs)), atol=1e-9)
+    assert facts.in_theorem
+
+
+def test_split_effectors_moved_together_are_those_of_the_osprey() -> None:
+    """Elevator, thrust, aileron and rudder of the twin and of the V-tail, from the geometry alone."""
+    whole, twin, tail = (load_airframe(name).matrix_b() for name in ("osprey", "osprey_twin", "osprey_vtail"))
+    both = np.array([twin[:, 0] + twin[:, 1], twin[:, 5] + twin[:, 6], twin[:, 2] + twin[:, 3], twin[:, 4]]).T
+    np.testing.assert_allclose(both, whole, atol=1e-12)
+    both = np.array([tail[:, 0] + tail[:, 1], tail[:, 4], tail[:, 2] + tail[:, 3], tail[:, 0] - tail[:, 1]]).T
+    np.testing.assert_allclose(both, whole, atol=1e-12)
+
+
+def test_the_flying_wing_has_the_short_period_of_its_coefficients() -> None:
+    """Z_alpha, M_alpha and M_q by hand from the coefficients of Gryte et al. 2018 at 18 m/s: see the source in the file."""
+    q_S = 0.5 * 1.225 * 18.0**2 * 0.75
+    Z_alpha = -(q_S * 4.0203 + 3.459) / (3.364 * 18.0)
+    M_alpha = -q_S * 0.35714 * 0.4629 / 0.165
+    M_q = -q_S * 0.35714 * 1.30124 * 0.35714 / (2.0 * 18.0) / 0.165
+    airframe = load_airframe("x8_elevons")
+    A, rows = airframe.matrix_a(), [airframe.index("alpha"), airframe.index("q")]
+    np.testing.assert_allclose(A[rows, rows], [Z_alpha, M_q], rtol=0.01)
+    assert A[airframe.index("q"), airframe.index("alpha")] == pytest.approx(M_alpha, rel=0.01)
+
+
 def test_zeros_of_the_osprey() -> None:
     zeros = airframe_facts(load_airframe("osprey")).zeros
     # -0.69 is Y_beta; -7.19 is Z_alpha with the elevator that holds q.

@@ -149,6 +149,25 @@ def test_a_flight_with_an_allocation_at_its_stops_tracks_and_replays_to_the_bit(
     assert np.abs(tape["internals"]["e.q"][tape.time("internals") > 9.5]).max() < 0.01
 
 
+@pytest.mark.parametrize(
+    ("name", "effector", "channel"),
+    [("osprey_twin", "left_elevator", "q"), ("osprey_vtail", "left_aileron", "p"), ("x8_elevons", "right_outer", "q")],
+)
+def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, channel: str) -> None:
+    """Half of the effect is left, which D = I survives: e within twice that of the whole aircraft, 15 mrad/s; u inside."""
+    scenario = find_scenario(name)
+    inputs = list(scenario.aircraft.channels().inputs)
+    lost = scenario.aircraft.actuators.model_dump() | {"lost_at": [1.0 if key == effector else np.inf for key in inputs]}
+    scenario = scenario.vary(
+        aircraft={"actuators": lost, "rate": 200.0, "step": 0.005}, reference_model={"rate": 200.0}, flight={"duration": 5.0}
+    )
+    tape = simulate(scenario)
+    assert tape.outcome == "completed"
+    assert np.abs(tape["internals"][f"e.{channel}"]).max() < 0.03
+    limits = scenario.controller.effector_limits()
+    assert ((tape["u"].values >= limits.lower) & (tape["u"].values <= limits.upper)).all()
+
+
 def test_the_margins_are_those_of_the_aircraft_behind_the_allocation() -> None:
     """By C B T = I the channels are those of a loop with unit response, whatever the units of the effectors."""
     scenario = find_scenario("osprey_servo").vary(controller=mixed())

@@ -40,7 +40,8 @@ def new(
         str, typer.Option(help='Inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1".')
     ] = "",
     outputs: Annotated[
-        str, typer.Option(help='As many as inputs: states, rows of C ("V: ft/s"), or sums: "q, V = 0.987 u + 0.163 w".')
+        str,
+        typer.Option(help='As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = 0.987 u + 0.163 w".'),
     ] = "",
     thrust: Annotated[
         bool, typer.Option("--thrust", help="Add an input thrust in units of the weight along the flight path.")

@@ -86,9 +86,11 @@ def select_gains(
     chosen, frame = find_scenario(scenario), load_airframe(airframe)
     chosen.rise_di()
     require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
-    loop = _with_limits(_loop(chosen, frame, rate, y_rate, lag, delay), chosen, frame)
+    loop = _loop(chosen, frame, rate, y_rate, lag, delay)
     if mixing == FULL or len(frame.inputs) > len(frame.outputs):
         loop, frame = _allocated(loop, chosen, frame)
+    else:
+        loop = _with_limits(_without_allocation(loop, chosen), chosen, frame)
     setting = loop._replace(
         inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
         gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
@@ -178,6 +180,16 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
             own = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
             limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(own, loop.base.inputs, strict=True))
     return loop._replace(base=loop.base.model_copy(update=limits))
+
+
+def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
+    """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of the actuators."""
+    if loop.base.allocation is None:
+        return loop
+    names, actuators = tuple(scenario.aircraft.channels().inputs), scenario.aircraft.actuators
+    plain = {"allocation": None, "inputs": names, **dict.fromkeys(gain_selection.INPUT_LIMITS)}
+    lag = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True))
+    return loop._replace(base=loop.base.model_copy(update=plain), lag=lag | dict(loop.lag))
 
 
 def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tuple[LoopSetting, Airframe]:

@@ -61,7 +61,8 @@ def new_airframe(
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
         states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".
         inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1 more thrust".
-        outputs: As many as inputs: names of states or of rows of C with units ("V: ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
+        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V: ft/s"), or sums:
+            "q, V = 0.987 u + 0.163 w".
             Empty: q, V, p, r by elevator, thrust, aileron, rudder.
         thrust: Whether to add an input thrust in units of the weight along the flight path, for a model without a thrust.
         text: Where the figures come from.
@@ -97,7 +98,8 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
 
     `trial`: the airframe's file of the trial flights; `files`: airframe and scenario as the text names them.
     """
-    inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)]
+    square = len(airframe.inputs) == len(airframe.outputs)
+    inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)] if square else []
     reached, controller = "", first_flight.placeholder(airframe, lag)
     for size in SIZES:
 

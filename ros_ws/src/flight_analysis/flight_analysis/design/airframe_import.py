@@ -77,7 +77,8 @@ def import_airframe(
         speed: Trim speed, a number in m/s or with a unit: "176 ft/s".
         states: Names of the states in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".
         inputs: Names of the inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1 more thrust".
-        outputs: As many as inputs: names of states or of rows of C with units ("V: ft/s"), or sums: "q, V = 0.987 u + 0.163 w".
+        outputs: As many as inputs, or fewer: names of states or of rows of C with units ("V: ft/s"), or sums:
+            "q, V = 0.987 u + 0.163 w".
             Empty: q, V, p, r by elevator, thrust, aileron, rudder.
         thrust: Whether to add an input thrust in units of the weight along the flight path, for a model without a thrust.
         text: Where the figures come from.
@@ -414,7 +415,8 @@ def _airframe(model: Model, name: str, speed: float, outputs: str | Sequence[str
     names = list(model.states)
     wanted = [part.strip() for part in outputs.split(",")] if isinstance(outputs, str) and outputs else list(outputs)
     wanted = wanted or _default_outputs(model)
-    require(len(wanted) == len(model.inputs), "outputs", ", ".join(wanted) or "none", f"{len(model.inputs)}, as many as inputs")
+    fewer = f"{len(model.inputs)} or fewer, as many as inputs or fewer"
+    require(0 < len(wanted) <= len(model.inputs), "outputs", ", ".join(wanted) or "none", fewer)
     rows, shown, units = [], [], {}
     identity = model.C is not None and model.C.shape == (len(names),) * 2 and np.array_equal(model.C, np.eye(len(names)))
     labels = model.outputs if model.C is not None and len(model.outputs) == len(model.C) else ()

@@ -14,6 +14,7 @@ from rise_di_controller.params import AllocationConfig
 
 LAW_INPUT = "v_"  # begin of the name of an input of the law: v_q is that of the output q
 DIGITS = 10  # of T and effect in a file: their product is I to 1e-9
+SERVO = 0.01  # s, added to the lags in the weights: that of a fast servo, so that an ideal one is not alone
 SMALL = 1e-9  # part of the largest: an effector that gives less of an input of the law does not limit it
 
 
@@ -41,10 +42,11 @@ def design_allocation(
 ) -> tuple[AllocationConfig, LawInputs]:
     """The allocation by the weighted pseudo-inverse of Omega = C B, (m, p), and the inputs of the law: C B T = I.
 
-        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(1 / range_j^2),  effect = Omega
+        T = W^-1 Omega' (Omega W^-1 Omega')^-1,  W = diag(((lag_j + SERVO) / range_j)^2),  effect = Omega
 
-    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of squares of u_j / range_j,
-    range_j half the way between the stops. lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to first order.
+    v is y_dot by the input, so D = S = U = I on this airframe. T gives v with the least sum of squares of
+    (lag_j + SERVO) u_j / range_j, range_j half the way between the stops: a slow effector helps a fast one little.
+    lag_i = sum_j Omega_ij T_ji lag_j is the lag of v_i, exact to first order.
     `priority` are outputs, the one that keeps its input the longest first; the rest follow in their order.
 
     Raises ParameterError for fewer effectors than outputs, for infinite stops, and for dependent rows of Omega.
@@ -57,11 +59,12 @@ def design_allocation(
     for name, low, high in zip(names, effectors.lower.tolist(), effectors.upper.tolist(), strict=True):
         both = np.isfinite([low, high]).all() and low <= 0.0 <= high and low < high
         require(bool(both), f"aircraft.actuators of {name}", f"{low:g} to {high:g}", "both end stops: they weigh the effectors")
-    scaled = Omega * (effectors.upper - effectors.lower) / 2.0
+    reach = (effectors.upper - effectors.lower) / 2.0 / (effectors.lag + SERVO)
+    scaled = Omega * reach
     size = np.abs(scaled).max(axis=1, keepdims=True)
     independent = bool((size > 0.0).all()) and np.linalg.matrix_rank(scaled / np.where(size > 0.0, size, 1.0), 1e-6) == m
     require(independent, f"airframe {airframe.name}: C B", "rows that depend on each other", "inputs that move each output")
-    T = ((effectors.upper - effectors.lower) / 2.0)[:, None] * np.linalg.pinv(scaled)
+    T = reach[:, None] * np.linalg.pinv(scaled)
     law = tuple(f"{LAW_INPUT}{name}" for name in airframe.outputs)
     first = [f"{LAW_INPUT}{name}" for name in priority]
     config = AllocationConfig.validate_mapping(

@@ -9,9 +9,11 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.design import gain_selection
+from flight_analysis.design.effectors import Effectors, LawInputs, design_allocation
 from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
 from rise_di_controller.decomposition import search
+from rise_di_controller.params import AllocationConfig
 
 SURFACE_LAG, ENGINE_LAG = 0.05, 0.3  # s, servos and engine of a light aircraft, assumed
 STOP, SURFACE_RATE = 0.35, 1.0  # rad, rad/s: 20 deg, 57 deg/s, assumed
@@ -80,21 +82,20 @@ def scenario_text(
     more than USED of the input's authority. Gusts have 3 % of the trim speed.
     """
     inputs, outputs, V0 = list(airframe.inputs), list(airframe.outputs), airframe.speed
-    surfaces = [quantity(given.unit).dimension == ANGLE for given in airframe.inputs.values()]
-    paired = pairing(airframe)
-    response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
-    dimensions = [quantity(unit).dimension for unit in airframe.units_of_outputs().values()]
-    stops = [STOP] * len(inputs)
-    for i, j in enumerate(paired):
-        if not surfaces[j]:
-            stops[j] = float(f"{AUTHORITY.get(dimensions[i], 1.0) / max(response[i], 1e-9):.3g}")
-    lag_of = {outputs[i]: lag[j] for i, j in enumerate(paired)}
+    stops, rates = _stops(airframe), _rates(airframe)
+    if len(inputs) > len(outputs):
+        _, law = _distributed(airframe, lag)
+        authority, lag_of = law.upper, dict(zip(outputs, law.lag.tolist(), strict=True))
+    else:
+        paired = pairing(airframe)
+        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
+        authority, lag_of = response * np.array(stops)[list(paired)], {outputs[i]: lag[j] for i, j in enumerate(paired)}
     fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if {"p", "r"} <= set(outputs) else None
     amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
     start, pulses = 2.0, {}
     for k, output in enumerate(outputs):
-        reachable = USED * float(response[k]) * stops[paired[k]] / fastest[output]
+        reachable = USED * float(authority[k]) / fastest[output]
         value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
         if output == "r" and turn:
             continue  # the turns command it
@@ -121,7 +122,7 @@ def scenario_text(
             "lag": list(lag),
             "lower": [-stop for stop in stops],
             "upper": stops,
-            "rate": [SURFACE_RATE if surface else stop for surface, stop in zip(surfaces, stops, strict=True)],
+            "rate": rates,
         },
         noise=[NOISE.get(output, 0.001) for output in outputs],
         frequency=list(fastest.values()),
@@ -132,16 +133,48 @@ def scenario_text(
     )
 
 
+def _surfaces(airframe: Airframe) -> list[bool]:
+    return [quantity(given.unit).dimension == ANGLE for given in airframe.inputs.values()]
+
+
+def _stops(airframe: Airframe) -> list[float]:
+    """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the output that it moves."""
+    Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
+    given = np.array([AUTHORITY.get(quantity(unit).dimension, 1.0) for unit in airframe.units_of_outputs().values()])
+    moved = np.argmax(Omega / given[:, None], axis=0).tolist()
+    if len(airframe.inputs) == len(airframe.outputs):
+        for i, j in enumerate(pairing(airframe)):
+            moved[j] = i
+    return [
+        STOP if surface else float(f"{given[i] / max(Omega[i, j], 1e-9):.3g}")
+        for j, (surface, i) in enumerate(zip(_surfaces(airframe), moved, strict=True))
+    ]
+
+
+def _rates(airframe: Airframe) -> list[float]:
+    return [SURFACE_RATE if surface else stop for surface, stop in zip(_surfaces(airframe), _stops(airframe), strict=True)]
+
+
+def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationConfig, LawInputs]:
+    """The allocation of an airframe with more inputs than outputs."""
+    stops = np.array(_stops(airframe))
+    return design_allocation(airframe, Effectors(-stops, stops, np.array(_rates(airframe)), np.array(lag)))
+
+
 def default_lags(airframe: Airframe) -> tuple[float, ...]:
     """Lags of the inputs, s: a servo for an angle, an engine for the rest."""
-    return tuple(SURFACE_LAG if quantity(given.unit).dimension == ANGLE else ENGINE_LAG for given in airframe.inputs.values())
+    return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
 
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
     """A section controller with gains of 1, for the selection of gains."""
-    paired = pairing(airframe)
-    inputs = [list(airframe.inputs)[j] for j in paired]
-    m = len(inputs)
+    allocation, m = None, len(airframe.outputs)
+    if len(airframe.inputs) > m:
+        config, law = _distributed(airframe, lag)
+        allocation, inputs, lags = config.model_dump(exclude_none=True), list(law.names), law.lag.tolist()
+    else:
+        paired = pairing(airframe)
+        inputs, lags = [list(airframe.inputs)[j] for j in paired], [lag[j] for j in paired]
     require(m > 1, "inputs", inputs[0], "two inputs or more: add a thrust with --thrust, or a second control")
     values: Mapping[str, Any] = {
         "rate": 100.0,
@@ -152,14 +185,15 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         "k_d": [1.0] * (m - 1),
         **dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), [1.0] * m),
         "sign": "auto",
-        "lag": [lag[j] for j in paired],
+        "lag": lags,
         "delay": 0.003,
         "softening": SOFTENING,
         "max_age": 0.1,
         "hold": 0.5,
         "ramp": 2.0,
+        **({} if allocation is None else {"allocation": allocation}),
     }
-    lines = [f"    {key}: {gain_selection.yaml_flow(value)}" for key, value in values.items()]
+    lines = [f"    {key}: {gain_selection.yaml_flow(value, 10)}" for key, value in values.items()]
     return "\n".join(["/**/controller:", "  ros__parameters:", *lines, ""])
 
 
