@@ -13,6 +13,8 @@ from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.learner import Learner
+from flight_analysis.report.figures import learned_figure, plot_context
+from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.parameters import ParameterError
@@ -217,3 +219,15 @@ def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
     flight.update()
     shown = [event for event in flight.events if event.kind == "learning"]
     assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines
+
+
+def test_report_draws_what_was_identified_with_its_deviations(flown: Flown) -> None:
+    flight, found = read_flight(flown.run), flown.learner.identification
+    assert found is not None
+    figure = learned_figure(plot_context(flight.tape, {}, {}))
+    assert figure is not None
+    (entry,) = (entry for entry in found.entries if entry.name == "B[p, aileron]")
+    (drawn,) = (trace for trace in figure.data if trace["name"] == entry.name)
+    assert drawn["y"] == pytest.approx([entry.nominal * (1.0 + entry.error)])
+    assert drawn["error_y"]["array"] == pytest.approx([2.0 * abs(entry.nominal) * entry.deviation])
+    assert drawn["x"] == pytest.approx([14.0])

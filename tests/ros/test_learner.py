@@ -117,7 +117,7 @@ def get(peer_node: Peer) -> float:
 
 
 def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
-    chosen = scenario(tmp_path, updates=[1.0], window=6.0, latency=0.0)
+    chosen = scenario(tmp_path, updates=[1.0, 4.0])
     command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
     command.wait_for("no model: record: found")
     command.child("flight_learner.main").kill()

@@ -47,7 +47,7 @@ SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
 GUIDANCE_VIEWS = ("odometry", "path", "markers")
-LEARNED = ("proposal", "learning")  # what a learner proposes, and what became of it
+OF_LEARNING = ("proposal", "learned", "learning")  # what a learner proposes and has found, and what became of it
 
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
@@ -56,7 +56,7 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         REFERENCE_MODEL: ("y_m",),
         GUIDANCE: ("u_m", "guidance", *GUIDANCE_VIEWS),
         CONTROLLER: ("u", "internals", "learning"),
-        LEARNER: ("proposal",),
+        LEARNER: ("proposal", "learned"),
         BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
         RECORDER: ("recorded",),
     }
@@ -173,7 +173,7 @@ def parameter_overrides(
         further += GUIDANCE_VIEWS
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
-        further += LEARNED
+        further += OF_LEARNING
     if further:
         overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further]
     overrides[RECORDER]["directory"] = str(run)

@@ -12,7 +12,7 @@ import traceback
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flight_analysis.closed_loop.learning import Proposal, as_received
+from flight_analysis.closed_loop.learning import Identifications, Proposal, as_received
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
@@ -26,7 +26,7 @@ from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder
 from flight_ros.reports import Report
 from flight_ros.ticker import Tick
-from flight_ros.topics import INTERNALS, LOCKSTEP, PROPOSAL, RECORD_FOREIGN
+from flight_ros.topics import INTERNALS, LEARNED, LOCKSTEP, PROPOSAL, RECORD_FOREIGN
 from rise_di.learning import learner
 from rise_di_controller.learning import Updates
 
@@ -62,7 +62,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
             lock=None if lockstep else PublisherLock(self._timeouts_ns),
             qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
         )
-        self._publish = self.advertise(PROPOSAL)
+        self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
+        self._identifications = Identifications(self._learner, self._start.outputs)
         self._search: threading.Thread | None = None
         self._proposal, self._end_ns, self._flown, self._is_due = Proposal(None, ""), 0, 0, False
         self._said = "no model yet"
@@ -94,6 +95,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
             values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
             report = Report(self._end_ns, self.instance, proposal.sentence, values, warns=not proposal.change)
             self._publish(reports.encode(report, "proposal"))
+            if (found := self._identifications.next(self._proposal)) is not None:
+                self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
             self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
             self.get_logger().info(self._said)
             advanced = True

@@ -101,6 +101,7 @@ RECORDED = Topic("recorded", Time)  # in lockstep: the instant up to which the l
 CLOCKS = Topic("clocks", JointState)  # of each other node: the least (own clock at reception) - (its clock at sending), s
 ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridge; value: why it is not engaged
 PROPOSAL = Topic("proposal", DiagnosticArray)  # of a learner: flight_ros.reports
+LEARNED = Topic("learned", JointState)  # the entries of A and B that a learner identified
 LEARNING = Topic("learning", DiagnosticArray)  # what became of a proposal, and fallbacks
 START = Topic("start", Time)  # t = 0 of a flight in real time, once its nodes are matched
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState

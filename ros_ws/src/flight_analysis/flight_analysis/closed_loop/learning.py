@@ -2,8 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A learner beside a controller in a loop of one process, and what a learner is."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray
@@ -33,6 +35,60 @@ class Learner(Protocol):
 Learn = Callable[[RiseDiConfig], Learner]
 
 
+class Entry(Protocol):
+    """An entry of A or B that was identified: its nominal value in SI, its relative error and the deviation of that."""
+
+    @property
+    def name(self) -> str:
+        """Such as B[q, elevator]."""
+
+    @property
+    def row(self) -> str:
+        """A state."""
+
+    @property
+    def nominal(self) -> float:
+        """Of the rough airframe."""
+
+    @property
+    def error(self) -> float:
+        """Of the nominal value, 1."""
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the error, 1."""
+
+
+class Learned(NamedTuple):
+    """Channels of the topic `learned`: `proposed`, and value and deviation of entries of A and B in the rows of the outputs."""
+
+    names: tuple[str, ...]
+    values: FloatArray
+
+
+def learned(entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool) -> Learned:
+    """What an identification found, and whether it became a proposal."""
+    kept = [entry for entry in entries if entry.row in outputs]
+    channels = {f"value.{entry.name}": entry.nominal * (1.0 + entry.error) for entry in kept}
+    channels |= {f"deviation.{entry.name}": abs(entry.nominal) * entry.deviation for entry in kept}
+    return Learned(("proposed", *channels), np.array([float(proposed), *channels.values()]))
+
+
+class Identifications:
+    """The identifications of a learner that has them, each once."""
+
+    def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
+        self._learner, self._outputs, self._last = learner, outputs, None
+
+    def next(self, proposal: Proposal) -> Learned | None:
+        """That of a proposal; None where nothing was identified."""
+        found = getattr(self._learner, "identification", None)
+        if found is None or found is self._last:
+            return None
+        self._last = found
+        return learned(found.entries, self._outputs, proposed=proposal.controller is not None)
+
+
 def as_received(proposal: Proposal, start: RiseDiConfig, end_ns: int, flown: int) -> ReceivedProposal:
     """A proposal as the controller receives it: with the end of its window, and the digest of what flew then."""
     change = {} if proposal.controller is None else designed(start, proposal.controller)
@@ -44,18 +100,21 @@ class LearningLoop:
 
     def __init__(self, parameters: RiseDiConfig, learn: Learn, announce: Callable[[Event], None]) -> None:
         self._parameters, self._learner = parameters, learn(parameters)
+        self._identifications = Identifications(self._learner, parameters.outputs)
         self._learning = Learning(parameters, announce, simulated=True)
 
     def before_tick(self, controller: Controller, now_ns: int) -> None:
         """Let the proposals act that are due, and fall back where the law diverges."""
         self._learning.step(controller, now_ns)
 
-    def after_tick(self, controller: Controller, output: ControlOutput | None, now_ns: int) -> None:
-        """Record a tick, and propose where an identification is due."""
+    def after_tick(self, controller: Controller, output: ControlOutput | None, now_ns: int) -> Learned | None:
+        """Record a tick, and propose where an identification is due. Returns what it found."""
         if output is None or not controller.has_internals:
-            return
+            return None
         if controller.mode is Mode.ENGAGED:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u)
-        if self._learning.ticked(now_ns):
-            proposal = as_received(self._learner.propose(), self._parameters, now_ns, controller.digest)
-            self._learning.receive(proposal, controller, now_ns)
+        if not self._learning.ticked(now_ns):
+            return None
+        proposal = self._learner.propose()
+        self._learning.receive(as_received(proposal, self._parameters, now_ns, controller.digest), controller, now_ns)
+        return self._identifications.next(proposal)

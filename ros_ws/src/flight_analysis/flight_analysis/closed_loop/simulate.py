@@ -156,8 +156,8 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
                     u = select(aircraft.inputs, inputs, output.u)
                     signals["u"].add(output.stamp_ns, output.u)
                     signals["internals"].add(output.stamp_ns, output.internals)
-                if learning is not None:
-                    learning.after_tick(controller, output, t_ns)
+                if learning is not None and (found := learning.after_tick(controller, output, t_ns)) is not None:
+                    signals.setdefault("learned", _SignalBuilder(found.names)).add(t_ns, found.values)
             if t_ns % NANOSECONDS == 0:
                 record({topic: builder.take() for topic, builder in signals.items()})
                 if progress is not None:

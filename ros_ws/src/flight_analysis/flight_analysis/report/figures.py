@@ -56,6 +56,7 @@ MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
 FREQUENCIES = [digit * 10.0**power for power in range(-4, 4) for digit in (1, 2, 5)]  # Hz, ticks of a spectrum
 MIN_VISIBLE_FRACTION = 1 / 500  # of the axis, about two pixels: shorter intervals are lengthened to it
+MAX_DEVIATION = 0.15  # of the value of an entry that the flight shows: half of the deviation before it
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
 Limits = Mapping[str, tuple[float, float]]  # lower and upper limit by input, SI; infinite without a limit
@@ -171,6 +172,31 @@ def integral_figure(context: PlotContext) -> Figure | None:
     values = np.stack([internals[channel] for channel in channels.values()]).T
     curve = Curve(Signal(internals.stamp_ns, tuple(channels), values), PLANT)
     return time_series_figure(context, {"": curve}, columns=2, height=120)
+
+
+def learned_figure(context: PlotContext) -> Figure | None:
+    """Entries of A and B over time, as identified in flight, with bars of two deviations; open marks: no model was proposed.
+
+    None without a learner. An entry whose least deviation is above MAX_DEVIATION of its value is left out.
+    """
+    if "learned" not in context.tape:
+        return None
+    t, found = context.tape.time("learned"), context.tape["learned"]
+    values, deviations = found.group("value"), found.group("deviation")
+    known = [name for name in values.names if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))]
+    if not known:
+        return None
+    columns, symbols = min(len(known), 3), np.where(found["proposed"] > 0.0, "circle", "circle-open").tolist()
+    figure = Figure(len(known), columns, 110, spacing=0.06)
+    for index, name in enumerate(known):
+        bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
+        marks = {"type": "scatter", "x": t, "y": values[name], "mode": "markers", "name": name, "error_y": bars}
+        style = {"marker": {"color": PLANT, "size": 7, "symbol": symbols}, "showlegend": False, "cliponaxis": False}
+        figure.add(marks | style | {"hovertemplate": "%{y:.4g} at %{x:.1f} s"}, index)
+        figure.x[index] |= {"range": [0.0, context.end], "showticklabels": index + columns >= len(known)}
+        figure.x[index] |= {"title": {"text": "t (s)"}} if index + columns >= len(known) else {}
+        figure.y[index]["title"] = {"text": name}
+    return set_layout(figure)
 
 
 def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, DisplayUnit]) -> Figure | None:

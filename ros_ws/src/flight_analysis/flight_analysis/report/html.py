@@ -166,6 +166,11 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
             "Limits are in view where u comes near them. Marks above each row: the controller saturated the input.",
             figures.input_figure(context, limits),
         ),
+        Section(
+            "What was learned",
+            "A and B as identified, SI, with bars of two standard deviations; open marks: no model was proposed",
+            figures.learned_figure(context),
+        ),
         Section("Wind", "along the body axes of trim", figures.wind_figure(context)),
         Section("States", "SI where no unit is given", figures.state_figure(context)),
         Section(
