@@ -15,7 +15,9 @@ from flight_core.parameters import ParameterError
 
 pytestmark = pytest.mark.package("autopilot_bridge")
 
-EXAMPLES = {"arduplane": "ardupilot", "px4_airplane": str(REPOSITORY / "examples" / "px4_airplane" / "map.yaml")}
+OF_PX4 = ("px4_airplane", "px4_quadrotor")
+EXAMPLES = {"arduplane": "ardupilot"} | {name: str(REPOSITORY / "examples" / name / "map.yaml") for name in OF_PX4}
+LARGEST = {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2, "vertical_speed": 1.0}  # an aircraft that is lost leaves them at once
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -27,8 +29,8 @@ def test_example_has_signs_and_limits_of_map_and_tracks_in_simulation(name: str,
     require_limits(autopilot, scenario)
     tape = simulate(scenario)
     y, y_m = tape["y"], tape["y_m"]
-    for output, largest in {"q": 0.1, "V": 1.0, "p": 0.2, "r": 0.2}.items():  # an aircraft that is lost leaves them at once
-        assert abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max() < largest, output
+    for output in y.names:
+        assert abs(y[output][: len(y_m.stamp_ns)] - y_m[output][: len(y.stamp_ns)]).max() < LARGEST[output], output
 
 
 def test_limits_of_u_beyond_those_of_map_refused_before_flight_that_sends() -> None:

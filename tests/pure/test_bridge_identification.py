@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.signal import cont2discrete, dlsim
+from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES
 from typer.testing import CliRunner
 
@@ -385,3 +386,33 @@ def test_experiment_stays_within_part_of_limits_of_map() -> None:
     for name, amplitude in zip(planned.inputs, planned.amplitude, strict=True):
         row = MAP.inputs[name]
         assert amplitude == pytest.approx(0.2 * min(-row.lower, row.upper))
+
+
+QUADROTOR = REPOSITORY / "examples" / "px4_quadrotor"
+HOVER_MAP = load_map(str(QUADROTOR / "map.yaml"))
+
+
+def test_quadrotor_identified_and_flown_without_a_name_of_a_fixed_wing(tmp_path: Path) -> None:
+    """The airframe of the example, whose channels are q, p, r and a vertical speed, by an experiment without an airspeed."""
+    frame = str(QUADROTOR / "airframe.yaml")
+
+    def flown(name: str, airframe: str, scenario: str) -> Tape:
+        chosen = loaded(tmp_path, name, airframe, scenario)
+        sensors = {"noise": [0.02, 0.05, 0.02, 0.01], "delay": 0.04}
+        real = {"airframe": frame, "rate": 100.0, "step": 0.005, "sensors": sensors}
+        return simulate(replace(chosen, aircraft=AircraftConfig.validate_mapping(real, "aircraft")))
+
+    planned = experiment(HOVER_MAP, None, 0.2, str(tmp_path / "experiment_airframe.yaml"), wait=1.0)
+    tape = flown("experiment", planned.airframe, planned.scenario)
+    pairing, _ = channel_pairs(HOVER_MAP)
+    response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
+    channels = join(HOVER_MAP, response, channel_models(HOVER_MAP, tape, [(0, 10**18)], None))
+    known = load_airframe(frame)
+    np.testing.assert_allclose(np.diag(channels.Omega), np.diag(known.matrix_b()), rtol=0.1)  # q, p, r by a noise of 20 mrad/s
+    found = flying_scenario(HOVER_MAP, channels, None, str(tmp_path / "flight_airframe.yaml"))
+    assert "speed" not in yaml.safe_load(found.airframe)
+    _, error = best_error(flown("flight", found.airframe, found.scenario))
+    rms = {name: error_metrics(error[name]).rms for name in error.names}
+    # the noise alone is 0.02 rad/s and 0.05 m/s; the commands have 0.15 rad/s and 1 m/s
+    assert max(rms["q"], rms["p"], rms["r"]) < 0.04
+    assert rms["vertical_speed"] < 0.1

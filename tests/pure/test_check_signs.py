@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 from typer.testing import CliRunner
 
@@ -118,6 +119,17 @@ def test_map_of_other_channels_or_motions_is_one_sentence() -> None:
         through(changed(original, "outputs", "q", positive="roll right"), OMEGA)
     with pytest.raises(ParameterError, match=r"inputs\.elevator\.positive: found 'roll right', .* in the airframe p"):
         through(changed(original, "inputs", "elevator", positive="roll right"), OMEGA)
+
+
+def test_channels_of_quadrotor_go_by_their_motions() -> None:
+    folder = REPOSITORY / "examples" / "px4_quadrotor"
+    hover, frame = load_map(str(folder / "map.yaml")), load_airframe(str(folder / "airframe.yaml"))
+    Omega = frame.matrix_b()
+    np.testing.assert_array_equal(through(hover, Omega), Omega)  # outputs are the states, in one order
+    climbs = changed(hover, "inputs", "thrust", positive="climbs")  # of a raw value that sinks
+    np.testing.assert_array_equal(through(climbs, Omega), Omega * [1.0, -1.0, 1.0, 1.0])
+    with pytest.raises(ParameterError, match=r"outputs\.p\.positive: found 'climbs', expected a motion to which p responds"):
+        through(changed(hover, "outputs", "p", positive="climbs"), Omega)
 
 
 # Recorded flights, with the servos' lags, a delay of 0.15 s as on an autopilot, and moderate turbulence.

@@ -17,7 +17,7 @@ from aircraft_sim.disturbance import AXES
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
-from flight_core.parameters import Config, Names, Number, Numbers, Positive, require
+from flight_core.parameters import Config, Names, NonNegative, Number, Numbers, require
 from flight_core.units import quantity, si_per_unit
 from flight_core.vectors import FloatArray
 
@@ -57,7 +57,7 @@ class Airframe(Config):
 
     name: str
     source: str = Field(description="where the figures come from")
-    speed: Positive = Field(description="the trim speed V0, m/s")
+    speed: NonNegative = Field(default=0.0, description="the trim speed V0, m/s; 0 in hover")
     states: dict[str, Unit] = Field(description="units by state")
     inputs: dict[str, Input] = Field(description="unit and sign by input")
     outputs: Names = Field(description="the outputs of y = C x: states, or the rows of C")
@@ -95,6 +95,7 @@ class Airframe(Config):
         for i, term in enumerate(self.inertial_coupling):
             require(len(term.product) == 2, f"inertial_coupling[{i}].product", f"{len(term.product)} states", "two of them")
             named |= {f"inertial_coupling[{i}].product[{k}]": state for k, state in enumerate(term.product)}
+        require(not self.gusts or self.speed > 0.0, "speed", self.speed, "above 0 m/s beside gusts, which are per w / V0")
         for gust in self.gusts:
             require(gust in AXES, f"gusts.{gust}", f"{gust!r}", f"an axis of the wind: {', '.join(AXES)}")
         named |= {f"gusts.{gust}.{state}": state for gust, direction in self.gusts.items() for state in direction}

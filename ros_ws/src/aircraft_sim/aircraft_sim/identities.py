@@ -184,14 +184,13 @@ def _entries(model: Model) -> Iterator[Finding]:
         "": 1.0,
         "g": GRAVITY,
         "V0": V0,
-        "g/V0": GRAVITY / V0,
-        "2 g/V0": 2.0 * GRAVITY / V0,
-        "2 g/V0^2": 2.0 * GRAVITY / V0**2,
     }
+    if V0 > 0.0:
+        values |= {"g/V0": GRAVITY / V0, "2 g/V0": 2.0 * GRAVITY / V0, "2 g/V0^2": 2.0 * GRAVITY / V0**2}
     right = dict.fromkeys(values, True)
     for (row, column), (sign, symbol, (least, most)) in EXPECTED.items():
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
-        if row not in names or column not in names:
+        if row not in names or column not in names or (V0 == 0.0 and "V0" in symbol):
             continue
         found, expected = float(model.matrix_a()[names.index(row), names.index(column)]), sign * values[symbol]
         left_out = found == 0.0 and (symbol.startswith("2 g") or (symbol == "V0" and not model.angular))  # a multirotor hovers

@@ -457,6 +457,7 @@ EULER_STATES = ("phi", "theta", "p", "q", "r")
 
 
 def _euler_kinematics(airframe: Airframe) -> EulerKinematics:
+    require(airframe.speed > 0.0, "kinematics", "euler without a trim speed", "linear, or an airframe with `speed`")
     unit, rows = np.eye(len(airframe.states)), airframe.matrix_a()
     alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
     return EulerKinematics(

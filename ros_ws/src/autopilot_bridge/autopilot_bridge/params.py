@@ -31,12 +31,17 @@ Motion = Literal[
     "slower",
     "more thrust",
     "less thrust",
+    "climbs",
+    "sinks",
 ]
 
 MOTIONS: Mapping[str, tuple[str, int]] = MappingProxyType(
-    dict(zip(get_args(Motion), product(("q", "p", "r", "V", "V"), (1, -1)), strict=True))
+    dict(zip(get_args(Motion), product(("q", "p", "r", "V", "V", "climb"), (1, -1)), strict=True))
 )
-"""The output that responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V faster +."""
+"""What responds to a motion, and its sign: FRD, q nose up +, p roll right +, r nose right +, V faster +, climb up +."""
+
+UNITS: Mapping[str, str] = MappingProxyType(dict.fromkeys(("q", "p", "r"), "rad/s") | dict.fromkeys(("V", "climb"), "m/s"))
+"""The unit of what responds to a motion."""
 
 Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"]
@@ -74,7 +79,7 @@ class MovingRow(Row):
 
     @property
     def motion(self) -> tuple[str, int]:
-        """The output that responds to an increasing channel, and the sign of its response."""
+        """What responds to an increasing channel, a key of UNITS, and the sign of its response."""
         output, sign = MOTIONS[self.positive]
         return output, sign * self.sign
 

@@ -23,6 +23,7 @@ from flight_analysis.design.bridge_identification import (
     cut_short,
     experiment,
     flying_scenario,
+    has_airspeed,
     join,
     map_text,
     measured_trims,
@@ -47,7 +48,7 @@ from flight_log.tape_reader import read_run
 
 def identify_behind_bridge(
     map_name: str,
-    speed: float,
+    speed: float | None,
     folder: Path,
     amplitude: float,
     log: Path | None,
@@ -58,6 +59,10 @@ def identify_behind_bridge(
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
     channel_map = load_map(map_name)
     require(0.0 < amplitude <= 1.0, "--amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
+    if has_airspeed(channel_map):
+        require(speed is not None, "--speed", "none", "the airspeed in trim, m/s: the map has one")
+    else:
+        require(speed is None, "--speed", f"{speed}", "none: the map has no airspeed")
     require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
     console = Console(quiet=as_json)
     if log is None:
@@ -84,7 +89,7 @@ def identify_behind_bridge(
 
 
 def _identified(
-    console: Console, channel_map: ChannelMap, tape: Tape, spans: list[tuple[int, int]], speed: float
+    console: Console, channel_map: ChannelMap, tape: Tape, spans: list[tuple[int, int]], speed: float | None
 ) -> tuple[dict[str, float], Response, Channels]:
     """Trims, step responses and channels of an experiment, shown. Raises ParameterError for a channel that is not certain."""
     pairing, _ = channel_pairs(channel_map)
@@ -97,13 +102,15 @@ def _identified(
     return trims, response, join(channel_map, response, models)
 
 
-def _excite(console: Console, channel_map: ChannelMap, map_name: str, speed: float, folder: Path, amplitude: float) -> Path:
+def _excite(
+    console: Console, channel_map: ChannelMap, map_name: str, speed: float | None, folder: Path, amplitude: float
+) -> Path:
     """Fly the experiment; the folder of its run."""
     airframe, scenario = folder / "experiment_airframe.yaml", folder / "experiment.yaml"
     planned = experiment(channel_map, speed, amplitude, str(airframe.resolve()))
     _write(folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
     chosen = load_scenario(scenario)
-    _announce(console, planned, chosen.flight.duration)
+    _announce(console, planned, chosen.flight.duration, hovers=speed is None)
     run = new_run(chosen, Path("runs"))
     with flight_progress(chosen.flight.duration, quiet=console.quiet) as (progress, announce):
         outcome = fly_over_topics(
@@ -127,7 +134,7 @@ def _write(folder: Path, files: Mapping[str, str]) -> None:
             write_file(folder / f"{name}.yaml", content)
 
 
-def _announce(console: Console, planned: Experiment, duration: float) -> None:
+def _announce(console: Console, planned: Experiment, duration: float, *, hovers: bool) -> None:
     """The whole experiment, before it begins."""
     controller = planned.controller
     table = new_table(
@@ -142,7 +149,8 @@ def _announce(console: Console, planned: Experiment, duration: float) -> None:
         )
     console.print(table)
     console.print(
-        f"Fly straight and level, in the mode in which the map engages, then in another terminal: rise-di engage (within"
+        f"{'Hover' if hovers else 'Fly straight and level'}, in the mode in which the map engages, then in another terminal:"
+        " rise-di engage (within"
         f" {duration - controller.duration:.0f} s). The pilot's override, rise-di engage --off and Ctrl-C end it at any time.",
         highlight=False,
         soft_wrap=True,

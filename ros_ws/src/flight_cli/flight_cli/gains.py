@@ -279,6 +279,8 @@ def _format_delay_margin(found: Study, answer: Assessment) -> str:
 
 def speed_of_margin(found: Study, answer: Assessment) -> str:
     """Up to which speed a delay margin above 0 lasts with fixed gains."""
+    if found.airframe.speed == 0.0:
+        return "the airframe has no trim speed"
     ratio = gain_selection.stable_speed_ratio(found, answer.controller)
     if math.isinf(ratio):
         return f"it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"

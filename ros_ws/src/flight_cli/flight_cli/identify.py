@@ -123,9 +123,9 @@ def identify(
         of_others["--guidance"] = guidance or None
         for name, value in (of_others | {"--namespace": namespace}).items():
             require(value is None, name, f"{value}", "none beside --bridge")
-        if speed is None or write is None:
-            raise ParameterError("identify: found too few arguments, expected --speed and --write beside --bridge")
-        require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
+        if write is None:
+            raise ParameterError("identify: found too few arguments, expected --write beside --bridge")
+        require(speed is None or 0.0 < speed < math.inf, "--speed", f"{speed}", "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
         identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
         return

@@ -14,19 +14,19 @@ import numpy as np
 import yaml
 
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.jsbsim_aircraft import OUTPUTS
 from aircraft_sim.uncertainty import nominal_and_sampled
 from autopilot_bridge.channel_map import to_channel
-from autopilot_bridge.params import ChannelMap
+from autopilot_bridge.params import UNITS, ChannelMap
 from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.margins import LoopMargins, linear_loop, loop_assessment
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_conditions import bandwidths
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
-from flight_analysis.design.identification import reference_parameters
+from flight_analysis.design.identification import DAMPING, NATURAL_FREQUENCY, PULSE_P, PULSE_V, reference_parameters
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
 from flight_analysis.design.response_identification import MIN_RATIO, Response, Spans
+from flight_analysis.design.sign_check import motion_as_channel_grows, output_signs
 from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -42,13 +42,27 @@ from rise_di_controller.rise_di import RiseDiConfig
 RATE = 100.0  # Hz, of law and reference model by default
 
 AMPLITUDE = 0.2  # of the smaller limit of an input, by default
-WIDTH, PERIOD, BAND = 0.25, 6.0, (0.3, 8.0)  # s, s, Hz: of the excitation of an input that turns the aircraft
-SPEED_WIDTH, SPEED_PERIOD, SPEED_BAND = 1.0, 12.0, (0.1, 0.8)  # the same of thrust: engines take longer
+
+
+class Excitation(NamedTuple):
+    """The excitation of an input."""
+
+    width: float = 0.25  # s
+    period: float = 6.0  # s
+    lowest: float = 0.3  # Hz
+    highest: float = 8.0  # Hz
+
+
+EXCITATIONS: Mapping[str, Excitation] = {
+    "V": Excitation(1.0, 12.0, 0.1, 0.8),  # engines take longer
+    "climb": Excitation(0.8, 10.0, 0.1, 1.5),  # the climb is an integral: slow commands move it more than its noise
+}
+"""By the motion that the input causes; another input turns the aircraft."""
 PAUSE = 1.5  # s, between the inputs
 
 REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
-MAX_NATURAL_FREQUENCY: Mapping[str, float] = {"q": 4.0, "p": 5.0, "r": 4.0, "V": 1.2}  # rad/s, those of `osprey_servo`
-HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V needs in the end; the rest is for disturbances
+HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V or climb needs in the end; the rest is for disturbances
+HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
 UNCERTAINTY, SAMPLES = 0.3, 20  # of the uncertain aircraft whose phase margin counts
 MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
@@ -64,27 +78,35 @@ WAIT = 30.0  # s before the first command of the flight: the time to engage
 def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     """Outputs and driving inputs by the motions of the map, and the signs of the effects, (m,).
 
-    Raises ParameterError for an output without an input, or unknown to the reference model.
+    Raises ParameterError for an output without an input, and for one with the opposite sign.
     """
     driven: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
         output, sign = row.motion
         other = driven.setdefault(output, (name, sign))
         require(other[0] == name, f"map {channel_map.name}: inputs", f"{other[0]} and {name} both for {output}", "one of them")
-    for name, measured in channel_map.outputs.items():
-        require(name in OUTPUTS, f"map {channel_map.name}: outputs", name, f"some of {', '.join(OUTPUTS)}")
-        require(name in driven, f"map {channel_map.name}: inputs", f"none that moves {name}", "one input for each output")
-        require(
-            measured.motion == (name, 1), f"map {channel_map.name}: outputs.{name}", "the opposite sign", "the stack's signs"
-        )
-    outputs = tuple(channel_map.outputs)
-    inputs = tuple(driven[name][0] for name in outputs)
-    return ChannelPairing(outputs, inputs), np.array([float(driven[name][1]) for name in outputs])
+    moved = motions(channel_map)
+    for (name, motion), sign in zip(moved.items(), output_signs(channel_map), strict=True):
+        require(motion in driven, f"map {channel_map.name}: inputs", f"none that moves {name}", "one input for each output")
+        require(sign > 0.0, f"map {channel_map.name}: outputs.{name}", "the opposite sign", "the stack's signs")
+    inputs = tuple(driven[motion][0] for motion in moved.values())
+    return ChannelPairing(tuple(moved), inputs), np.array([float(driven[motion][1]) for motion in moved.values()])
+
+
+def motions(channel_map: ChannelMap) -> dict[str, str]:
+    """The motion of each output of a map, a key of UNITS: the name of q, p, r and V."""
+    return {name: row.motion[0] for name, row in channel_map.outputs.items()}
+
+
+def has_airspeed(channel_map: ChannelMap) -> bool:
+    """Whether a map has an airspeed: without one the aircraft hovers."""
+    return "V" in motions(channel_map).values()
 
 
 def require_envelope(channel_map: ChannelMap) -> None:
-    """Raise ParameterError for a map without limits of the speed, and of a measured attitude: nothing further guards."""
-    needed = [name for name in ("phi", "theta", "V") if name in channel_map.pose or name in channel_map.outputs]
+    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude: nothing further guards."""
+    needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
+    needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
     missing = [name for name in needed if name not in channel_map.envelope]
     limits = ", ".join(needed)
     found = f"none of {', '.join(missing)}"
@@ -99,12 +121,13 @@ class Experiment(NamedTuple):
     controller: ExcitationConfig
 
 
-def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe_file: str, wait: float = WAIT) -> Experiment:
-    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s."""
+def experiment(
+    channel_map: ChannelMap, speed: float | None, amplitude: float, airframe_file: str, wait: float = WAIT
+) -> Experiment:
+    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s, None in hover."""
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
-    thrust = [name == "V" for name in pairing.outputs]
-    m, lowest = len(rows), [SPEED_BAND[0] if drives_speed else BAND[0] for drives_speed in thrust]
+    m, chosen = len(rows), [EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()]
     controller = ExcitationConfig.validate_mapping(
         _controller(channel_map, pairing)
         | {
@@ -114,12 +137,9 @@ def experiment(channel_map: ChannelMap, speed: float, amplitude: float, airframe
             "lag": [0.0] * m,
             "delay": 0.0,
             "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
-            "width": [SPEED_WIDTH if drives_speed else WIDTH for drives_speed in thrust],
-            "period": [SPEED_PERIOD if drives_speed else PERIOD for drives_speed in thrust],
-            "lowest": lowest,
-            "highest": [SPEED_BAND[1] if drives_speed else BAND[1] for drives_speed in thrust],
             "pause": PAUSE,
-        },
+        }
+        | {key: [getattr(excitation, key) for excitation in chosen] for key in Excitation._fields},
         "controller",
     )
     none = {"rate": RATE, "outputs": list(pairing.outputs), "rise": 0.1}
@@ -147,18 +167,23 @@ def cut_short(flown: Sequence[Engagement], duration: float) -> str:
     return f"the bridge released after {engaged:.0f} of {duration:.0f} s: {flown[lengths.index(engaged)].reason}"
 
 
-def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float) -> list[ChannelModel | None]:
+def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None) -> list[ChannelModel | None]:
     """The models of the channels of a map from the log of an experiment, engaged in `spans`; None for no model.
 
-    V has no model without a measured climb: the phugoid, which thrust excites too, would be taken for a response to thrust.
+    Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the phugoid, which thrust excites
+    too, would be taken for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield, "Helicopter Flight
+    Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
     y, u = tape["y"].within(spans), tape["u"].within(spans)
-    gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape else None
+    gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
+    moved = motions(channel_map)
     return [
         None
-        if output == "V" and gravity is None
-        else fit_channel(y, u, output, name, direction, gravity if output == "V" else None)
+        if moved[output] == "V" and gravity is None
+        else fit_channel(
+            y, u, output, name, direction, gravity if moved[output] == "V" else None, first_order=moved[output] == "climb"
+        )
         for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
     ]
 
@@ -224,7 +249,7 @@ class Flyable(NamedTuple):
 
 
 def flying_scenario(
-    channel_map: ChannelMap, found: Channels, speed: float, airframe_file: str, needed: Requirement = REQUIREMENT
+    channel_map: ChannelMap, found: Channels, speed: float | None, airframe_file: str, needed: Requirement = REQUIREMENT
 ) -> Flyable:
     """Gains for identified channels, and the texts of airframe and scenario.
 
@@ -235,17 +260,18 @@ def flying_scenario(
     pairing, _ = channel_pairs(channel_map)
     delay = float(np.min(found.delay))
     later = found.lag + found.delay - delay  # the controller has one delay: what a channel has beyond it counts as its lag
-    products = np.array([gain_selection.CROSSOVER_LAG_PRODUCTS[name] for name in pairing.outputs])
+    moved = motions(channel_map)
+    products = {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved.items()}
     loop = Loop(later, delay, 1.0 / RATE)
-    bandwidth = dict(zip(pairing.outputs, bandwidths(loop, products).tolist(), strict=True))
+    bandwidth = dict(zip(pairing.outputs, bandwidths(loop, np.array(list(products.values()))).tolist(), strict=True))
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
-    authority = held = 1.0  # m/s^2, m/s
-    if "V" in pairing.outputs:
-        thrust = pairing.outputs.index("V")
-        row = rows[pairing.inputs[thrust]]
-        authority = abs(float(found.Omega[thrust, thrust])) * min(-row.lower, row.upper)
-        held = HELD_FRACTION * authority / max(float(found.damping[thrust]), 1e-3)
-    commands = _commands(pairing.outputs, bandwidth, speed, authority, held)
+    range_ = np.array([min(-row.lower, row.upper) for row in rows.values()])
+    authority = dict(zip(pairing.outputs, (np.abs(np.diag(found.Omega)) * range_).tolist(), strict=True))
+    held = {
+        name: HELD_FRACTION * authority[name] / max(damping, 1e-3)
+        for name, damping in zip(pairing.outputs, found.damping.tolist(), strict=True)
+    }
+    commands = _commands(moved, bandwidth, speed, authority, held)
     lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
     ones = [1.0] * len(pairing.inputs)
     base = RiseDiConfig.validate_mapping(
@@ -256,7 +282,7 @@ def flying_scenario(
         "controller",
     )
     manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
-    range_rate = np.array([min(-row.lower, row.upper) / FULL_RANGE_TIME for row in rows.values()])
+    range_rate = range_ / FULL_RANGE_TIME
 
     airframe = airframe_yaml(channel_map, pairing, found, speed, "identified in flight")
     frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
@@ -268,7 +294,8 @@ def flying_scenario(
     # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
     studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
-    selection = gain_selection.select_gains(studied, LoopSetting(base, RATE, lag, delay, {}, requirement=needed))
+    setting = LoopSetting(base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed)
+    selection = gain_selection.select_gains(studied, setting)
     flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, found, loop), frame, needed)
     turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
     model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
@@ -394,27 +421,38 @@ def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, A
 
 
 def _commands(
-    outputs: Sequence[str], bandwidth: Mapping[str, float], speed: float, authority: float, held: float
+    moved: Mapping[str, str],
+    bandwidth: Mapping[str, float],
+    speed: float | None,
+    authority: Mapping[str, float],
+    held: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The manoeuvre of `reference_parameters` after WAIT, by a reference model within reach of the loop; V to `held` m/s."""
-    commands = reference_parameters(speed, authority)
-    frequency = dict(zip(commands["outputs"], commands["second_order"]["natural_frequency"], strict=True))
-    damping = dict(zip(commands["outputs"], commands["second_order"]["damping"], strict=True))
-    limit = {name: min(MAX_NATURAL_FREQUENCY[name], REFERENCE_BANDWIDTH * bandwidth[name]) for name in outputs}
+    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held` m/s.
+
+    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel after another and a climb.
+    Arguments, by output: the motion, the bandwidth, rad/s, the authority, y_dot, and the speed that half of it holds.
+    """
+    motion_of = {motion: name for name, motion in moved.items()}
+    cruise = None if speed is None else reference_parameters(speed, authority.get("V", 1.0))
+    fastest = {"climb": NATURAL_FREQUENCY["V"], **NATURAL_FREQUENCY}
+    if cruise is not None:
+        fastest |= dict(zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True))
+    limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
     pulses = {
-        name: pulse | {key: [WAIT + t for t in pulse[key]] for key in ("start", "stop")}
-        for name, pulse in commands["pulses"].items()
-        if name in outputs
+        motion_of[motion]: pulse | {key: [WAIT + t for t in pulse[key]] for key in ("start", "stop")}
+        for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items()
+        if motion in motion_of
     }
-    if "V" in pulses:
-        pulses["V"]["value"] = [round(min(value, held), 4) for value in pulses["V"]["value"]]
-    turns = commands["coordinated_turn"] if {"p", "r"} <= set(outputs) else None
-    return commands | {
+    for name, pulse in pulses.items():
+        if UNITS[moved[name]] == "m/s":
+            pulse["value"] = [round(min(value, held[name]), 4) for value in pulse["value"]]
+    turns = cruise["coordinated_turn"] if cruise is not None and {"p", "r"} <= set(moved) else None
+    return (cruise or {}) | {
         "rate": RATE,
-        "outputs": list(outputs),
+        "outputs": list(moved),
         "second_order": {
-            "natural_frequency": [round(min(frequency[name], limit[name]), 4) for name in outputs],
-            "damping": [damping[name] for name in outputs],
+            "natural_frequency": [round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()],
+            "damping": [DAMPING.get(motion, DAMPING["V"]) for motion in moved.values()],
         },
         "rise": 0.5,
         "pulses": pulses,
@@ -422,7 +460,17 @@ def _commands(
     }
 
 
-def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Channels, speed: float, source: str) -> str:
+def _hover_pulses() -> dict[str, dict[str, list[float]]]:
+    """By motion: doublets of 1 s of the rates, back to the attitude before, then a climb of 8 s."""
+    starts = zip(HOVER, (2.0, 8.0, 14.0), strict=True)
+    pulses = {
+        motion: {"start": [t, t + 2.0], "stop": [t + 1.0, t + 3.0], "value": [HOVER[motion], -HOVER[motion]]}
+        for motion, t in starts
+    }
+    return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}
+
+
+def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Channels, speed: float | None, source: str) -> str:
     """The text of the airframe of identified channels, in units of the map's channels.
 
     With z_i of the dimension of y_i dt:
@@ -439,14 +487,16 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
         A[i, place] = found.damping[i] * found.zero[i] - found.stiffness[i] - found.zero[i] ** 2
         A[place, i], A[place, place] = 1.0, -found.zero[i]
     B = np.vstack([found.Omega, np.zeros((len(second), m))])
-    states: dict[str, str] = {name: OUTPUTS[name] for name in pairing.outputs}
+    states = {name: UNITS[motion] for name, motion in motions(channel_map).items()}
     states |= {f"{pairing.outputs[i]}_integral": "1" for i in second}
     values = {
         "name": f"{channel_map.name}_aircraft",
         "source": source,
-        "speed": float(speed),
+        **({} if speed is None else {"speed": float(speed)}),
         "states": states,
-        "inputs": {name: {"unit": "1", "positive": channel_map.inputs[name].positive} for name in pairing.inputs},
+        "inputs": {
+            name: {"unit": "1", "positive": motion_as_channel_grows(channel_map.inputs[name])} for name in pairing.inputs
+        },
         "outputs": list(pairing.outputs),
         "A": [[float(f"{value:.4g}") for value in row] for row in A],
         "B": [[float(f"{value:.4g}") for value in row] for row in B],

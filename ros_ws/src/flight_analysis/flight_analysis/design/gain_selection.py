@@ -58,7 +58,7 @@ from rise_di_controller.linear_loop import Loop, is_stable
 from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
-CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46}
+CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46, "climb": 0.46}
 """Bandwidth of a channel times the lag of its loop, rad, by output, at the begin of the search: 0.63 and 0.46 cost 36 and 26
 degrees of phase at the crossover. Yaw has a margin for the dutch roll, speed for the engine. The integral, Lambda and the slope
 of the softened sign, costs more: the search makes the integral slower, and lowers the bandwidth, until the margins meet the
@@ -206,7 +206,12 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     """
     whole = scenario.reference_model
     for name in airframe.outputs:
-        require(name in whole.outputs, f"{scenario.name}: reference_model.outputs", ", ".join(whole.outputs), f"{name} too")
+        require(
+            name in whole.outputs,
+            f"{scenario.name}: reference_model.outputs",
+            ", ".join(whole.outputs),
+            f"{name} too: --scenario has them",
+        )
     values = whole.model_dump(exclude_none=True)
     if set(airframe.outputs) != set(whole.outputs):
         require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
@@ -217,7 +222,7 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
             values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
     turn = whole.coordinated_turn
     if turn is not None:
-        present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs)
+        present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs) and airframe.speed > 0.0
         values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
     gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
     reference = ReferenceModelConfig.validate_mapping(values, "reference_model")

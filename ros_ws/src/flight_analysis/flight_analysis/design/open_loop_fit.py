@@ -94,12 +94,13 @@ class ChannelModel(NamedTuple):
 
 
 def fit_channel(
-    y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None
+    y: Signal, u: Signal, output: str, name: str, sign: float, gravity: Signal | None = None, *, first_order: bool = False
 ) -> ChannelModel | None:
     """The model from the time of excitation of an input, of the lowest sufficient order.
 
     None without excitation, or for a constant output. The search begins with an Omega of this sign, and may end with the
-    opposite sign. `gravity` is a measured part of y_dot without u, a channel: then the model is of first order.
+    opposite sign. `gravity` is a measured part of y_dot without u, a channel: then, and by `first_order`, the model is of first
+    order.
     """
     excited = np.flatnonzero(u[name] != 0.0)
     if not len(excited):
@@ -130,7 +131,7 @@ def fit_channel(
         e = measured[output] - response(theta)
         return np.asarray(e - q @ (q.T @ e))
 
-    orders = ORDERS if gravity is None else ORDERS[:1]
+    orders = ORDERS[:1] if first_order or gravity is not None else ORDERS
     values = residuals(np.array([0.0, 1.0, 0.0, 0.0]))
     fits = [_search(residuals, values, order, sign * float(np.max(np.abs(u[name])))) for order in orders]
     misfits = [float(np.linalg.norm(fit.fun) / np.linalg.norm(values)) for fit in fits]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from autopilot_bridge.params import MOTIONS, ChannelMap, InputRow, OutputRow
+from autopilot_bridge.params import MOTIONS, UNITS, ChannelMap, InputRow, OutputRow
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
@@ -171,19 +171,19 @@ def _places(names: Iterable[str], among: Iterable[str]) -> list[int]:
 
 
 def output_signs(channel_map: ChannelMap) -> FloatArray:
-    """+1 for an output with the sign convention of the stack (q nose up, p roll right, r nose right, V faster), otherwise -1.
+    """+1 for an output with the sign of the stack (q nose up, p roll right, r nose right, V faster, climb up), otherwise -1.
 
-    Shape (m,) in the map's order. Raises ParameterError where the motion of a row does not belong to the channel.
+    Shape (m,) in the map's order. The motion of a row says what a channel of another name is. Raises ParameterError where the
+    motion of q, p, r or V is that of another channel, and for two channels of one motion.
     """
-    signs = []
+    signs: dict[str, int] = {}
     for name, row in channel_map.outputs.items():
-        output, sign = row.motion
-        channels = sorted({channel for channel, _ in MOTIONS.values()})
-        key = f"map {channel_map.name}: outputs.{name}"
-        require(name in channels, key, "a channel", f"one of {', '.join(channels)}")
-        require(output == name, f"{key}.positive", f"{row.positive!r}", f"a motion to which {name} responds")
-        signs.append(sign)
-    return np.array(signs, dtype=np.float64)
+        moved, sign = row.motion
+        key = f"map {channel_map.name}: outputs.{name}.positive"
+        require(name not in UNITS or moved == name, key, f"{row.positive!r}", f"a motion to which {name} responds")
+        require(moved not in signs, key, f"{row.positive!r}, the motion of another output too", "a motion of its own")
+        signs[moved] = sign
+    return np.array(list(signs.values()), dtype=np.float64)
 
 
 def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
@@ -194,12 +194,14 @@ def input_signs(channel_map: ChannelMap, Omega: FloatArray) -> FloatArray:
     """
     signs = []
     for j, (name, row) in enumerate(channel_map.inputs.items()):
-        output, sign = row.motion
+        moved, sign = row.motion
         key = f"map {channel_map.name}: inputs.{name}.positive"
-        outputs = list(channel_map.outputs)
-        require(output in outputs, key, f"{row.positive!r}", f"a motion to which one of {', '.join(outputs)} responds")
-        effect = Omega[outputs.index(output), j]
-        require(effect != 0.0, key, f"{row.positive!r}", f"a motion by {name}: in the airframe {output} does not respond")
+        outputs = {measured.motion[0]: output for output, measured in channel_map.outputs.items()}
+        expected = f"a motion to which one of {', '.join(outputs.values())} responds"
+        require(moved in outputs, key, f"{row.positive!r}", expected)
+        effect = Omega[list(outputs).index(moved), j]
+        expected = f"a motion by {name}: in the airframe {outputs[moved]} does not respond"
+        require(effect != 0.0, key, f"{row.positive!r}", expected)
         signs.append(sign * np.sign(effect))
     return np.array(signs)
 
