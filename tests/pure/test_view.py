@@ -45,7 +45,7 @@ from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
-from flight_view.watch import newest_run, require_log
+from flight_view.watch import newest_run, require_log, runs_in_recording
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
 
@@ -838,6 +838,10 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
     with (tmp_path / "20260102T000000Z-b" / "run_0.mcap").open("rb") as recorder:
         assert try_lock(recorder)
         assert newest_run(tmp_path).name == "20260102T000000Z-b"
+        with (tmp_path / "20260103T000000Z-c" / "run_0.mcap").open("rb") as second:
+            assert try_lock(second)
+            assert [folder.name[-1] for folder in runs_in_recording(tmp_path)] == ["c", "b"]
+            assert runs_in_recording(tmp_path, "uav1") == []
 
 
 def test_no_run_and_no_log_are_sentences(tmp_path: Path) -> None:

@@ -16,13 +16,14 @@ from flight_cli.log_options import LogScenario, scenario_file
 from flight_cli.route_options import parse_origin
 from flight_cli.target import RemovedKeyFile
 from flight_core.environment import require_ros_environment
+from flight_core.files import display_path
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
 from flight_log.tape_reader import StoredFile, stored_scenario
 from flight_view.background import Line, read_background
 from flight_view.flight import Flight
 from flight_view.text import show
-from flight_view.watch import DEFAULT_PORT, newest_run, require_log, serve
+from flight_view.watch import DEFAULT_PORT, newest_run, require_log, runs_in_recording, serve
 
 
 def watch(
@@ -63,7 +64,7 @@ def watch(
     """
     require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
     given = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
-    chosen = [newest_run(runs) if run is None else run, *([ghost] if ghost is not None else [])]
+    chosen = [_newest(runs, namespace) if run is None else run, *([ghost] if ghost is not None else [])]
     for folder in chosen:
         if not wait:
             require_log(folder, namespace)
@@ -81,6 +82,18 @@ def watch(
         _serve_with_control(chosen, ports, namespace or "", given, lines, real=control_real)
     else:
         serve(chosen, ports, _announce, None, namespace, given, lines)
+
+
+def _newest(runs: Path, namespace: str | None) -> Path:
+    """The run to watch without a RUN; a note names the other aircraft in flight."""
+    chosen = newest_run(runs, namespace)
+    beside = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
+    if beside and namespace is None:
+        print(
+            f"note: shows {display_path(chosen)}; also in flight: {', '.join(beside)}: name one, or --namespace",
+            file=sys.stderr,
+        )
+    return chosen
 
 
 def _announce(line: str) -> None:

@@ -26,13 +26,22 @@ from flight_view.server import ADDRESS, Server
 DEFAULT_PORT = 8077
 
 
-def newest_run(runs: Path) -> Path:
-    """The newest run in recording, else the last run flown. Raises ParameterError without a run."""
+def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
+    """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
     folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True) if is_folder(runs) else []
+    found, prefix = [], f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
         with suppress(ParameterError, OSError):
-            if any(is_locked(file) for file in bag_files(folder)):
-                return folder
+            held = any(is_locked(file) for file in bag_files(folder))
+            if held and (not namespace or any(topic.startswith(prefix) for topic in log_topics(folder))):
+                found.append(folder)
+    return found
+
+
+def newest_run(runs: Path, namespace: str | None = None) -> Path:
+    """The newest run in recording, with a namespace of that aircraft, else the last run flown. Raises ParameterError."""
+    if recording := runs_in_recording(runs, namespace):
+        return recording[0]
     latest = runs / "latest"
     require(is_folder(latest), str(runs), "no run", "the runs of `rise-di fly`, or a RUN by its name")
     return latest.resolve()
