@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import linprog
+from tests.conftest import REPOSITORY
 
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.margins import margins
@@ -166,6 +167,17 @@ def test_shipped_aircraft_track_without_an_effector(name: str, effector: str, ch
     assert np.abs(tape["internals"][f"e.{channel}"]).max() < 0.03
     limits = scenario.controller.effector_limits()
     assert ((tape["u"].values >= limits.lower) & (tape["u"].values <= limits.upper)).all()
+
+
+def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six rotors, no V, no guidance; 64 mrad/s off at most in the two commands of 0.5 rad/s, so a sixth of these."""
+    monkeypatch.chdir(REPOSITORY)  # the scenario names its airframe from there
+    path = "examples/hexarotor/hexarotor_flight.yaml"
+    scenario = find_scenario(path).vary(flight={"duration": 3.0})
+    tape = simulate(scenario)
+    assert tape.outcome == "completed"
+    assert max(np.abs(tape["internals"][f"e.{name}"]).max() for name in "pq") < 0.5 / 6.0
+    assert replay(tape).equal()
 
 
 def test_the_margins_are_those_of_the_aircraft_behind_the_allocation() -> None:

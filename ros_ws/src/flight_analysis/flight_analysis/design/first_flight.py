@@ -91,7 +91,8 @@ def scenario_text(
         response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
         authority, lag_of = response * np.array(stops)[list(paired)], {outputs[i]: lag[j] for i, j in enumerate(paired)}
     fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
-    turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if {"p", "r"} <= set(outputs) else None
+    banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))  # a bank turns an aeroplane
+    turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
     amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
     start, pulses = 2.0, {}
     for k, output in enumerate(outputs):
