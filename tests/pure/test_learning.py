@@ -192,7 +192,9 @@ def test_filter_of_a_constant_record_begins_as_after_a_long_one() -> None:
 )
 def test_divergence_is_three_times_the_error_before(errors: tuple[float, float], expected: bool) -> None:
     now, largest = (np.array([value**2, 0.0]) for value in errors)
-    assert divergence.diverges(divergence.Errors(now, largest), divergence.least(("q", "V"))) is expected
+    state, least = divergence.Errors(now, largest), divergence.least(("q", "V"))
+    assert divergence.diverges(state, least, np.array([True, True])) is expected
+    assert not divergence.diverges(state, least, np.array([False, True]))  # q flies the law of the start
 
 
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:

@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_core.modes import Mode
 from flight_core.parameters import require
@@ -58,7 +59,7 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._first = self._parameters = parameters
-        self._first_law = True
+        self._first_law, self._learned = True, _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
@@ -110,11 +111,12 @@ class Controller:
         )
         self._state = guard.retune(self._state, self._law, new.law, (self._guard.nominal, new.guard.nominal))
         self._law, self._guard, self._digest, self._parameters = new.law, new.guard, new.digest, new.parameters
-        self._first_law = self._has_first_model(new.parameters)
+        self._first_law, self._learned = self._has_first_model(new.parameters), _with_feedforward(new.parameters)
 
     def fallback(self) -> ControllerConfig | None:
         """The parameters of the start where a law with a model that was learned in flight diverges; else None."""
-        return None if self._first_law or not divergence.diverges(self._errors, self._least) else self._first
+        diverges = not self._first_law and divergence.diverges(self._errors, self._least, self._learned)
+        return self._first if diverges else None
 
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return (parameters.observer, parameters.feedforward) == (self._first.observer, self._first.feedforward)
@@ -176,3 +178,9 @@ class Controller:
         """Names of the stale inputs: y or y_m never received or older than the age limit."""
         ages, limit = self.ages(now_ns), seconds(self._guard.max_age_ns)
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)
+
+
+def _with_feedforward(parameters: ControllerConfig) -> NDArray[np.bool_]:
+    """Mask of the channels with a feedforward, (m,): a learner leaves out those that fly the law of the start."""
+    some = None if parameters.feedforward is None else parameters.feedforward.inputs
+    return np.array([some is None or name in some for name in parameters.inputs])

@@ -5,6 +5,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flight_core.vectors import FloatArray
 
@@ -32,6 +33,9 @@ def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
 
 
-def diverges(errors: Errors, least: FloatArray) -> bool:
-    """Whether the rms error of an output is above FACTOR times its largest under the first law, and above `least`."""
-    return bool(np.any(errors.now > np.maximum(FACTOR**2 * errors.largest, least)))
+def diverges(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> bool:
+    """Whether the rms error of an output is above FACTOR times its largest under the first law, and above `least`.
+
+    Only outputs with a model that was learned count, mask (m,): the others fly the first law.
+    """
+    return bool(np.any(learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))))

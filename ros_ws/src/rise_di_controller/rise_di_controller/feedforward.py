@@ -31,14 +31,15 @@ class Nominal(NamedTuple):
     path_gravity: Array  # (n, n), path gravity
     lead: Array  # (m,) time from a tick until the input acts: half a period of hold, delay, actuator lag; s
     sine_states: tuple[int, ...]  # indices of the states with a sine term
+    acts: Array | None = None  # (m,) 1 for the inputs with a feedforward, 0 for the others; None: all have one
 
 
-def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array) -> Nominal:
+def nominal_model(A: Array, B: Array, C: Array, gravity: Array, lead: Array, acts: Array | None = None) -> Nominal:
     """The nominal model with the products for a tick. Omega = C B is regular."""
     inverse = arithmetic.inverse(product(C, B))
     path = np.eye(len(A)) - product(product(B, inverse), C)
     angles = tuple(np.flatnonzero(gravity.any(axis=0)).tolist())
-    return Nominal(A, B, C, gravity, inverse, path, product(path, A), product(path, gravity), lead, angles)
+    return Nominal(A, B, C, gravity, inverse, path, product(path, A), product(path, gravity), lead, angles, acts)
 
 
 class FeedforwardState(NamedTuple):
@@ -115,7 +116,12 @@ def step(state: FeedforwardState, y_m: Array, dt: Array, nominal: Nominal) -> tu
     u = ideal((x + state.x) / 2.0, y_m_dot, nominal)
     u_ff = u + (dt + 2.0 * nominal.lead) * (u - state.u) / (dt + state.dt)
     u_0 = xp.where(state.ticks < 2.0, u_ff, state.u_0)
-    return FeedforwardState(x, u, dt, state.ticks + 1.0, u_0), u_ff - u_0
+    return FeedforwardState(x, u, dt, state.ticks + 1.0, u_0), acting(u_ff - u_0, nominal)
+
+
+def acting(u: Array, nominal: Nominal) -> Array:
+    """The input u of the inputs with a feedforward, 0 for the others, (m,)."""
+    return u if nominal.acts is None else u * nominal.acts
 
 
 def zero_dynamics(nominal: Nominal) -> NDArray[np.complex128]:

@@ -222,7 +222,7 @@ def retune(
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
     An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
-    the same motion: z is that of the new filter over these ticks, and u_o takes the part of the law.
+    the same motion: z is that of the new filter over these ticks, and u_o goes on where an observer acts.
     Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Arguments:
     `nominal`, the models of the old and the new feedforward.
     """
@@ -238,9 +238,12 @@ def retune(
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
         if other_model or other_nominal:
-            # The law's part passes to u_o, which goes on to -F z at its own rate.
+            # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part of the law: what
+            # the law has integrated beside an observer stays there, which would take it long to integrate again.
             rest, limits = state.u - state.u_trim - state.u_ff, new.params.limits
-            u_o = np.clip(rest, limits.lower, limits.upper)
+            acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in (old.params, new.params))
+            goes_on = np.where(acted, law.u_o - change, rest)
+            u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
             inner = shifted(law.law, rest - u_o - (rest + change - law.u_o), new.params.law)
             z = observer.estimates_after(state.history, change, new.params)
             law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
@@ -261,7 +264,7 @@ def _with_nominal(state: ControllerState, y_m: FloatArray, nominal: Nominal | No
     if nominal is not None:
         earlier, last = state.history[-2], state.history[-1]
         goes_on = feedforward.continued(state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal)
-        u_ff = goes_on.u - goes_on.u_0
+        u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
     return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
 
 

@@ -38,10 +38,10 @@ class Event(NamedTuple):
 
 
 class Updates:
-    """When identifications begin: at the first tick at or after each of the times, counted from the first tick."""
+    """When identifications and tests begin: at the first tick at or after each of the times, counted from the first tick."""
 
     def __init__(self, settings: LearnConfig) -> None:
-        self._window_ns = nanoseconds(settings.window)
+        self._check_ns = nanoseconds(settings.check)
         self._times_ns = deque(map(nanoseconds, settings.updates))
         self._first_ns: int | None = None
 
@@ -52,7 +52,7 @@ class Updates:
         while now_ns - self._first_ns >= self._times_ns[0]:
             due, last_ns = True, self._times_ns.popleft()
             if not self._times_ns:
-                self._times_ns.append(last_ns + self._window_ns)
+                self._times_ns.append(last_ns + self._check_ns)
         return due
 
 

@@ -63,6 +63,7 @@ class FeedforwardConfig(Config):
     B: Numbers = Field(description="B, a row a state, the columns in the order of controller.inputs")
     gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
     lead: NonNegatives = Field(description="time from a tick until its input acts, s: half a period, delay and lag")
+    inputs: Names | None = Field(default=None, description="the inputs with a feedforward; all where absent")
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
         """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for a C B whose D differs."""
@@ -82,7 +83,10 @@ class FeedforwardConfig(Config):
         except DecompositionError as error:
             raise ParameterError(f"feedforward.B: found a C B without a D ({error}), expected D = {list(D)}") from None
         require(nominal_D == list(D), "feedforward.B", f"a C B with D = {nominal_D}", f"D = {list(D)}, that of the controller")
-        return nominal_model(A, B, C, gravity, np.array(self.lead))
+        unknown = [name for name in self.inputs or () if name not in inputs]
+        require(not unknown, "feedforward.inputs", ", ".join(unknown), f"some of {', '.join(inputs)}")
+        acts = None if self.inputs is None else np.array([float(name in self.inputs) for name in inputs])
+        return nominal_model(A, B, C, gravity, np.array(self.lead), acts)
 
 
 class ObserverConfig(Config):

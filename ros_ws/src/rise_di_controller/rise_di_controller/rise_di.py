@@ -39,14 +39,17 @@ class LearnConfig(Config):
         default=(10.0, 15.0, 20.0, 30.0, 60.0),
         description="when the first identifications begin, from the first tick of the law, s; then one a window",
     )
+    check: Annotated[float, Field(ge=1, le=600)] = Field(
+        default=10.0, description="after the last of these times: how often it is tested whether the aircraft has changed, s"
+    )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
         description="in lockstep and in one process: from the end of a window until the controller takes the model, s",
     )
 
     def spacing(self) -> float:
-        """The shortest time between two identifications, s."""
-        times = (*self.updates, self.updates[-1] + self.window)
+        """The shortest time between two identifications or tests, s."""
+        times = (*self.updates, self.updates[-1] + self.check)
         return min(after - before for before, after in pairwise(times))
 
 

@@ -50,6 +50,8 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
     flies = controller.observer is None or controller.observer.part > 0.0
     require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")
+    some = controller.feedforward is not None and controller.feedforward.inputs is not None
+    require(not some, "controller.feedforward.inputs", "a list", "none: the C code has a feedforward of all inputs")
     return controller
 
 

@@ -7,16 +7,19 @@ refused with a sentence. The controller refuses parameters that fail its own che
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning import Proposal
+from flight_analysis.design.change_test import MAX_GAIN, RECORD, Change, change_test
+from flight_analysis.design.gain_conditions import MIN_GAIN
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import TRANSIENT, Actuation, Recording
-from flight_analysis.design.model_identification import PRIOR, Identification, identify
-from flight_core.parameters import ParameterError, require
+from flight_analysis.design.model_identification import PRIOR, Entry, Identification, Part, identify, with_entries
+from flight_core.parameters import SMALLEST, ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
@@ -29,8 +32,18 @@ Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
 """The controller with the feedforward and the observer of a model. Raises ParameterError."""
 
 
+class Known(NamedTuple):
+    """A part of the aircraft whose model flies."""
+
+    end_ns: int  # of its window
+    deviation: Mapping[str, float]  # of its entries by name, 1
+
+
 class Learner:
-    """The record of y and u over a window, and proposals from it."""
+    """The record of y and u over a window, and proposals from it.
+
+    The parts of the aircraft that do not couple are learned one by one: one without a model flies the law of the start.
+    """
 
     def __init__(self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0) -> None:
         """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling and lags.
@@ -40,28 +53,35 @@ class Learner:
         settings = controller.learn
         require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
         assert settings is not None  # noqa: S101 - for the type checker
-        self._controller, self._airframe, self._design = controller, airframe, design
+        self._controller, self._rough, self._design = controller, airframe, design
         self._period = 1.0 / controller.rate
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
         self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
         self._record: deque[tuple[int, FloatArray, FloatArray]] = deque()
         self._window_ns = nanoseconds(settings.window)
+        self._planned = deque(map(nanoseconds, settings.updates))
+        self._first_ns: int | None = None
+        self._prior, self._model = airframe, airframe  # of the next identification; what flies
+        self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
+        self._dead: dict[tuple[str, ...], str] = {}  # inputs without effect by the outputs of their part
+        self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
         self.identification: Identification | None = None  # the last one
-        self._has_model = False
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
         """Record y and u, after its limits, of a tick, (m,), in the law's order."""
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         if not self._record or stamp_ns > self._record[-1][0]:
             self._record.append((stamp_ns, y, u))
         while stamp_ns - self._record[0][0] >= self._window_ns:
             self._record.popleft()
 
-    def recording(self) -> Recording:
-        """The record in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""
-        stamp_ns = np.array([row[0] for row in self._record])
+    def recording(self, after_ns: int = -1) -> Recording:
+        """The record after an instant in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""
+        record = [row for row in self._record if row[0] > after_ns]
+        stamp_ns = np.array([row[0] for row in record])
         place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
         place, kept = np.unique(place, return_index=True)
-        y, u = (np.array([row[column] for row in self._record])[kept] for column in (1, 2))
+        y, u = (np.array([row[column] for row in record])[kept] for column in (1, 2))
         t = seconds(int(stamp_ns[0])) + self._period * np.arange(place[-1] + 1)
         whole = np.full((len(t), y.shape[1]), np.nan)
         whole[place] = y
@@ -69,51 +89,165 @@ class Learner:
         of_y, of_u = self._controller.outputs, self._controller.inputs
         y, u = (
             np.stack([values[:, own.index(name)] for name in names], axis=1)
-            for values, own, names in ((whole, of_y, self._airframe.outputs), (held, of_u, tuple(self._airframe.inputs)))
+            for values, own, names in ((whole, of_y, self._rough.outputs), (held, of_u, tuple(self._rough.inputs)))
         )
         return Recording(self._period, t, y, u)
 
     def propose(self) -> Proposal:
-        """Parameters with the observer and the feedforward of the identified model, or the sentence of a refusal.
+        """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
 
-        Before the first model, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
+        The last RECORD seconds are tested for a change of what flies. After one the older record is left out, and the model
+        that flew is the prior. A part with an input without effect flies the law of the start, without this input. Before the
+        first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
         """
         if len(self._record) < SHORTEST / self._period:
             return Proposal(None, f"record: found {len(self._record) * self._period:.3g} s, expected {SHORTEST:g} s")
+        end_ns = self._record[-1][0]
+        changes = self._changes(end_ns)
+        dead = {change.outputs: change.dead for change in changes if change.dead}
+        found = [change for change in changes if change.found]
+        due = self._is_due(end_ns)
+        if not (due or found or self._changed):
+            gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes) or "none tested"
+            return Proposal(None, f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}")
+        if found:
+            self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
+            self._prior = self._model
+            self._changed |= {change.outputs for change in found}
+        sentences = [
+            f"{name} has no effect: {' and '.join(part)} without it, by the law of the start" for part, name in dead.items()
+        ]
+        sentences += [
+            f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}" for change in found if not change.dead
+        ]
+        gone = self._dead | dead
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
-        found = self.identification = identify(self.recording(), self._airframe, self._actuation, channels, at_bound=AT_BOUND)
-        rough = not self._has_model and found.before.whiteness.max() <= MAX_WHITENESS and explains(found)
-        refusal = "" if rough else found.refusal or not_white(found)
-        if refusal:
-            return Proposal(None, refusal)
+        identified = self.identification = identify(self.recording(), self._prior, self._actuation, channels, at_bound=AT_BOUND)
+        known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
+        refusals = []
+        for part in identified.parts:
+            if part.outputs in gone:
+                continue
+            rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
+            if not rough and (refusal := part.refusal or not_white(part)):
+                refusals.append(refusal)
+                continue
+            entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
+            model = with_entries(model, relative(entries, self._prior, model))
+            known[part.outputs] = Known(end_ns, {entry.name: entry.deviation / (1.0 + entry.error) for entry in entries})
+            sentences.append(
+                f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
+            )
+        if not sentences:
+            return Proposal(None, "; ".join(refusals))
         try:
-            model = self._airframe if rough else found.airframe
-            designed = self._design(self._controller.model_copy(update={"learn": None}), model)
-            values = designed.model_dump() | {"learn": self._controller.model_dump()["learn"]}
-            proposed = RiseDiConfig.validate_mapping(values, "proposal")
+            proposed = self._designed(model, known, gone)
         except ParameterError as error:
             return Proposal(None, str(error))
-        self._has_model = True
-        return Proposal(proposed, f"the airframe {self._airframe.name} as it is" if rough else sentence(found))
+        learned = {part for part, value in known.items() if value.end_ns == end_ns}
+        self._known, self._model, self._dead, self._changed = known, model, gone, self._changed - learned - gone.keys()
+        return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
+
+    def _is_due(self, end_ns: int) -> bool:
+        """Whether an identification is planned by now: at `learn.updates`, then once a window."""
+        assert self._first_ns is not None  # noqa: S101 - there is a record
+        due = False
+        while end_ns - self._first_ns > self._planned[0] - nanoseconds(self._period):
+            due, last = True, self._planned.popleft()
+            if not self._planned:
+                self._planned.append(last + self._window_ns)
+        return due
+
+    def _changes(self, end_ns: int) -> list[Change]:
+        """Tests of the parts whose window ended RECORD ago or earlier."""
+        tested = {part: known for part, known in self._known.items() if part not in self._changed}
+        old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
+        if not old:
+            return []
+        deviation = {name: value for known in old.values() for name, value in known.deviation.items()}
+        recent = self.recording(end_ns - nanoseconds(RECORD))
+        return [change for change in change_test(recent, self._model, self._actuation, deviation) if change.outputs in old]
+
+    def _designed(
+        self, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+    ) -> RiseDiConfig:
+        """The controller of a model, with the law of the start in the parts without one. Raises ParameterError."""
+        start = self._controller
+        learned = {output for part in known for output in part}
+        bare = [output not in learned for output in start.outputs]
+        designed = start.model_copy(update={"learn": None})
+        if learned:
+            designed = self._design(designed, model)
+        proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
+        return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": start.model_dump()["learn"]}, "proposal")
 
 
-def explains(found: Identification) -> bool:
+def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]) -> RiseDiConfig:
+    """A controller with the gains of `start` in some channels, without feedforward and observer there; not checked.
+
+    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
+    input scale, so that the law holds it.
+    """
+    law, own = start.law_params(), designed.law_params()
+    last, channels = own.K[-1], np.array(bare)
+    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
+    K[-1] = last
+    share = np.where(channels, law.K / K, 1.0)
+    scale = np.where(channels, law.input_scale * share, own.input_scale)
+    of_start, of_designed = (
+        (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
+        for part in (start, designed)
+    )
+    beta, Lambda, omega, softening = (
+        np.where(channels, kept * factor, taken)
+        for kept, taken, factor in zip(of_start, of_designed, (1.0 / share, 1.0, share, 1.0), strict=True)
+    )
+    changed: dict[str, Any] = {
+        "k_d": tuple((K[:-1] - last).tolist()),
+        "Lambda": tuple(Lambda.tolist()),
+        "beta": tuple(beta.tolist()),
+        "omega": tuple(omega.tolist()),
+        "softening": tuple(softening.tolist()),
+        "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
+    }
+    observer, feedforward = designed.observer, designed.feedforward
+    if channels.any() and observer is not None and feedforward is not None:
+        F = np.reshape(observer.F, (len(bare), -1)) * ~channels[:, None]
+        flown = tuple(name for name, without in zip(start.inputs, bare, strict=True) if not without)
+        changed["observer"] = observer.model_copy(update={"F": tuple(F.ravel().tolist())})
+        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
+    return designed.model_copy(update=changed)
+
+
+def relative(entries: Iterable[Entry], prior: Airframe, model: Airframe) -> list[Entry]:
+    """Entries whose errors count from the matrices of a model in place of those of the prior."""
+    matrices = {"A": (prior.matrix_a(), model.matrix_a()), "B": (prior.matrix_b(), model.matrix_b())}
+    moved = []
+    for entry in entries:
+        before, now = matrices[entry.matrix]
+        columns = list(model.states if entry.matrix == "A" else model.inputs)
+        place = model.index(entry.row), columns.index(entry.column)
+        moved.append(entry._replace(error=(1.0 + entry.error) * before[place] / now[place] - 1.0))
+    return moved
+
+
+def explains(found: Part) -> bool:
     """Whether the nominal airframe predicts the held-out samples as well as the identified model."""
     return bool(found.after.log_likelihood <= found.before.log_likelihood)
 
 
-def not_white(found: Identification) -> str:
+def not_white(found: Part) -> str:
     """The output with the least white innovations, if above MAX_WHITENESS."""
     worst = int(np.argmax(found.after.whiteness))
     white = float(found.after.whiteness[worst])
     if white <= MAX_WHITENESS:
         return ""
-    name = found.airframe.outputs[worst]
+    name = found.outputs[worst]
     return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
 
 
-def sentence(found: Identification) -> str:
+def sentence(found: Part) -> str:
     """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with deviations."""
-    effects = (entry for entry in found.entries if entry.matrix == "B" and entry.row in found.airframe.outputs)
+    effects = (entry for entry in found.entries if entry.matrix == "B" and entry.row in found.outputs)
     known = (entry for entry in effects if entry.deviation < PRIOR / 2.0)
     return ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)

@@ -101,15 +101,21 @@ class Search:
     """The data of one block, and the functions of theta over them."""
 
     def __init__(self, recorded: Recording, model: NominalModel, block: Block, airframe: Airframe) -> None:
+        """The prior of each relative error is PRIOR; `believe` replaces it."""
         self._model, self._block, self._airframe = block.of(model), block, airframe
         named = (tuple(airframe.states), tuple(airframe.inputs), airframe.outputs, tuple(airframe.gusts))
-        self._names = Names(*(tuple(names[k] for k in part) for names, part in zip(named, block, strict=True)))
+        self.names = Names(*(tuple(names[k] for k in part) for names, part in zip(named, block, strict=True)))
         self._y, self._u = recorded.y[:, block.outputs], recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         entries = sum(int(mask.sum()) for mask in uncertain(self._model))
-        self.prior = np.concatenate([np.full(entries, PRIOR), np.full(len(block.winds), WIND_PRIOR)])
+        self.believe(np.full(entries, PRIOR))
+
+    def believe(self, deviation: FloatArray) -> None:
+        """Take these standard deviations of the relative errors before the flight, (p - G,)."""
+        self.prior = np.concatenate([deviation, np.full(len(self._block.winds), WIND_PRIOR)])
         self.bound = MAX_ERROR / PRIOR * self.prior
+        self._errors = np.arange(len(self.prior)) < len(deviation)
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that acts by the model's own A."""
@@ -128,7 +134,7 @@ class Search:
     def bank(self, thetas: FloatArray) -> FilterBank:
         """The filters of relative errors (N, p)."""
         strength = np.exp(thetas[:, len(self.prior) - len(self._block.winds) :])
-        return filter_bank(self.with_errors(thetas), self._names, self._airframe.speed, strength)
+        return filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength)
 
     def levels(self, bank: FilterBank) -> NDArray[np.int64]:
         """The level of the wind in each span for the first model of a bank, shape (spans,).
@@ -180,7 +186,7 @@ class Search:
         hardly a second minimum. Then the levels follow theta, and their strengths are part of it. At last the spans of gusts do
         not count: a gust is no noise. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
-        size, errors = len(self.prior), self.prior == PRIOR
+        size, errors = len(self.prior), self._errors
         theta, levels, follows, gusts = np.zeros(size), np.full(len(self._spans), STRONG), False, False
         for iteration in range(MAX_ITERATIONS + 1):
             progress()
@@ -209,9 +215,9 @@ class Search:
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
         places = []
-        for matrix, mask, columns in zip("AB", uncertain(self._model), (self._names.states, self._names.inputs), strict=True):
+        for matrix, mask, columns in zip("AB", uncertain(self._model), (self.names.states, self.names.inputs), strict=True):
             values = self._model.A if matrix == "A" else self._model.B
-            places += [(matrix, self._names.states[i], columns[j], float(values[i, j])) for i, j in np.argwhere(mask)]
+            places += [(matrix, self.names.states[i], columns[j], float(values[i, j])) for i, j in np.argwhere(mask)]
         found = zip(places, fit.theta.tolist(), fit.deviation.tolist(), strict=False)  # the winds follow the entries
         return [Entry(*place, error, deviation) for place, error, deviation in found]
 
@@ -262,17 +268,37 @@ class Prediction(NamedTuple):
     log_likelihood: float  # mean of a sample, up to a constant
 
 
+class Part(NamedTuple):
+    """The model of a part of the aircraft that does not couple with the rest."""
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    before: Prediction  # of the nominal model
+    after: Prediction
+    refusal: str  # why this part must not be used, one sentence; empty if it may
+
+
 class Identification(NamedTuple):
     """The identified model of one flight."""
 
     airframe: Airframe
-    entries: tuple[Entry, ...]
     recorded: Recording
     held_out: NDArray[np.bool_]  # (T,)
     innovations: tuple[FloatArray, FloatArray]  # (T, m) each, of the nominal model and of this one, units of y
     before: Prediction
     after: Prediction
-    refusal: str  # why this model must not be used, one sentence; empty if it may
+    parts: tuple[Part, ...]
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Those of all parts."""
+        return tuple(entry for part in self.parts for entry in part.entries)
+
+    @property
+    def refusal(self) -> str:
+        """Why this model must not be used, a sentence a part; empty if it may."""
+        return "; ".join(part.refusal for part in self.parts if part.refusal)
 
 
 def identify(
@@ -286,32 +312,34 @@ def identify(
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `at_bound` how many entries may lie at their bound; `progress` is called with the steps `completed` of the
-    search, and their largest number `total`.
+    airframe's order; `at_bound` how many entries of a part may lie at their bound; `progress` is called with the steps
+    `completed` of the search, and their largest number `total`.
     """
     recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     held_out = known & (np.arange(len(recorded.t)) // span_length(recorded) % HELD_OUT == HELD_OUT - 1)
-    parts, done = blocks(model), count(1)
-    entries, before, after = [], [], []
-    for block in parts:
+    every, done = blocks(model), count(1)
+    paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
+    parts, before, after = [], [], []
+    for block in every:
         search = Search(recorded, model, block, airframe)
-        fit = search.fit(known & ~held_out, lambda: progress(completed=next(done), total=len(parts) * (MAX_ITERATIONS + 1)))
-        entries += search.entries(fit)
+        fit = search.fit(known & ~held_out, lambda: progress(completed=next(done), total=len(every) * (MAX_ITERATIONS + 1)))
+        outputs, entries = search.names.outputs, search.entries(fit)
+        predictions = prediction(fit.before, held_out), prediction(fit.after, held_out)
+        sentences = (
+            another_airframe(entries, airframe.name, at_bound),
+            too_little_excitation(entries, outputs),
+            other_signs(airframe, with_entries(airframe, entries), paired),
+            no_better(*predictions),
+        )
+        parts.append(Part(search.names.inputs, outputs, tuple(entries), *predictions, next(filter(None, sentences), "")))
         before.append(fit.before)
         after.append(fit.after)
-    first, last = joined(before, parts), joined(after, parts)
-    predictions = prediction(first, held_out), prediction(last, held_out)
-    identified = with_entries(airframe, entries)
-    sentences = (
-        another_airframe(entries, airframe.name, at_bound),
-        too_little_excitation(entries, airframe.outputs),
-        other_signs(airframe, identified, channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))),
-        no_better(*predictions),
-    )
-    refusal = next(filter(None, sentences), "")
-    return Identification(identified, tuple(entries), recorded, held_out, (first.r, last.r), *predictions, refusal)
+    first, last = joined(before, every), joined(after, every)
+    identified = with_entries(airframe, (entry for part in parts for entry in part.entries))
+    figures = prediction(first, held_out), prediction(last, held_out)
+    return Identification(identified, recorded, held_out, (first.r, last.r), *figures, tuple(parts))
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
