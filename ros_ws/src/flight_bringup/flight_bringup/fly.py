@@ -193,6 +193,7 @@ def _follow_real_time(
     text, phase, why, announced = "starting", "", "", ""
     engaged_at = math.inf
     while True:
+        _announce_learned(processes, monitor, processes.start_time, announce)
         t = time.monotonic() - processes.started
         if outcome := span.outcome(t):
             return outcome
@@ -200,7 +201,6 @@ def _follow_real_time(
             return reason
         if reason := span.failed(t):
             return reason
-        _announce_learned(processes, monitor, processes.start_time, announce)
         for phase, why in monitor.engagement():
             line = f"{phase}{f': {why}' if why else ''}"
             if (kind := NUMBER.sub("", line)) != announced:
@@ -260,6 +260,7 @@ def _follow_lockstep(
         _announce_learned(processes, monitor, 0.0, announce)
         progress(t, text)
         yield
+    _announce_learned(processes, monitor, 0.0, announce)
     return COMPLETED
 
 
