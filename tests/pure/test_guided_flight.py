@@ -479,6 +479,27 @@ def test_replay_names_first_different_step() -> None:
     assert (changed.first.number, changed.first.channel, changed.first.ulps) == (101, "published.p", 1)
 
 
+def without(tape: Tape, name: str) -> Tape:
+    """A tape whose `guidance` lacks a channel."""
+    log = tape["guidance"]
+    kept = [k for k, channel in enumerate(log.names) if channel != name]
+    shorter = Signal(log.stamp_ns, tuple(log.names[k] for k in kept), log.values[:, kept])
+    return Tape({**tape.signals, "guidance": shorter})
+
+
+def test_replay_checks_log_of_earlier_version() -> None:
+    scenario = calm(1.0, program=program(heading=0.5))
+    tape = simulate(scenario)
+    earlier = without(tape, "age.link")
+    result = replay_guidance(earlier, scenario.guidance)
+    assert (result.checked, result.differing) == (51, 0)
+    earlier["guidance"].values[30, -1] += 1.0
+    changed = replay_guidance(earlier, scenario.guidance).first
+    assert changed is not None
+    assert (changed.number, changed.channel) == (31, "u_m.r")
+    assert replay_guidance(without(tape, "joining"), scenario.guidance).checked == 0  # a step takes it
+
+
 def test_replay_leaves_route_that_arrived_in_flight_unchecked() -> None:
     scenario = calm(2.0, route={"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]})
     section = calm(2.0).guidance

@@ -36,6 +36,8 @@ LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
+ADDED = (LINK_AGE,)
+"""Channels of the log that logs of earlier versions lack, and that no step takes."""
 
 
 class GuidanceOutput(NamedTuple):

@@ -50,18 +50,19 @@ def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
 def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceReplay:
     """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
-    Steps on a route outside the log are not checked, nor steps with the channels of a different version. Raises ParameterError
-    for a log without the scenario's section of guidance.
+    Steps on a route outside the log are not checked, nor steps with the channels of a different version; a log may lack
+    `guidance.ADDED`. Raises ParameterError for a log without the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
     signal, t, outputs = tape["guidance"], tape.time("guidance"), parameters.outputs
-    names = guidance.names(outputs)
-    if signal.names != names:
+    names = signal.names
+    if tuple(name for name in guidance.names(outputs) if name in names or name not in guidance.ADDED) != names:
         why = "a different version recorded their channels"
         return GuidanceReplay(len(t), 0, 0, None, (f"{len(t)} steps of guidance not checked: {why}",))
     legs = {guidance.digest(None): None} | known_routes(tape, parameters)
     published = {} if "u_m" not in tape else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
+    recorded_of = [name in names for name in guidance.names(outputs)]
     params, checked, differing = parameters.params(), 0, 0
     first: Difference | None = None
     previous: GuidanceState | None = None
@@ -70,10 +71,11 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
         flown = int(row[names.index("route")])
         if flown in legs and (previous is not None or inputs.begin is Begin.HOLD):
             checked += 1
+            link_age = row[names.index(LINK_AGE)] if LINK_AGE in names else 0.0
             state, commands = modes.step(previous, inputs, legs[flown], params)
             both = (
                 np.append(row, published.get(stamp_ns, guidance.u_m(recorded))),
-                np.append(guidance.row(inputs, state, commands, flown, row[names.index(LINK_AGE)]), guidance.u_m(state)),
+                np.append(guidance.row(inputs, state, commands, flown, link_age)[recorded_of], guidance.u_m(state)),
             )
             columns = np.flatnonzero(both[0].view(np.int64) != both[1].view(np.int64))
             if len(columns):
