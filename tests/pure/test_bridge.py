@@ -6,11 +6,14 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from textwrap import dedent
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
+import yaml
+from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
@@ -595,6 +598,27 @@ def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float,
     assert bridge.step(at(0.03)) is Phase.RELEASE
     lower, upper = ENVELOPE[name]
     assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
+
+
+def test_listening_link_of_docs_adds_sensor_and_receiver_to_the_map_over_dds() -> None:
+    page = (REPOSITORY / "docs" / "autopilots-reference.md").read_text(encoding="utf-8")
+    block = page[page.index("    link: {") : page.index("The condition `receiver`")]
+    content = named_map("ardupilot").model_dump()
+    for section, rows in yaml.safe_load(dedent(block)).items():
+        content[section] = (content[section] or {}) | rows
+    content["envelope"] = {name: limits for name, limits in content["envelope"].items() if name == "airspeed"}
+    bridge = Bridge(ChannelMap.validate_mapping({**content, "engage_if": {}, "trims": {}}, "map"), dry_run=False)
+    receive_outputs(bridge, 0.0)
+    receive_u(bridge, 0.0)
+    for name, raw in {"manual": 0.0, "armed": 1.0, "flying": 1.0, "receiver": 0.0}.items():
+        bridge.take_condition(name, raw, at(0.0))
+    bridge.take_output("airspeed", 25.0, at(0.0), at(0.0))
+    assert bridge.engage(at(0.0)) == "the transmitter is lost (rssi is 0)"
+    bridge.take_condition("receiver", 90.0, at(0.0))
+    assert bridge.engage(at(0.0)) == ""
+    bridge.take_output("airspeed", 15.0, at(0.05), at(0.05))  # a gust that the estimator's V does not have
+    bridge.step(at(0.05))
+    assert bridge.reason == "airspeed is 15, outside the envelope [16, 40]"
 
 
 def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:

@@ -2,9 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The MAVLink link over UDP, against a peer that is made with pymavlink alone."""
 
+import hashlib
 import socket
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -27,10 +29,12 @@ PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
 class Peer:
     """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
 
-    def __init__(self, port: int, system: int = 1) -> None:
+    def __init__(self, port: int, system: int = 1, phrase: str = "") -> None:
         self.connection: Any = mavutil.mavlink_connection(
             f"udpout:127.0.0.1:{port}", source_system=system, source_component=1, dialect="ardupilotmega"
         )
+        if phrase:
+            self.connection.setup_signing(hashlib.sha256(phrase.encode()).digest())
         self.requested: dict[int, float] = {}  # Hz by message
 
     def beat(self) -> None:
@@ -60,15 +64,15 @@ def ends() -> Iterator[Ends]:
     links: list[Link] = []
     peers: list[Peer] = []
 
-    def make(**rates: float) -> tuple[Link, int]:
+    def make(passphrase_file: str | None = None, **rates: float) -> tuple[Link, int]:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        links.append(Link(LinkConfig(url=f"udpin:127.0.0.1:{port}", rates=rates)))
+        links.append(Link(LinkConfig(url=f"udpin:127.0.0.1:{port}", rates=rates, passphrase_file=passphrase_file)))
         return links[-1], port
 
-    def peer(port: int, system: int = 1) -> Peer:
-        peers.append(Peer(port, system))
+    def peer(port: int, system: int = 1, phrase: str = "") -> Peer:
+        peers.append(Peer(port, system, phrase))
         return peers[-1]
 
     yield Ends(make, peer)
@@ -146,6 +150,40 @@ def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> 
     until(lambda: made.conflict, other.beat)
     assert "another sender" in made.conflict
     assert "system 255 too" in made.conflict
+
+
+def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    station = ends.peer(port, system=254)
+    until(lambda: made.stations, lambda: station.connection.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4))
+    assert made.stations == {254}
+    assert made.conflict == ""
+
+
+def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(ends: Ends, tmp_path: Path) -> None:
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    other = ends.peer(port, phrase="another")
+    until(lambda: made._refused, other.beat)
+    assert not queue
+    peer = ends.peer(port, phrase="a phrase")
+    until(lambda: queue, peer.beat)
+    taken: list[Any] = []  # the autopilot refuses what has no valid signature
+
+    def take() -> None:
+        peer.beat()
+        taken.extend(message for message in [peer.answer()] if message is not None)
+
+    until(lambda: taken, take)
+    assert taken[0].get_signed()
+
+    unsigned, port = ends.link()
+    unsigned.start()
+    until(lambda: unsigned.conflict, ends.peer(port, phrase="a phrase").beat)
+    assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
 
 
 def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,7 +61,7 @@ class Bridge:
         self.reason = "not engaged yet"  # why the bridge is not engaged, what an engagement waits for, or lacks
         self.conflict = ""  # the topics of the autopilot that have another publisher, as a sentence; set by the node
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
-        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.outputs, **sources}
+        self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.sensors, **channel_map.outputs, **sources}
         self._readings: dict[str, Reading] = {}
         self._zero: dict[str, float] = {}  # captured outputs: their value at engagement
         self._trim: dict[str, float] = {}  # captured inputs: their trim at engagement
@@ -176,8 +176,7 @@ class Bridge:
         reading = self._conditions.get(name)
         if stale := _staleness(row.topic, reading, row.max_age, now_ns):
             return _sentence({f"{name}: {row.field}": stale})
-        holds = reading is not None and row.masked(reading.value) in row.one_of
-        return "" if holds or reading is None else f"{row.sentence} ({row.field} is {reading.value:g})"
+        return "" if reading is None or row.holds(reading.value) else f"{row.sentence} ({row.field} is {reading.value:g})"
 
     def _is_active(self, name: str, now_ns: int) -> bool:
         """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""

@@ -6,20 +6,24 @@ A thread receives, sends a heartbeat each second and requests the rates of messa
 SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as pymavlink has them.
 """
 
+import hashlib
 import time
 from collections import deque
+from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from autopilot_bridge.params import MAVLINK, LinkConfig
+from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # MAV_CMD, MAV_RESULT
+SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
 GCS, INVALID = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 BEAT = 1.0  # s; ArduPilot's FS_GCS_ENABL waits 5 s for the next one
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
@@ -59,7 +63,11 @@ def _zero(kind: str) -> Any:
 
 
 class Link:
-    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none."""
+    """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none.
+
+    With a passphrase each message is signed, and messages without a valid signature are refused. Source: MAVLink guide, message
+    signing; the key of a passphrase is that of MAVProxy and Mission Planner.
+    """
 
     def __init__(self, config: LinkConfig) -> None:
         require_package("pymavlink")
@@ -81,7 +89,12 @@ class Link:
             raise ParameterError(
                 f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
             ) from None
+        if config.passphrase_file is not None:
+            passphrase = read_file(Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase").strip()
+            self._connection.setup_signing(hashlib.sha256(passphrase).digest())
         self.conflict = ""
+        self.stations: set[int] = set()  # systems of ground stations beside this bridge
+        self._refused = ""  # why the last message was refused, for its signature
         self._queues: dict[str, deque[ReceivedMessage]] = {}
         self._heard: dict[str, deque[float]] = {}  # instants of messages by name, of the last MEASURED seconds
         self._to_request = dict(config.rates)
@@ -117,7 +130,8 @@ class Link:
         """What is wrong with the link, or with a message of it."""
         now = time.monotonic()
         if now - max(self._alive, self._began) > SILENCE:
-            return f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
+            silence = f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
+            return "; ".join(filter(None, (silence, self._refused)))
         denied = [sentence for at, sentence in self._denied.items() if at == name or not name]
         return "; ".join([*denied, *self._slow(now, name)])
 
@@ -161,8 +175,14 @@ class Link:
                 f"another sender on {self._config.url} has system {self._config.source_system} too, and the autopilot takes its"
                 " RC overrides: give it another number"
             )
+        elif name == "HEARTBEAT" and message.type == GCS:
+            self.stations.add(message.get_srcSystem())
+        if name == "BAD_DATA" and "signature" in str(message.reason):
+            self._refused = "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
         if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
             return
+        if message.get_header().incompat_flags & SIGNED and self._config.passphrase_file is None:
+            self.conflict = "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
         if now - self._alive > SILENCE:
             self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
         self._alive = now

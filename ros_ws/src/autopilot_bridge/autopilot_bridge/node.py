@@ -71,6 +71,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         named: list[NamedRow] = [
             *self._map.outputs.items(),
             *self._map.pose.items(),
+            *self._map.sensors.items(),
             *((trim_key(name), row) for name, row in self._map.trims.items()),
             *self._map.conditions.items(),
             *self._map.overrides.items(),
@@ -79,6 +80,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
         self._link = None if self._map.link is None else mavlink_link.Link(self._map.link)
+        self._known_stations: set[int] = set()  # systems of ground stations that were told
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}  # what comes over MAVLink, as named vectors
         self._readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
@@ -309,8 +311,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
             is_stale = any(name in stale for name, row in rows if isinstance(row, MeasuredRow))
             if is_stale and isinstance(subscription, PolledSubscription):
                 self.warn_no_publisher(subscription)
-        if self._link is not None and (problem := self._link.problem()):
-            self.get_logger().warning(f"link: {problem}", throttle_duration_sec=10.0)
+        if self._link is not None:
+            if problem := self._link.problem():
+                self.get_logger().warning(f"link: {problem}", throttle_duration_sec=10.0)
+            for station in sorted(self._link.stations - self._known_stations):
+                self._known_stations.add(station)
+                self.get_logger().info(
+                    f"link: a ground station beside the bridge, system {station}: it may change mode and rates"
+                )
         if self._bridge.u_timed_out(now_ns):
             self.warn_no_publisher(self._u.subscription)
 

@@ -160,7 +160,8 @@ class WatchedRow(Config):
 class ConditionRow(WatchedRow):
     """A condition of the engagement: the field has one of some values. The bridge disengages where it has not."""
 
-    one_of: Numbers = Field(description="the values with which the condition holds; false is 0 and true is 1")
+    one_of: Numbers = Field(default=(), description="the values with which the condition holds; false is 0 and true is 1")
+    within: Limits | None = Field(default=None, description="in place of `one_of`: the limits within which it holds")
     sentence: str = Field(min_length=1, description="what is wrong where the condition does not hold")
     max_age: Positive = Field(description="the age above which the field is stale, s")
     awaited: bool = Field(
@@ -170,6 +171,11 @@ class ConditionRow(WatchedRow):
         default=False,
         description="whether the field tells the loss of the pilot's transmitter: an engagement with `--blind` ignores the row",
     )
+
+    def holds(self, raw: float) -> bool:
+        """Whether the condition holds."""
+        value = self.masked(raw)
+        return value in self.one_of if self.within is None else self.within[0] <= value <= self.within[1]
 
 
 class OverrideRow(WatchedRow):
@@ -211,6 +217,10 @@ class LinkConfig(Config):
     source_system: SystemId = Field(
         default=255, description="the system of the bridge: ArduPilot takes RC overrides of MAV_GCS_SYSID alone, 255 by default"
     )
+    passphrase_file: str | None = Field(
+        default=None,
+        description="a file with the passphrase of an autopilot that signs; its key is the SHA-256 of the passphrase",
+    )
     rates: dict[str, Rate] = Field(default={}, description="requested rates by message, Hz")
 
 
@@ -245,11 +255,14 @@ class ChannelMap(Config):
     pose: dict[str, PoseRow] = Field(
         default={}, description="the channels of the pose; the newest stamp of the first row is the stamp of the pose"
     )
+    sensors: dict[str, PoseRow] = Field(
+        default={}, description="further measured channels, absolute values, for `envelope` and `engage_if` alone"
+    )
     envelope: dict[str, Limits] = Field(
-        default={}, description="limits of channels of the pose or of y: the bridge disengages beyond them"
+        default={}, description="limits of channels of the pose, of y or of the sensors: the bridge disengages beyond them"
     )
     engage_if: dict[str, Limits] = Field(
-        default={}, description="limits of channels of the pose or of y at an engagement alone: outside it is refused"
+        default={}, description="limits of the same channels at an engagement alone: outside it is refused"
     )
     inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
     trims: dict[str, MeasuredRow] = Field(
@@ -288,11 +301,28 @@ class ChannelMap(Config):
             require(name in POSE, f"pose.{name}", "a channel", f"one of {', '.join(POSE)}")
         for name in self.outputs:
             require(name not in self.pose, f"outputs.{name}", "a channel of the pose too", "a name of its own")
-        watched = [*self.pose, *self.outputs]
+        for name in self.sensors:
+            require(
+                name not in {**self.pose, **self.outputs},
+                f"sensors.{name}",
+                "a channel of y or of the pose too",
+                "a name of its own",
+            )
+        watched = [*self.pose, *self.outputs, *self.sensors]
         for section, limits in (("envelope", self.envelope), ("engage_if", self.engage_if)):
             for name, (lower, upper) in limits.items():
-                require(name in watched, f"{section}.{name}", "a channel", f"one of the pose or of y: {', '.join(watched)}")
+                require(
+                    name in watched,
+                    f"{section}.{name}",
+                    "a channel",
+                    f"one of the pose, of y or of the sensors: {', '.join(watched)}",
+                )
                 require(lower < upper, f"{section}.{name}", [lower, upper], "the lower end before the upper one")
+        for name, condition in self.conditions.items():
+            found = "both" if condition.one_of else "neither"
+            require(
+                bool(condition.one_of) is (condition.within is None), f"conditions.{name}", found, "one of one_of and within"
+            )
         for name, override in self.overrides.items():
             thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
             found = " and ".join(thresholds) or "no threshold"
@@ -337,7 +367,7 @@ class ChannelMap(Config):
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
         """The sections whose rows read a field of a topic."""
-        kinds = ("outputs", "pose", "trims", "conditions", "overrides")
+        kinds = ("outputs", "pose", "sensors", "trims", "conditions", "overrides")
         return {kind: getattr(self, kind) for kind in kinds}
 
     def used_topics(self) -> list[tuple[str, str, str]]:
