@@ -139,8 +139,10 @@ def test_lost_ticks_are_unknown_in_record() -> None:
 
 def test_short_record_is_refused() -> None:
     made = made_learner(scenario())
-    made.take(0, np.zeros(4), np.zeros(4))
-    assert made.propose() == Proposal(None, "record: found 0.01 s, expected 10 s")
+    assert made.propose() == Proposal(None, "record: found 0 s, expected 10 s")
+    for t in (0, 5):  # the ticks between them are lost
+        made.take(t * NANOSECONDS, np.zeros(4), np.zeros(4))
+    assert made.propose() == Proposal(None, "record: found 5.01 s, expected 10 s")
 
 
 def test_flight_without_learner_is_refused() -> None:

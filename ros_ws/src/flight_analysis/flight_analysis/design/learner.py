@@ -100,9 +100,10 @@ class Learner:
         that flew is the prior. A part with an input without effect flies the law of the start, without this input. Before the
         first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
         """
-        if len(self._record) < SHORTEST / self._period:
-            return Proposal(None, f"record: found {len(self._record) * self._period:.3g} s, expected {SHORTEST:g} s")
-        end_ns = self._record[-1][0]
+        end_ns = self._record[-1][0] if self._record else 0
+        length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
+        if length < SHORTEST - self._period:
+            return Proposal(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
         found = [change for change in changes if change.found]
