@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 from tests.conftest import REPOSITORY
+from tests.maps import named_map
 
+from aircraft_sim.airframe import load_airframe
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.margins import margins
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.sign_check import check_scenario
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -206,6 +209,18 @@ def test_the_margins_are_those_of_the_aircraft_behind_the_allocation() -> None:
 def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         find_scenario("osprey_servo").vary(controller=mixed(**changes))
+
+
+def test_a_map_with_a_wrong_sign_contradicts_the_effect_of_an_effector() -> None:
+    """The D of the law is I for any sign of an effector, so `effect` tells the sign."""
+    channel_map, frame = named_map("ardupilot"), load_airframe("osprey")
+    assert not check_scenario(channel_map, find_scenario("osprey_servo").vary(controller=mixed()), frame, None).contradictions
+    flip = np.diag([1.0, 1.0, -1.0, 1.0])
+    effect = (np.reshape(full_mixing()["effect"], (4, 4)) @ flip).ravel().tolist()
+    T = (flip @ np.reshape(full_mixing()["T"], (4, 4))).ravel().tolist()
+    scenario = find_scenario("osprey_servo").vary(controller=mixed(effect=effect, T=T))
+    (sentence,) = check_scenario(channel_map, scenario, frame, None).contradictions
+    assert "aileron has +85.9 on p_dot, allocation.effect has -85.9: a positive aileron means roll right" in sentence
 
 
 def test_the_c_code_refuses_an_allocation() -> None:

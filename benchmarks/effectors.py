@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Each effector of the scenarios with an allocation fails once at a random time, under RISE-DI, PI and the observer.
+
+python -m benchmarks.effectors --seeds 3
+"""
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from benchmarks.sampling import new_table, wide_console
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import best_error
+from flight_bringup.scenarios import find_scenario
+from flight_campaign.statistics import score, score_units
+from flight_core.outcome import COMPLETED
+from rise_di.gain_design import select_gains
+from rise_di_controller.params import ControllerConfig
+
+SCENARIOS = ("osprey_twin", "osprey_vtail", "x8_elevons")
+FAULTS = {"lost": "lost_at", "stuck": "stuck_at", "half": "weak_at", "slow": "slow_at", "loose": "loose_at"}
+DURATION, RATE, FROM, TO = 22.0, 200.0, 3.0, 10.0  # s, Hz, s: a flight, of y, first and last begin of a fault
+SCORE_LOST = 10.0  # a higher score is a loss of track
+
+
+class Flight(NamedTuple):
+    """A flight with a fault."""
+
+    score: float  # from the begin of the fault on; infinite for an early end
+    beyond: float  # largest excess of u over its stops, SI
+    held: float  # part of the time in which an effector is at its stop
+
+
+def laws(scenario: Scenario, *, with_observer: bool) -> dict[str, ControllerConfig]:
+    """RISE-DI of the scenario, the PI of the same linear gains, and RISE-DI beside an observer of the airframe, if wanted."""
+    own = scenario.rise_di()
+    params = own.law_params()
+    common = {key: getattr(own, key) for key in ControllerConfig.model_fields}
+    integral = params.Lambda + params.beta / (params.eps * params.K)
+    pi = {**common, "law": "pi", "K": params.K.tolist(), "Lambda": integral.tolist(), "allocation": own.allocation}
+    values = {key: value.model_dump() if hasattr(value, "model_dump") else value for key, value in pi.items()}
+    found = {"RISE-DI": own, "PI": scenario.vary(controller=values).controller}
+    if with_observer:
+        found["observer"] = select_gains(scenario.aircraft.airframe, scenario, samples=10, observer=True).chosen
+    return found
+
+
+def with_fault(scenario: Scenario, kind: str, effector: str, seed: int) -> tuple[Scenario, float]:
+    """The scenario with noise and a fault of a seed, and the begin of the fault, s."""
+    names = list(scenario.aircraft.channels().inputs)
+    begin = float(np.random.default_rng((seed, names.index(effector))).uniform(FROM, TO))
+    times = [begin if name == effector else np.inf for name in names]
+    aircraft: Mapping[str, Any] = {
+        "actuators": scenario.aircraft.actuators.model_dump() | {FAULTS[kind]: times},
+        "sensors": scenario.aircraft.sensors.model_dump() | {"seed": seed},
+    }
+    return scenario.vary(aircraft=aircraft), begin
+
+
+def fly(scenario: Scenario, begin: float) -> Flight:
+    """Fly a scenario with a fault."""
+    tape = simulate(scenario)
+    _, error = best_error(tape)
+    after = (error.stamp_ns - tape.start_ns) / 1e9 >= begin
+    units = score_units(error.names, scenario.aircraft.channels().outputs)
+    rms = np.sqrt(np.mean(error.values[after] ** 2, axis=0))[:, None]
+    limits = scenario.controller.effector_limits()
+    excess = np.maximum(limits.lower - tape["u"].values, tape["u"].values - limits.upper).max()
+    held = ((tape["u"].values <= limits.lower) | (tape["u"].values >= limits.upper)).any(axis=1).mean()
+    return Flight(float(score(rms, units)[0]) if tape.outcome == COMPLETED else np.inf, float(excess), float(held))
+
+
+def shortened(name: str) -> Scenario:
+    """A scenario without its gusts, which come after DURATION or hide the fault."""
+    found = find_scenario(name).vary(flight={"duration": DURATION}, aircraft={"rate": RATE, "step": 1.0 / RATE, "gusts": {}})
+    return found.vary(reference_model={"rate": RATE})
+
+
+def main() -> None:
+    """Fly all faults and print a table a scenario."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--scenarios", default=",".join(SCENARIOS))
+    parser.add_argument("--without-observer", action="store_true")
+    parser.add_argument("--faults", default=",".join(FAULTS))
+    given = parser.parse_args()
+    console, beyond = wide_console(), 0.0
+    for name in given.scenarios.split(","):
+        scenario = shortened(name)
+        controllers = laws(scenario, with_observer=not given.without_observer)
+        effectors, kinds = list(scenario.controller.effectors), given.faults.split(",")
+        none = {law: fly(scenario.vary(controller=controller), FROM).score for law, controller in controllers.items()}
+        title = f"{name}: score after the fault, mean (worst), {given.seeds} seeds"
+        table = new_table(title, ("effector", "fault", *controllers), 2)
+        table.add_row("none", "", *(f"{value:.2f}" for value in none.values()))
+        for effector in effectors:
+            for kind in kinds:
+                cells = []
+                for controller in controllers.values():
+                    flown = [
+                        fly(*with_fault(replace(scenario, controller=controller), kind, effector, seed))
+                        for seed in range(1, given.seeds + 1)
+                    ]
+                    scores = np.array([flight.score for flight in flown])
+                    beyond = max(beyond, *(flight.beyond for flight in flown))
+                    lost = int((scores > SCORE_LOST).sum())
+                    cells.append(f"{scores.mean():.2f} ({scores.max():.2f})" + (f", {lost} lost" if lost else ""))
+                table.add_row(effector, kind, *cells)
+        console.print(table)
+    console.print(f"largest u beyond its end stop: {beyond:.3g}")
+
+
+if __name__ == "__main__":
+    main()
