@@ -116,6 +116,7 @@ class FleetResult(NamedTuple):
     slew: Array  # (m, N) mean abs(u_dot), units of u / s
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
     mission: dict[str, Array] | None = None  # of `missions.figures`; None without guidance
+    windows: Array | None = None  # (W, m, N) rms by window
 
 
 def assemble(
@@ -237,17 +238,36 @@ def fly(
     control_law: ControlLaw,
     params: Any,
     mission: Mission | None = None,
+    windows: tuple[int, ...] = (),
 ) -> FleetResult:
     """Fly N aircraft through the course under one law, from trim at rest; on a mission guidance commands the reference.
 
     At each tick: sensors, step of the law (or engagement, or a missed sample, by the course's phase), actuators over the K
     steps to the next tick, aircraft. The remainder s at the middle of a tick is extrapolated from this tick and the previous.
     Arguments: `params` of the law, (m, 1) or (m, N); of one aircraft, (m,), where all fly the same, as `shared` makes them.
+    `windows` has the ticks at which a window of the figures ends and the next begins.
     """
-    static = {"control_law": control_law, "blocks": fleet.blocks, "steps": course.steps, "y_late": course.late}
+    timing = Timing(fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), windows)
     arrays, segments = fleet._replace(blocks=()), jax.tree.map(jnp.asarray, course.segments)
-    u_late = int(np.max(np.asarray(fleet.late)))
-    return _fly(arrays, vehicle, segments, params, course.period, mission, u_late=u_late, **static)
+    return _fly(arrays, vehicle, segments, params, course.period, mission, control_law=control_law, timing=timing)
+
+
+class Timing(NamedTuple):
+    """Constants of the compiled loop. Hashable."""
+
+    blocks: tuple[StateBlock, ...]
+    steps: int  # of the integration in a tick
+    y_late: int  # ticks
+    u_late: int  # ticks, the largest
+    windows: tuple[int, ...]  # ticks at which a window of the figures ends and the next begins
+
+
+class Sample(NamedTuple):
+    """What a law takes at a tick, (m, N) or (m, 1)."""
+
+    y: Array
+    y_m: Array  # at the stamp of y
+    y_m_dot: Array
 
 
 class LoopState(NamedTuple):
@@ -260,14 +280,14 @@ class LoopState(NamedTuple):
     u: Array  # (m, N) law's order
     y_before: Array  # (y_late, m, N) newest first
     u_before: Array  # (u_late, m, N)
-    squares: Array  # (m, N) sums over the ticks
+    squares: Array  # (W, m, N) sums over the ticks of a window
     max: Array
     travel: Array  # sum of abs(u - previous u)
     bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
     mission: Any  # MissionState; None without guidance
 
 
-@partial(jax.jit, static_argnames=("control_law", "blocks", "steps", "y_late", "u_late"))
+@partial(jax.jit, static_argnames=("control_law", "timing"))
 def _fly(
     fleet: Fleet,
     vehicle: Vehicle,
@@ -277,14 +297,10 @@ def _fly(
     mission: Mission | None,
     *,
     control_law: ControlLaw,
-    blocks: tuple[StateBlock, ...],
-    steps: int,
-    y_late: int,
-    u_late: int,
+    timing: Timing,
 ) -> FleetResult:
-    places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
-
-    def measure(now: LoopState, y: Array, segment: Segments, y_m: Array, y_m_dot: Array) -> Measurements:
+    def measure(now: LoopState, segment: Segments, sample: Sample) -> Measurements:
+        y, y_m, y_m_dot = sample
         x = now.x.at[vehicle.outputs].set(y)
         matrices = _at(segment.t, fleet)
         acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
@@ -297,78 +313,166 @@ def _fly(
         started = control_law.engage(measure(now, *measured), params)
         return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
 
-    def step(now: LoopState, y: Array, segment: Segments, *reference: Array) -> tuple[Any, Array]:
-        law, _, u = control_law.limited(now.law, measure(now, y, segment, *reference), segment.dt, params, vehicle.limits)
+    def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array]:
+        law, _, u = control_law.limited(now.law, measure(now, segment, sample), segment.dt, params, vehicle.limits)
         return law, u
 
     def hold(now: LoopState, *measured: Any) -> tuple[Any, Array]:
         return control_law.missed(now.law, measure(now, *measured), params), now.u
 
-    def tick(now: LoopState, at_tick: tuple[Segments, Array | None]) -> tuple[LoopState, None]:
-        segment, action = at_tick
-        true, flown = now.x[vehicle.outputs], now.mission
-        if mission is None:
-            y_m, *reference = (values[:, None] for values in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
-        else:
-            flown, y_m, *reference = missions.reference(flown, mission)
-        e = true - y_m
-        y = true + segment.error[:, None]
-        if vehicle.quantum is not None:
-            y = sensors.quantised(y, vehicle.quantum)
-        arriving = jnp.concatenate([y[None], now.y_before])
-        y, y_before = arriving[-1], arriving[:-1]
-        if mission is not None:
-            flown = missions.guide(flown, now.x, y, segment, action, mission)
-        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, y, segment, *reference)
-        history = jnp.concatenate([u[None], now.u_before])
-        acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
-        command = acting[jnp.argsort(vehicle.inputs)]
+    def tick(now: LoopState, at_tick: tuple[Segments, Array | None, Array]) -> tuple[LoopState, None]:
+        segment, action, window = at_tick
+        sensed, sample = _sense(now, segment, action, window, vehicle, mission)
+        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, segment, sample)
+        return _advance(sensed._replace(law=law), u, segment, fleet, vehicle, mission, timing), None
 
-        def move(position: Array, t: Array) -> tuple[Array, Array]:
-            return actuators.move(t, position, command, vehicle.dt, vehicle.actuators)
-
-        # A loop of its own: without one the compiler computes all mean positions again for each state that they act on.
-        position, means = jax.lax.scan(move, now.position, segment.t + np.arange(steps) * vehicle.dt)
-        remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
-        moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
-        matrices = _at(segment.t, fleet)
-        parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(matrices.tick, blocks, strict=True)]
-        x = jnp.concatenate(parts)[places]
-        x = jax.lax.cond(
-            jnp.any(segment.forcing != 0.0),
-            lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing),
-            lambda x: x,
-            x,
-        )
-        if mission is not None:
-            flown = missions.advance(flown, x, mission)
-        after = LoopState(
-            x,
-            position,
-            remainder,
-            law,
-            u,
-            y_before,
-            history[:u_late],
-            now.squares + e * e,
-            jnp.maximum(now.max, jnp.abs(e)),
-            now.travel + jnp.abs(u - now.u),
-            now.bounded & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
-            flown,
-        )
-        return after, None
-
-    first, none = jax.tree.map(lambda segment: segment[0], segments), jnp.zeros((len(vehicle.outputs), len(fleet.wind)))
-    begin = _in_trim(fleet, vehicle, y_late, u_late, mission)
-    measured = measure(begin, none, first, none, none)
+    first = jax.tree.map(lambda segment: segment[0], segments)
+    begin = _in_trim(fleet, vehicle, mission, timing)
+    none = 0.0 * begin.u
+    measured = measure(begin, first, Sample(none, none, none))
     states = jax.eval_shape(
         lambda: control_law.limited(control_law.engage(measured, params), measured, first.dt, params, vehicle.limits)[0]
     )
     begin = begin._replace(law=jax.tree.map(lambda like: jnp.zeros(like.shape, like.dtype), states))
-    end, _ = jax.lax.scan(tick, begin, (segments, None if mission is None else mission.action))
-    of_mission = None if mission is None else missions.figures(end.mission, mission)
     ticks = len(segments.t)
-    return FleetResult(jnp.sqrt(end.squares / ticks), end.max, end.travel / ((ticks - 1) * period), ~end.bounded, of_mission)
+    window = window_of(np.arange(ticks), timing.windows)
+    end, _ = jax.lax.scan(tick, begin, (segments, None if mission is None else mission.action, window))
+    return _result(end, ticks, period, mission, timing)
+
+
+def window_of(ticks: Array, windows: tuple[int, ...]) -> Array:
+    """Number of the window of each tick, from 0."""
+    return np.searchsorted(np.array(windows, dtype=np.int64), ticks, side="right")
+
+
+def _sense(
+    now: LoopState, segment: Segments, action: Array | None, window: Array, vehicle: Vehicle, mission: Mission | None
+) -> tuple[LoopState, Sample]:
+    """The sample of a tick for the law; guidance steps, and the figures take the true error."""
+    true, flown = now.x[vehicle.outputs], now.mission
+    if mission is None:
+        y_m, *reference = (values[:, None] for values in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
+    else:
+        flown, y_m, *reference = missions.reference(flown, mission)
+    e = true - y_m
+    y = true + segment.error[:, None]
+    if vehicle.quantum is not None:
+        y = sensors.quantised(y, vehicle.quantum)
+    arriving = jnp.concatenate([y[None], now.y_before])
+    y, y_before = arriving[-1], arriving[:-1]
+    if mission is not None:
+        assert action is not None  # noqa: S101 - for the type checker: a mission has the actions of its guidance
+        flown = missions.guide(flown, now.x, y, segment, action, mission)
+    sensed = now._replace(
+        y_before=y_before,
+        squares=now.squares.at[window].add(e * e),
+        max=jnp.maximum(now.max, jnp.abs(e)),
+        bounded=now.bounded & (jnp.max(jnp.abs(now.x), axis=0) < DIVERGENCE_LIMIT),  # False for NaN too
+        mission=flown,
+    )
+    return sensed, Sample(y, *reference)
+
+
+def _advance(
+    now: LoopState, u: Array, segment: Segments, fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing
+) -> LoopState:
+    """The state at the next tick, with the command u of this one."""
+    blocks, u_late, flown = timing.blocks, timing.u_late, now.mission
+    places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
+    history = jnp.concatenate([u[None], now.u_before])
+    acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
+    command = acting[jnp.argsort(vehicle.inputs)]
+
+    def move(position: Array, t: Array) -> tuple[Array, Array]:
+        return actuators.move(t, position, command, vehicle.dt, vehicle.actuators)
+
+    # A loop of its own: without one the compiler computes all mean positions again for each state that they act on.
+    position, means = jax.lax.scan(move, now.position, segment.t + np.arange(timing.steps) * vehicle.dt)
+    remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
+    moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
+    matrices = _at(segment.t, fleet)
+    parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(matrices.tick, blocks, strict=True)]
+    x = jnp.concatenate(parts)[places]
+    x = jax.lax.cond(
+        jnp.any(segment.forcing != 0.0),
+        lambda x: x + fleet.wind * _product(matrices.forced, segment.forcing),
+        lambda x: x,
+        x,
+    )
+    if mission is not None:
+        flown = missions.advance(flown, x, mission)
+    return now._replace(
+        x=x,
+        position=position,
+        remainder=remainder,
+        u=u,
+        u_before=history[:u_late],
+        travel=now.travel + jnp.abs(u - now.u),
+        mission=flown,
+    )
+
+
+def _result(end: LoopState, ticks: int, period: Array, mission: Mission | None, timing: Timing) -> FleetResult:
+    """The figures of flights at their end."""
+    of_mission = None if mission is None else missions.figures(end.mission, mission)
+    lengths = np.diff([0, *timing.windows, ticks])[:, None, None]
+    return FleetResult(
+        jnp.sqrt(jnp.sum(end.squares, axis=0) / ticks),
+        end.max,
+        end.travel / ((ticks - 1) * period),
+        ~end.bounded,
+        of_mission,
+        jnp.sqrt(end.squares / lengths),
+    )
+
+
+class Stepper:
+    """The flights of `fly` tick by tick, with u from outside: `sense`, then `advance`, for each tick of the course."""
+
+    def __init__(
+        self, fleet: Fleet, vehicle: Vehicle, course: Course, mission: Mission | None = None, windows: tuple[int, ...] = ()
+    ) -> None:
+        self.ticks, self._course, self._mission, self._k = len(course.segments.t), course, mission, 0
+        self._timing = Timing(fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), windows)
+        self._fleet, self._vehicle = jax.device_put((fleet._replace(blocks=()), vehicle))
+        self._windows = window_of(np.arange(self.ticks), windows)
+        self._state = _in_trim(fleet, vehicle, mission, self._timing)
+
+    @property
+    def t(self) -> float:
+        """Time of the present tick, s."""
+        return self._k * self._course.period
+
+    @property
+    def bounded(self) -> NDArray[np.bool_]:
+        """Which aircraft have not diverged, (N,)."""
+        return np.asarray(self._state.bounded)
+
+    def sense(self) -> tuple[FloatArray, FloatArray]:
+        """The y and y_m of the present tick, each (m, N), in the law's order."""
+        action = None if self._mission is None else np.asarray(self._mission.action)[self._k]
+        self._state, sample = _sense_once(
+            self._state, self._segment, action, self._windows[self._k], self._vehicle, self._mission
+        )
+        y = np.asarray(sample.y)
+        return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
+
+    def advance(self, u: FloatArray) -> None:
+        """To the next tick with the command u, (m, N), in the law's order."""
+        self._state = _advance_once(self._state, u, self._segment, self._fleet, self._vehicle, self._mission, self._timing)
+        self._k += 1
+
+    def result(self) -> FleetResult:
+        """The figures after the last tick."""
+        return _result(self._state, self.ticks, np.float64(self._course.period), self._mission, self._timing)
+
+    @property
+    def _segment(self) -> Segments:
+        return Segments(*(values[self._k] for values in self._course.segments))
+
+
+_sense_once = jax.jit(_sense)
+_advance_once = jax.jit(_advance, static_argnames=("timing",))
 
 
 def _at(t: Array, fleet: Fleet) -> Fleet:
@@ -382,7 +486,7 @@ def _at(t: Array, fleet: Fleet) -> Fleet:
     return fleet._replace(**now)
 
 
-def _in_trim(fleet: Fleet, vehicle: Vehicle, y_late: int, u_late: int, mission: Mission | None) -> LoopState:
+def _in_trim(fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing) -> LoopState:
     """The state of the closed loop before the first tick, without that of the law."""
     n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
     none = jnp.zeros((m, count))
@@ -392,13 +496,13 @@ def _in_trim(fleet: Fleet, vehicle: Vehicle, y_late: int, u_late: int, mission: 
         jnp.zeros((len(vehicle.remainder.gravity), count)),
         None,
         none,
-        jnp.zeros((y_late, m, count)),
-        jnp.zeros((u_late, m, count)),
-        none,
+        jnp.zeros((timing.y_late, m, count)),
+        jnp.zeros((timing.u_late, m, count)),
+        jnp.zeros((len(timing.windows) + 1, m, count)),
         none,
         none,
         jnp.ones(count, dtype=bool),
-        None if mission is None else missions.initial_state(count, y_late, mission),
+        None if mission is None else missions.initial_state(count, timing.y_late, mission),
     )
 
 

@@ -46,6 +46,7 @@ COMMANDS = MappingProxyType(
         "engage": "Engage or disengage the autopilot behind a running bridge.",
         "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
         "compare": "Compare RISE-DI with other control laws on the same aircraft.",
+        "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file of scores.",
     }
 )
 """What each command does. The function `NAME` of the module `flight_cli.NAME` is the command, with _ for -, and _ after

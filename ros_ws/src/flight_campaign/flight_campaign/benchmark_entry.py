@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An entry of the public benchmark: what flies a set, a law with parameters or a function of Python."""
+
+import hashlib
+import inspect
+import json
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from control_laws.catalogue import LAWS
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_campaign import tuned_gains
+from flight_campaign.benchmark_sets import Sets, frame
+from flight_campaign.tuned_controller import REGISTERED, tuned_controller
+from flight_campaign.tuning import build_benchmark
+from flight_core.parameters import ParameterError, require
+from flight_core.vectors import FloatArray, as_array
+from rise_di_controller.laws import AnyLaw
+from rise_di_controller.params import ControllerConfig
+
+TUNED_IN, TUNED_FOR, TUNED_ON = "osprey_servo", "osprey", "gust_turbulence"  # the gains of a law of the comparison
+FIXED = ("rate", "outputs", "inputs", "lower", "upper")  # keys of the frame that no law changes
+NOT_STATED = "not stated"
+
+
+class Task(NamedTuple):
+    """What an entry may know of a set: channels, rate, and the parameters of the controller that every law gets."""
+
+    set: str  # as "gusts"
+    airframe: str  # as "osprey", or "jsbsim:f16"
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    rate: float  # Hz
+    controller: Mapping[str, Any]  # with D, input_scale = 1 / abs(Omega_ii), lag, lower and upper
+
+
+Step = Callable[[float, FloatArray, FloatArray], ArrayLike]
+"""step(t, y, y_m) -> u: t in s, the rest (m,), SI, deviations from trim, in the order of the task."""
+
+Enter = Callable[[Task], Mapping[str, Any] | Step | None]
+"""A law for a task: a section `controller`, or a function that keeps the state of one aircraft; None takes no part."""
+
+
+class Entry(NamedTuple):
+    """An entry."""
+
+    name: str
+    sees: str  # measurements beside y_m
+    knows: str  # of the aircraft, beside D
+    source: str  # SHA-256 of its gains or of its module
+    enter: Enter
+
+
+def task_of(name: str, sets: Sets) -> Task:
+    """The task of a set."""
+    scenario = sets.scenario(name)
+    controller = scenario.controller
+    return Task(name, scenario.aircraft.airframe, controller.outputs, controller.inputs, controller.rate, frame(scenario))
+
+
+def entered(entry: Entry, task: Task) -> ControllerConfig | Step | None:
+    """What flies a task. Raises ParameterError for a section that is none, or that changes the frame."""
+    law = entry.enter(task)
+    if law is None or not isinstance(law, Mapping):
+        require(law is None or callable(law), entry.name, law, "a section `controller`, a function of t, y, y_m, or None")
+        return law
+    controller = AnyLaw.validate_mapping({**task.controller, **law}, f"{entry.name}: controller")
+    given = AnyLaw.validate_mapping({**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name)
+    for key in FIXED:
+        value, expected = getattr(controller, key), getattr(given, key)
+        require(value == expected, f"{entry.name}: controller.{key}", value, f"{expected}, as every law of {task.set} has it")
+    return controller
+
+
+def checked(u: ArrayLike, task: Task, t: float) -> FloatArray:
+    """The u of a function, (m,). Raises ParameterError for a wrong shape and for numbers that are not finite."""
+    expected = f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
+    vector = as_array(u, f"u in {task.set} at t = {t:g} s", expected)
+    fits = vector.shape == (len(task.inputs),) and bool(np.isfinite(vector).all())
+    require(fits, f"u in {task.set} at t = {t:g} s", u, expected)
+    return vector
+
+
+def find_entry(
+    words: Sequence[str],
+    sets: Sets,
+    find: Callable[[str], Scenario],
+    name: str | None = None,
+    sees: str | None = None,
+    knows: str | None = None,
+) -> Entry:
+    """The entry that words name: MODULE:FUNCTION, a law of the comparison, or scenarios, one for each airframe.
+
+    `find` reads a scenario. Raises ParameterError for an unknown word.
+    """
+    first = words[0]
+    if ":" in first and not first.endswith(".yaml"):
+        require(len(words) == 1, "ENTRY", " ".join(words), "one MODULE:FUNCTION")
+        enter, source = _function(first)
+        return Entry(name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter)
+    if first in REGISTERED:
+        require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
+        law, own = LAWS[first], _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
+        return Entry(name or first, sees or law.measurements, knows or law.model_data, *own)
+    scenarios = [find(word) for word in words]
+    by_airframe = {scenario.aircraft.airframe: scenario.controller for scenario in scenarios}
+    require(len(by_airframe) == len(words), "ENTRY", " ".join(words), "one scenario for each airframe")
+    known = sets.airframes()
+    for airframe in by_airframe:
+        require(airframe in known, "ENTRY", f"a scenario of {airframe}", f"one of {', '.join(known)}")
+    return Entry(name or Path(first).stem, sees or "y", knows or NOT_STATED, *_of_airframes(by_airframe))
+
+
+def _of_airframes(controllers: Mapping[str, ControllerConfig]) -> tuple[str, Enter]:
+    """Digest and entry of controllers by airframe."""
+    sections = {airframe: controller.model_dump(mode="json") for airframe, controller in controllers.items()}
+    modules = {type(controller) for controller in controllers.values()}
+    text = json.dumps(sections, sort_keys=True).encode() + b"".join(sorted(map(_source, modules)))
+    fixed = {airframe: _without_delay(section) for airframe, section in sections.items()}
+    return hashlib.sha256(text).hexdigest(), lambda task: fixed.get(task.airframe)
+
+
+def _without_delay(section: Mapping[str, Any]) -> dict[str, Any]:
+    """A section without the delay of the topics: that of the frame applies."""
+    return {key: value for key, value in section.items() if key != "delay"}
+
+
+def _tuned(name: str, scenario: Scenario) -> ControllerConfig:
+    tuned = tuned_gains.find(scenario, name, TUNED_ON)
+    if tuned is None:
+        raise ParameterError(f"ENTRY: found {name}, which has no gains for {TUNED_IN}, expected a law that has them")
+    return tuned_controller(name, tuned, build_benchmark(scenario))
+
+
+def _function(text: str) -> tuple[Enter, str]:
+    """A function by MODULE:FUNCTION, of an installed package or of a file of this folder, and the digest of its module."""
+    if "" not in sys.path:
+        sys.path.insert(0, "")
+    try:
+        function = resolve_name(text)
+    except (ImportError, AttributeError, ValueError, SyntaxError) as error:
+        raise ParameterError(f"ENTRY: found {text!r} ({error}), expected MODULE:FUNCTION of an installed package") from None
+    require(callable(function), "ENTRY", text, "a function of a task")
+    return function, hashlib.sha256(_source(function)).hexdigest()
+
+
+def _source(of: Any) -> bytes:
+    """The source of the module of a function or a class."""
+    try:
+        return Path(str(inspect.getsourcefile(of))).read_bytes()
+    except (OSError, TypeError):
+        return b""

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di benchmark`: the public benchmark, fixed sets of flights that any law can enter."""
+
+import re
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from flight_bringup.scenarios import find_scenario
+from flight_campaign import engines
+from flight_campaign.benchmark_entry import find_entry
+from flight_campaign.benchmark_scores import SCORES, Benchmark, Flights, define
+from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
+from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
+from flight_core.files import display_path
+from flight_core.installation import require_package
+from flight_core.parameters import require
+
+FOLDER = "benchmark-"
+LEGEND = (
+    "score: sum of rms of the true error over the unit of a channel (10 mrad/s, p 20, V 0.1 m/s), of a mission the largest"
+    " cross-track error in half seconds of flight; a lost aircraft counts 10"
+)
+
+
+def benchmark(
+    entry: Annotated[
+        list[str],
+        typer.Argument(
+            help="Scenarios whose controllers fly, one for each airframe; or a law of compare, as pi; or MODULE:FUNCTION."
+        ),
+    ],
+    aircraft: Annotated[int, typer.Option(min=1, help="Uncertain aircraft of a set; fewer to try an entry.")] = 200,
+    name: Annotated[str | None, typer.Option(help="Name of the entry.")] = None,
+    sees: Annotated[str | None, typer.Option(help="What the law measures beside y_m, as in: y.")] = None,
+    knows: Annotated[str | None, typer.Option(help="What the law knows of the aircraft beside D, as in: Omega_ii.")] = None,
+    release: Annotated[
+        str, typer.Option(help="Hash of the commit of a release: fresh seeds; by default the fixed seeds.")
+    ] = "",
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the run, which an interrupted run continues; by default in runs.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Threads; by default one a core.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the scores as JSON, nothing else.")] = False,
+) -> None:
+    """Fly the public benchmark with a law, and write a file of scores. The same command continues an interrupted run.
+
+    Exit status: 0 all flown, 2 bad input, 130 interrupted.
+    """
+    require_package("jax")
+    fits = not release or re.fullmatch(rf"[0-9a-f]{{{RELEASE_LENGTH}}}", release) is not None
+    require(fits, "--release", release, f"the hash of a commit, {RELEASE_LENGTH} hex digits")
+    with Console(stderr=True, quiet=as_json).status("preparing"):
+        sets = Sets({word: find_scenario(word) for word in SCENARIOS}, release)
+        entered = find_entry(entry, sets, find_scenario, name, sees, knows)
+        flights = Flights(entered, sets)
+        definition = define(flights, aircraft, version("rise-di"))
+    run = Benchmark(output or Path("runs") / (FOLDER + re.sub(r"[^\w.-]", "_", entered.name)), definition)
+    _fly(run, flights, engines.threads(workers), quiet=as_json)
+    scores = run.scores()
+    if as_json:
+        print_json(scores)
+        return
+    _show(Console(), scores)
+    print(f"scores: {display_path(run.folder / SCORES)}")
+
+
+def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: bool) -> None:
+    total, missing = run.definition.flights, run.missing()
+    done = total - sum(map(run.definition.size, missing))
+    try:
+        with progress_bar(*COUNT_COLUMNS, quiet=quiet) as bar:
+            task = bar.add_task("flights", total=total, completed=done)
+            for flown in run.fly(flights, engine):
+                done += flown
+                bar.update(task, completed=done)
+    except KeyboardInterrupt:
+        print(f"interrupted after {done} of {total} flights; the same command continues")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _show(console: Console, scores: Mapping[str, Any]) -> None:
+    entry, seeds = scores["entry"], scores["benchmark"]["release"] or "fixed"
+    title = f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows {entry['knows']}"
+    table = new_table(title, ("set", "flights", "score", "worst", "lost"), left=("set",), wrapped=("set",))
+    for of in scores["sets"].values():
+        if "not_flown" not in of:
+            figures = (f"{of['score']['mean']:.2f}", f"{of['score']['worst']:.2f}", str(of["lost"]))
+            table.add_row(of["title"], str(of["aircraft"]), *figures)
+    console.print(table)
+    for of in scores["sets"].values():
+        if "over_time" in of:
+            windows = ", ".join(f"{window} s {value:.2f}" for window, value in of["over_time"].items())
+            console.print(f"over time, damage at 60 s: {windows}; recovery {of['recovery']:.2f}", highlight=False)
+    for of in scores["sets"].values():
+        if "not_flown" in of:
+            console.print(f"not flown: {of['title']}: {of['not_flown']}", highlight=False, markup=False)
+    console.print(LEGEND, style="dim", highlight=False)
