@@ -39,7 +39,7 @@ ifdef MOVED
 .PHONY: .venv/.uv .venv/.fly .venv/.messages .venv/.all .venv/.workspace
 endif
 
-.PHONY: fly test test-fast test-sitl check docs evidence foxglove autopilot messages wheel setup setup-all lock clean
+.PHONY: fly test test-fast test-sitl mutants check docs evidence foxglove autopilot messages wheel setup setup-all lock clean
 
 fly: setup
 	@$(BIN)/rise-di fly $(SCENARIO) $(ARGS)
@@ -59,6 +59,9 @@ test-fast: .venv/.all .venv/.workspace
 
 test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
+
+mutants: setup-all
+	@$(BIN)/python -m benchmarks.mutants $(ARGS)
 
 foxglove autopilot: setup
 	$(INSTALL) --extra $@
