@@ -130,6 +130,8 @@ def gpx_points(kind: str) -> str:
     return "".join(f'<{kind} lat="{lat}" lon="{lon}"><ele>{h}</ele></{kind}>' for lon, lat, h in SQUARE)
 
 
+SEGMENTS = """<trk><trkseg><trkpt lat="47.4" lon="8.5"><ele>500</ele></trkpt></trkseg>
+<trkseg><trkpt lat="{}" lon="8.5"><ele>500</ele></trkpt><trkpt lat="47.41" lon="8.5"><ele>500</ele></trkpt></trkseg></trk>"""
 RTE, TRK, WPT = (gpx_points(kind) for kind in ("rtept", "trkpt", "wpt"))
 
 
@@ -287,6 +289,14 @@ WPL_FENCE = [
 ]
 
 
+def test_segments_of_track_are_joined(tmp_path: Path) -> None:
+    """0.003 deg of latitude are 0.18 nautical miles."""
+    (tmp_path / "r.gpx").write_text(gpx(SEGMENTS.format(47.403)), encoding="utf-8")
+    route = read_route_file(tmp_path / "r.gpx", ZURICH)
+    assert len(route.waypoints) == 3
+    assert route.notes == ("2 trkseg are one track: a leg joins them over each gap, up to 334 m",)
+
+
 @pytest.mark.parametrize("ending", [".plan", ".geojson", ".waypoints"])
 def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"fence{ending}"
@@ -382,7 +392,8 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.kml", kml("<NetworkLink/>"), "found no LineString and no Point, but 1 NetworkLink"),
         ("r.kml", kml(KML_LINE + KML_LINE), "found 2 LineStrings, expected one, or Points alone"),
         ("r.gpx", gpx("<rte>" + RTE + "</rte><rte>" + RTE + "</rte>"), "found 2 rte, expected one"),
-        ("r.gpx", gpx("<trk><trkseg>" + TRK + "</trkseg><trkseg>" + TRK + "</trkseg></trk>"), "found 2 trkseg, expected one"),
+        ("r.gpx", gpx(f"<trk><trkseg>{TRK}</trkseg></trk>" * 2), "found 2 trk, expected one"),
+        ("r.gpx", gpx(SEGMENTS.format(47.43)), r"found a gap of 3\.3 km between two trkseg, expected at most 1 km"),
         ("r.gpx", gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'), r"route\[0\]: found a rtept without ele, .* --altitude"),
         ("r.gpx", gpx(""), "found no rte, no trk and no wpt"),
         ("r.gpx", gpx("<rte>&a;</rte>", head=ENTITY), "found a document type, expected the XML of a GPX"),

@@ -9,12 +9,14 @@ Formats and MAV_FRAME.
 
 import io
 import json
+import math
 import re
 import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
+from itertools import chain, pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
@@ -309,21 +311,51 @@ def _read_kmz(content: bytes, key: str) -> Places:
     return _read_kml(limited(inside, f"{key}: {chosen}", A_ROUTE), key)
 
 
+EARTH_RADIUS = 6371e3
+"""m, mean radius R_1 of GRS80."""
+
+LARGEST_GAP = 1000.0
+"""m. Segments of a track that are nearer are one track: GPX begins a segment where the receiver lost its satellites."""
+
+
 def _read_gpx(content: bytes, key: str) -> Places:
-    """A route (rte), without one a track (trk) of one segment, without both the waypoints (wpt)."""
+    """A route (rte), without one a track (trk), without both the waypoints (wpt)."""
     root = _parsed_xml(content, key, "a GPX file")
     routes = [_gpx_places(element, "rtept") for element in root.iter() if _kind(element) == "rte"]
-    segments = [_gpx_places(element, "trkpt") for element in root.iter() if _kind(element) == "trkseg"]
+    tracks = [_gpx_track(element) for element in root.iter() if _kind(element) == "trk"]
+    tracks = [segments for segments in tracks if segments]
     marks = _gpx_places(root, "wpt")
-    lines = [places for places in (routes or segments) if places]
-    kind = "rte" if routes else "trkseg"
-    require(len(lines) <= 1, key, f"{len(lines)} {kind}", "one: GPX of a single route or of a track without a gap")
+    kind = "rte" if routes else "trk"
+    lines = [places for places in routes if places] if routes else [[*chain(*segments)] for segments in tracks]
+    require(len(lines) <= 1, key, f"{len(lines)} {kind}", "one: GPX of a single route or track")
+    gaps = [] if routes else [_gap(before[-1], after[0]) for segments in tracks for before, after in pairwise(segments)]
+    widest = max(gaps, default=0.0)
+    fits = widest <= LARGEST_GAP
+    require(fits, key, f"a gap of {widest / 1e3:.1f} km between two trkseg", f"at most {LARGEST_GAP / 1e3:g} km within a track")
     if not lines:
         require(bool(marks), key, "no rte, no trk and no wpt", "a route")
         return Places(marks)
-    beside = {"trkseg": len(segments) if routes else 0, "wpt": len(marks)}
-    notes = (f"{count} {what} beside the {kind}: no part of the route" for what, count in beside.items() if count)
+    beside = {"trk": len(tracks) if routes else 0, "wpt": len(marks)}
+    notes = [f"{count} {what} beside the {kind}: no part of the route" for what, count in beside.items() if count]
+    if gaps:
+        notes.append(f"{len(gaps) + 1} trkseg are one track: a leg joins them over each gap, up to {widest:.0f} m")
     return Places(lines[0], tuple(notes))
+
+
+def _gpx_track(track: Element) -> list[list[Place]]:
+    """The segments of a track that have a position."""
+    segments = [_gpx_places(element, "trkpt") for element in track if _kind(element) == "trkseg"]
+    return [places for places in segments if places]
+
+
+def _gap(end: Place, begin: Place) -> float:
+    """Distance of two near positions on a sphere, m; 0 where one of them is no position, which is refused later."""
+    values = (end.latitude, end.longitude, begin.latitude, begin.longitude)
+    if not all(isinstance(value, float) and math.isfinite(value) for value in values):
+        return 0.0
+    north = begin.latitude - end.latitude
+    east = math.remainder(begin.longitude - end.longitude, 360.0) * math.cos(math.radians(end.latitude))
+    return EARTH_RADIUS * math.radians(math.hypot(north, east))
 
 
 def _gpx_places(parent: Element, kind: str) -> list[Place]:
