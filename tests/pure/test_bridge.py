@@ -721,8 +721,10 @@ def test_flight_ends_once_log_holds_it(
     def recorded() -> float | None:
         return None if until is None else 1000.0 + min(now[0], until)
 
-    processes = SimpleNamespace(started=0.0, start_time=1000.0, ended_early=lambda: None, is_flying=lambda: True)
-    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=recorded)
+    processes = SimpleNamespace(
+        learner_ended=str, started=0.0, start_time=1000.0, ended_early=lambda: None, is_flying=lambda: True
+    )
+    monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=recorded)
     assert followed(cast("FlightProcesses", processes), cast("FlightMonitor", monitor), begins=begins) == outcome
     assert now[0] == pytest.approx(end, abs=0.1)
 
@@ -730,8 +732,13 @@ def test_flight_ends_once_log_holds_it(
 def test_flight_announces_each_reason_once_without_those_in_which_number_alone_changes() -> None:
     reasons = ["would refuse: u not received yet", "u is 0.30 s old", "u is 0.41 s old", "not engaged yet", "not engaged yet"]
     waiting, announced = [("DISENGAGED", reason) for reason in reasons] + [("ENGAGED", "")], list[str]()
-    processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: None if waiting else "the end")
-    monitor = SimpleNamespace(engagement=lambda: [waiting.pop(0)], newest=lambda: None, recorded=lambda: None)
+    processes = SimpleNamespace(
+        learner_ended=str,
+        start_time=1000.0,
+        started=time.monotonic(),
+        ended_early=lambda: None if waiting else "the end",
+    )
+    monitor = SimpleNamespace(learned=list, engagement=lambda: [waiting.pop(0)], newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert followed(*nodes, announce=announced.append) == "the end"
     assert announced == [*(f"DISENGAGED: {reasons[i]}" for i in (0, 1, 3)), "ENGAGED"]
@@ -739,16 +746,18 @@ def test_flight_announces_each_reason_once_without_those_in_which_number_alone_c
 
 def test_experiment_without_engagement_ends_when_too_little_time_left() -> None:
     # osprey_gust has 60 s, of which the experiment needs 59.8; it began 0.3 s ago
-    processes = SimpleNamespace(started=time.monotonic() - 0.3, ended_early=lambda: None)
-    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=lambda: None)
+    processes = SimpleNamespace(learner_ended=str, start_time=1000.0, started=time.monotonic() - 0.3, ended_early=lambda: None)
+    monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     assert followed(*nodes, engaged_for=59.8) == "not engaged within 0.2 s"
 
 
 def test_step_of_system_clock_does_not_end_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(["", "", "the end"])
-    processes = SimpleNamespace(started=time.monotonic(), ended_early=lambda: next(calls) or None)
-    monitor = SimpleNamespace(engagement=list, newest=lambda: None, recorded=lambda: None)
+    processes = SimpleNamespace(
+        learner_ended=str, start_time=1000.0, started=time.monotonic(), ended_early=lambda: next(calls) or None
+    )
+    monitor = SimpleNamespace(learned=list, engagement=list, newest=lambda: None, recorded=lambda: None)
     nodes = cast("tuple[FlightProcesses, FlightMonitor]", (processes, monitor))
     later = time.time() + 3600.0
     monkeypatch.setattr(time, "time", lambda: later)
