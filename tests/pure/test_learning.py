@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
@@ -17,6 +19,7 @@ from flight_analysis.report.figures import learned_figure, plot_context
 from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario, written
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
@@ -116,6 +119,21 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
     assert len(lines) == 1
     assert "B[p, aileron]" in lines[0]
     assert (run / "log" / "learner.log").read_text(encoding="utf-8").splitlines() == lines
+
+
+def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flown, tmp_path: Path) -> None:
+    model = tmp_path / "model.yaml"
+    result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--write", str(model)])
+    assert result.exit_code == 0, result.output
+    assert flown.lines[0].partition(" flies ")[2] in " ".join(result.output.split())
+    B, of_file = load_airframe(model).matrix_b(), load_airframe("osprey").matrix_b()
+    found = {entry.name: entry.error for entry in flown.learner.identification.entries}  # type: ignore[union-attr]
+    assert B[2, 0] / of_file[2, 0] - 1.0 == pytest.approx(found["B[q, elevator]"])
+    assert learner(scenario(learn={"prior": str(model)})) is not None
+    with pytest.raises(
+        ParameterError, match=r"^controller\.learn\.prior: found an airframe with another name, expected a model of"
+    ):
+        learner(scenario(learn={"prior": "navion_lateral"}))
 
 
 def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:

@@ -39,6 +39,7 @@ COMMANDS = MappingProxyType(
         "airframes": "Show airframes of the library or your own, and what the theorem asks of each.",
         "airframe": "Make an airframe of your own from matrices, with a scenario that flies.",
         "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
+        "learn": "Repeat the learner on the log of a flight, with other settings, and write the model.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
         "guidance": "Hold, skip a waypoint, resume, fly home or another route, in a running guided flight.",

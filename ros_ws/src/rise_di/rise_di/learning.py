@@ -2,12 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learner of a scenario: its airframe file is the rough model, and its observers have the gains of `rise-di gains`."""
 
+from typing import NamedTuple
+
+import numpy as np
+
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.learner import Learner
+from flight_core.modes import Mode
 from flight_core.parameters import require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
 from rise_di.gain_design import observed
+from rise_di_controller.learning import Updates
 from rise_di_controller.rise_di import RiseDiConfig
 
 
@@ -22,8 +31,64 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         return None
     require(not aircraft.is_jsbsim, "controller.learn", "an aircraft of JSBSim", "an airframe file: it has the rough model")
     airframe, margin = load_airframe(aircraft.airframe), 0.0 if controller.observer is None else controller.observer.margin
+    if controller.learn.prior is not None:
+        airframe = _prior(controller.learn.prior, airframe)
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
         return observed(start, scenario, model, margin)[0]
 
     return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0)
+
+
+def _prior(path: str, flown: Airframe) -> Airframe:
+    """The rough model of a file. Raises ParameterError for one of another airframe."""
+    prior = load_airframe(path)
+    for key in ("name", "states", "inputs", "outputs", "speed"):
+        same = getattr(prior, key) == getattr(flown, key)
+        require(same, "controller.learn.prior", f"an airframe with another {key}", f"a model of {flown.name}")
+    return prior
+
+
+class LearnStep(NamedTuple):
+    """What the learner found at a flight time."""
+
+    t: float  # s
+    proposed: bool
+    sentence: str
+
+
+class LearnResult(NamedTuple):
+    """The learner's steps over a log, and the model at its end; None where nothing was learned."""
+
+    steps: tuple[LearnStep, ...]
+    model: Airframe | None
+
+
+def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
+    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError."""
+    make, controller = learner(scenario, real_time=tape.start_ns > 0), scenario.rise_di()  # simulated time begins at 0
+    require(make is not None, "controller.learn", "no section", "one")
+    assert make is not None  # noqa: S101 - for the type checker
+    assert controller.learn is not None  # noqa: S101 - there is a learner
+    learned = make(controller)
+    assert isinstance(learned, Learner)  # noqa: S101 - `learner` makes no other
+    require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
+    ticks, updates, steps = tape["internals"], Updates(controller.learn), list[LearnStep]()
+    y, u, engaged = ticks.group("y").values, ticks.group("u").values, ticks["mode"] == Mode.ENGAGED
+    for k, stamp_ns in enumerate(ticks.stamp_ns.tolist()):
+        if engaged[k]:
+            learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
+        if updates.due(stamp_ns):
+            proposal = learned.propose()
+            t = (stamp_ns - tape.start_ns) / NANOSECONDS
+            steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
+    return LearnResult(tuple(steps), learned.model)
+
+
+def learned_yaml(result: LearnResult, origin: str) -> str:
+    """The model of a result as the text of an airframe file; the header has the steps. Raises ParameterError without one."""
+    require(result.model is not None, "the learner", "no model", "one")
+    assert result.model is not None  # noqa: S101 - for the type checker
+    lines = [f"The airframe {result.model.name}, with A and B learned from {origin}.", ""]
+    lines += [f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}" for step in result.steps]
+    return "".join(f"# {line}".rstrip() + "\n" for line in lines) + as_yaml(result.model)

@@ -42,6 +42,9 @@ class LearnConfig(Config):
     check: Annotated[float, Field(ge=1, le=600)] = Field(
         default=10.0, description="after the last of these times: how often it is tested whether the aircraft has changed, s"
     )
+    prior: str | None = Field(
+        default=None, description="the airframe file of the rough model, as `rise-di learn` writes it; none: the airframe's own"
+    )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
         description="in lockstep and in one process: from the end of a window until the controller takes the model, s",

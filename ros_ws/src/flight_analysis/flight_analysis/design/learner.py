@@ -67,6 +67,11 @@ class Learner:
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
         self.identification: Identification | None = None  # the last one
 
+    @property
+    def model(self) -> Airframe | None:
+        """The rough airframe with the models of the parts that are known; None where there is none."""
+        return self._model if self._known else None
+
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
         """Record y and u, after its limits, of a tick, (m,), in the law's order."""
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di learn`: repeat the learner on the log of a flight, with other settings, and write the model."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from flight_analysis.closed_loop.replay import recorded_scenario
+from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
+from flight_cli.output import LATEST, print_json, write_text
+from flight_core.arguments import as_numbers
+from flight_core.files import display_path
+from flight_core.parameters import require
+from flight_core.text import printable
+from flight_log.tape_reader import read_run
+from rise_di.learning import learn_again, learned_yaml
+
+NOTHING_LEARNED = 1
+
+
+def learn(
+    run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
+    window: Annotated[float | None, typer.Option(help="Length of the record of y and u, s.")] = None,
+    updates: Annotated[str | None, typer.Option(help="Times of the identifications, s, with commas.")] = None,
+    prior: Annotated[str | None, typer.Option(help="Airframe file of the rough model.")] = None,
+    write: Annotated[Path | None, typer.Option(help="File for the learned model, an airframe file.")] = None,
+    scenario: LogScenario = None,
+    namespace: LogNamespace = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+) -> None:
+    """Repeat the learner on the log of a flight, with the settings of its scenario or others.
+
+    y and u are those of the log: a flight without a learner can be learned from too, if its controller has an observer. With
+    --write the model becomes an airframe file, from which `controller.learn.prior` starts the next flight. Exit status: 0 a
+    model, 1 none, 2 bad input.
+    """
+    if write is not None:
+        require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
+        require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
+    changed: dict[str, Any] = {"window": window, "prior": prior}
+    if updates is not None:
+        changed["updates"] = as_numbers(updates.split(","), "--updates", "seconds with commas, as 10,15,30")
+    recorded = read_run(run, namespace, scenario_file(scenario))
+    recorded.require()
+    flown = recorded_scenario(recorded)
+    settings = flown.controller.model_dump().get("learn") or {}
+    settings |= {name: value for name, value in changed.items() if value is not None}
+    console = Console(quiet=as_json)
+    with console.status(f"learning from {printable(str(run))}"):
+        result = learn_again(recorded.tape, flown.vary(controller={"learn": settings}))
+    for step in result.steps:
+        console.print(
+            f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+    if result.model is not None and write is not None:
+        write_text("--write", write, learned_yaml(result, str(run)))
+        console.print(f"model: {display_path(write)}", highlight=False, markup=False, soft_wrap=True)
+    if as_json:
+        steps = [step._asdict() for step in result.steps]
+        print_json({"steps": steps, "model": None if result.model is None or write is None else str(write)})
+    raise typer.Exit(NOTHING_LEARNED if result.model is None else 0)
