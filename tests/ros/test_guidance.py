@@ -161,7 +161,7 @@ def test_target_without_channels_keeps_link(start: Start, peer_node: Peer, calm:
     made.until(lambda: made.last("age.link") > 0.3)
     made.until(lambda: made.last("age.link") < 0.1, made.target)
     made.until(lambda: made.last("mode.lateral") == Lateral.ORBIT)
-    assert "no message of an operator for 1 s: home" in made.process.output
+    made.until(lambda: "no message of an operator for 1 s: home" in made.process.output)
 
 
 def test_modes_of_second_controller_refused(flight: Flight) -> None:
