@@ -208,6 +208,7 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
         (SERVO.vary(aircraft={"sensors": {"dropout": 0.1}}), "aircraft.rate: found 500 Hz, expected controller.rate"),
         (SERVO.vary(aircraft={"sensors": {"delay": 0.004}}), "sensors.delay: found 0.01 s"),
         (find_scenario("jsbsim_c172p"), "airframe: found jsbsim:c172p, expected an airframe with matrices"),
+        (find_scenario("osprey_twin"), "controller.allocation: found a section, expected none"),
     ],
 )
 def test_scenario_that_fleet_cannot_fly_refused(scenario: Scenario, sentence: str) -> None:

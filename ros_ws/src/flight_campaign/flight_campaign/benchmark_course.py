@@ -59,13 +59,15 @@ class Course(NamedTuple):
 def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y by a part of a tick,
-    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit.
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, an allocation, a delay of y by a part of a
+    tick, dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
     fixed = getattr(controller, "learn", None) is None
     require(fixed, "controller.learn", "a section", "none: a campaign does not learn, rise-di fly --in-process does")
+    allocation = controller.allocation
+    require(allocation is None, "controller.allocation", "a section", "none: many aircraft at once fly the inputs of the law")
     airframe, plant = aircraft.load()[0], aircraft.plant()
     tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
     ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")

@@ -26,7 +26,6 @@ from flight_campaign.benchmark_course import Course, Segments
 from flight_campaign.missions import Mission
 from flight_core.arithmetic import product
 from flight_core.integrators import rk4
-from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements
@@ -85,9 +84,7 @@ class Vehicle(NamedTuple):
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
-    """The shared properties of all aircraft of a scenario. Raises ParameterError for a controller with an allocation."""
-    allocation = scenario.controller.allocation
-    require(allocation is None, "controller.allocation", "a section", "none: many aircraft at once fly the inputs of the law")
+    """The shared properties of all aircraft of a scenario."""
     plant, channels = scenario.aircraft.plant(), scenario.aircraft.channels()
     aircraft, errors = plant.aircraft, scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
