@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from tests.conftest import REPOSITORY
 
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
-from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
+from flight_analysis.c_export.events import RETUNE, Recording, flight_recordings, parameter_sets, run_recording
 from flight_analysis.c_export.proof import (
     CODE,
     FLAGS,
@@ -35,12 +36,15 @@ from flight_analysis.c_export.proof import (
     write_code,
 )
 from flight_analysis.closed_loop.replay import vary
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_cli.export import export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
-from flight_log.tape_reader import read_run
+from flight_core.rates import NANOSECONDS
+from flight_log.tape_reader import RecordedRun, StoredFile, read_run
+from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
@@ -330,3 +334,25 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "c" / REPORT).write_text("PROVED: every bit is equal\n", encoding="utf-8")  # of an earlier export
     export("osprey_servo", tmp_path / "c", without_proof=True)
     assert not (tmp_path / "c" / REPORT).exists()
+
+
+def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """New gains in flight are an event of the recording, and every u is that of the log; without the changes it is refused."""
+    scenario, change = find_scenario("osprey_servo", 2.0), {"k_g": 2.0}
+    tuned = vary(scenario.controller, change)
+
+    class Tuned(Controller):
+        def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
+            if now_ns >= NANOSECONDS:
+                self.retune(tuned)
+            return super().tick(now_ns, late_ns, active=active)
+
+    tape = simulate(scenario, control=Tuned)
+    stored = StoredFile("osprey_servo.yaml", scenario_yaml(scenario).encode())
+    run = RecordedRun(replace(tape, changes=(change,)), stored)
+    sets, recording, equal = run_recording(run)
+    assert [parameters.digest() for parameters in sets] == [scenario.controller.digest(), tuned.digest()]
+    assert (recording.events["kind"] == RETUNE).sum() == 1
+    assert equal == recording.ticks == 201
+    with pytest.raises(ParameterError, match="--run: found parameters before tick 101 that no change of the log leads to"):
+        run_recording(RecordedRun(tape, stored))

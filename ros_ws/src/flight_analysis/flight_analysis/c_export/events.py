@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.c_export.constants import exportable, sizes
-from flight_analysis.closed_loop.replay import recorded_parameters, vary
+from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.text import printable
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
@@ -255,19 +255,29 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
 
 
 def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
-    """The parameters of a log, the ticks of the log, and the number of ticks with the u of the log."""
-    controller = exportable(recorded_parameters(run.scenario_file()))
+    """The parameters of a log and their changes in flight, the ticks of the log, and the number of ticks with the u of the log.
+
+    Raises ParameterError for parameters in force that the changes of the log do not lead to.
+    """
+    sets = [exportable(recorded_parameters(run.scenario_file()))]
+    changes = [*recorded_changes(run, sets[0])]
     log = run.tape["internals"]
     groups = {name: log.group(name).values for name in ("y", "y_m", "u")}
-    recorder, equal = Recorder([controller]), 0
+    recorder, equal = Recorder(sets), 0
     now_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
     for k in np.argsort(now_ns, kind="stable").tolist():
         if log["number"][k] == 1 and k:
             recorder.begin()
+        in_force = int(log["parameters"][k])
+        while recorder.digest != in_force:
+            found = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
+            require(bool(changes), "--run", found, "a log with all changes of the parameters")
+            sets.append(exportable(vary(recorder.parameters, changes.pop(0))))
+            recorder.retune_to(len(sets) - 1)
         sample = None
         if log["mode"][k] == Mode.ENGAGED:
             offset_ns = round(float(log["y_m_offset"][k]) * NANOSECONDS)
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.u.tobytes() == groups["u"][k].tobytes()
-    return [controller], recorder.recording(f"the log {printable(str(run.path))}"), equal
+    return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal

@@ -204,10 +204,15 @@ def _recorded(
         own = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
         return run, as_controller(own, "parameters"), run.changes if changes is None else changes
     own = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
-    if changes is None and run.path is not None:
-        known = {name: field for name, field in type(own).model_fields.items() if name not in OF_NODE}
-        changes = parameter_changes(run.path, f"{run.namespace}/controller", known)
-    return run.tape, own, changes or ()
+    return run.tape, own, recorded_changes(run, own) if changes is None else changes
+
+
+def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
+    """The changes in flight of the parameters of the recorded controller, in order; those of the tape without a log."""
+    if run.path is None:
+        return run.tape.changes
+    known = {name: field for name, field in type(parameters).model_fields.items() if name not in OF_NODE}
+    return parameter_changes(run.path, f"{run.namespace}/controller", known)
 
 
 class _ParametersInForce:
