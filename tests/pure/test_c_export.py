@@ -354,5 +354,5 @@ def test_proof_of_a_log_takes_changes_of_parameters(monkeypatch: pytest.MonkeyPa
     assert [parameters.digest() for parameters in sets] == [scenario.controller.digest(), tuned.digest()]
     assert (recording.events["kind"] == RETUNE).sum() == 1
     assert equal == recording.ticks == 201
-    with pytest.raises(ParameterError, match="--run: found parameters before tick 101 that no change of the log leads to"):
+    with pytest.raises(ParameterError, match="run: found parameters before tick 101 that no change of the log leads to"):
         run_recording(RecordedRun(tape, stored))

@@ -56,13 +56,13 @@ IMPORTS: dict[str, set[str]] = {
         "flight_log", "flight_guidance", "rise_di_controller",
     },
     "rise_di": {
-        "aircraft_sim", "flight_analysis.closed_loop", "flight_analysis.design", "flight_analysis.metrics",
-        "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log", "reference_model",
-        "rise_di_controller",
+        "aircraft_sim", "flight_analysis.c_export", "flight_analysis.closed_loop", "flight_analysis.design",
+        "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign", "flight_core", "flight_log",
+        "reference_model", "rise_di_controller",
     },
     "flight_learner": {"flight_analysis.closed_loop", "flight_core", "rise_di", "rise_di_controller"},
     "flight_cli": {
-        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.c_export", "flight_analysis.closed_loop",
+        "aircraft_sim", "autopilot_bridge", "control_laws", "flight_analysis.closed_loop",
         "flight_analysis.design", "flight_analysis.metrics", "flight_analysis.report", "flight_bringup", "flight_campaign",
         "flight_core", "flight_log", "flight_view", "flight_guidance", "rise_di", "rise_di_controller",
     },

@@ -21,6 +21,7 @@ __all__ = [
     "ControlLaw",
     "Controller",
     "ControllerConfig",
+    "Exported",
     "Field",
     "FlightEnv",
     "FlightResult",
@@ -57,6 +58,7 @@ __all__ = [
     "decompose",
     "engage",
     "error_metrics",
+    "export",
     "find_scenario",
     "fly",
     "fly_campaign",
@@ -106,6 +108,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_core.tape import Signal, Tape
     from flight_core.vectors import Array, StampedVector, array_namespace
     from flight_log.tape_reader import RecordedRun, read_run
+    from rise_di.c_code import Exported, export
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.flight_env import FlightEnv
     from rise_di.gain_design import check_gains, select_gains
@@ -144,6 +147,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_core.tape": ("Signal", "Tape"),
         "flight_core.vectors": ("Array", "StampedVector", "array_namespace"),
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
+        "rise_di.c_code": ("Exported", "export"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.flight_env": ("FlightEnv",),
         "rise_di.gain_design": ("check_gains", "select_gains"),

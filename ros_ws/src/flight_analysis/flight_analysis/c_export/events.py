@@ -271,7 +271,7 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
         in_force = int(log["parameters"][k])
         while recorder.digest != in_force:
             found = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
-            require(bool(changes), "--run", found, "a log with all changes of the parameters")
+            require(bool(changes), "run", found, "a log with all changes of the parameters")
             sets.append(exportable(vary(recorder.parameters, changes.pop(0))))
             recorder.retune_to(len(sets) - 1)
         sample = None

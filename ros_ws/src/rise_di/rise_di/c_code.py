@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The controller of a scenario as C99 with its proof, as `rise-di export` writes it."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from flight_analysis.c_export.constants import exportable
+from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
+from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
+from flight_analysis.c_export.library import build_fmu
+from flight_analysis.c_export.proof import FMU, REPORT, Proof, compilers, prove, report, write_code
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup.scenarios import find_scenario
+from flight_core.arguments import FilePath, as_path
+from flight_core.files import write_file, writing
+from flight_core.parameters import require
+from flight_log.tape_reader import RecordedRun, read_run
+from rise_di_controller.rise_di import RiseDiConfig
+
+PART = 50_000  # drawn steps of a recording
+LONGEST = 20.0  # s, of a flight without a duration
+
+
+class Exported(NamedTuple):
+    """An exported controller: its files, the proof, None without one, and the text of the report."""
+
+    files: list[Path]
+    proof: Proof | None
+    report: str
+
+
+def export(
+    scenario: FilePath | Scenario,
+    folder: FilePath,
+    *,
+    run: FilePath | RecordedRun | None = None,
+    float32: bool = False,
+    duration: float | None = None,
+    drawn: int = 50_000,
+    seed: int = 1,
+    compiler: Sequence[str] = (),
+    fmu: bool = False,
+    proof: bool = True,
+) -> Exported:
+    """Write the controller of a scenario as C99, compile it, and prove that C and Python give the same bits.
+
+    Args:
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        folder: Where the code and the report of the proof go.
+        run: A recorded flight whose ticks are the proof, in place of flights and drawn inputs.
+        float32: Compute in float; the proof then bounds the difference of u.
+        duration: Of a flight of the proof, s; None: that of the scenario, at most 20 s.
+        drawn: Number of drawn steps of the proof.
+        seed: Seed of the drawn inputs.
+        compiler: Commands of C compilers; gcc and clang where none is named.
+        fmu: Write a co-simulation unit of FMI 2.0 too.
+        proof: Whether to prove.
+
+    Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C code, without a compiler,
+    and for a folder that cannot be written.
+    """
+    chosen, folder = find_scenario(scenario), as_path(folder, "c", "the path of a folder")
+    controller = exportable(chosen.controller)
+    commands = compilers(compiler) if proof or fmu else []
+    files = write_code(controller, chosen.name, folder, float32=float32)
+    if fmu:
+        files.append(build_fmu(folder, commands[0], controller, chosen.name, folder / FMU))
+    if not proof:
+        return Exported(files, None, "")
+    logged = ""
+    if run is None:
+        length = min(chosen.flight.duration, LONGEST) if duration is None else duration
+        sets = parameter_sets(controller)
+        recordings = _recordings(chosen.vary(flight={"duration": length}), sets, 0 if float32 else drawn, seed)
+    else:
+        sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
+        same = sets[0].digest() == controller.digest()
+        require(same, "run", "a flight with other parameters", f"those of {chosen.name}")
+        recordings, logged = iter([recording]), f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
+    proved = prove(folder, commands, sets, recordings, float32=float32)
+    text = report(proved, chosen.name) + logged
+    with writing("c", folder, "a folder that can"):
+        write_file(folder / REPORT, text)
+    return Exported([*files, folder / REPORT], proved, text)
+
+
+def _recordings(scenario: Scenario, sets: Sequence[RiseDiConfig], drawn: int, seed: int) -> Iterator[Recording]:
+    """Flights; `drawn` steps and a tenth as many calls, in parts, so that a part fits in memory."""
+    yield from flight_recordings(scenario, sets)
+    if drawn:
+        yield drawn_calls(sets, max(drawn // 10, 100), seed)
+        each = -(-drawn // len(sets))
+        for index in range(len(sets)):
+            for begin in range(0, each, PART):
+                yield drawn_steps(sets, index, min(PART, each - begin), seed + index + begin)
