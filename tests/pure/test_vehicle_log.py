@@ -177,6 +177,24 @@ def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_pat
     assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
 
 
+def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path) -> None:
+    whole = ulog(tmp_path / "whole.ulg", flight).read_bytes()
+    (tmp_path / "cut.ulg").write_bytes(whole[: len(whole) // 2 + 3])  # inside a message
+    rates = [
+        len(read_vehicle_log(tmp_path / name).tables["vehicle_angular_velocity"].stamp_ns) for name in ("cut.ulg", "whole.ulg")
+    ]
+    assert rates[0] == pytest.approx(rates[1] / 2, rel=0.02)  # the head has the definitions
+
+
+def test_tlog_of_two_autopilots_is_that_of_the_first_and_says_so(flight: Flight, tmp_path: Path) -> None:
+    first = tlog(tmp_path / "one.tlog", flight).read_bytes()
+    write_tlog(tmp_path / "other.tlog", [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))], system=7)
+    (tmp_path / "both.tlog").write_bytes(first + (tmp_path / "other.tlog").read_bytes())
+    both, one = (read_vehicle_log(tmp_path / name) for name in ("both.tlog", "one.tlog"))
+    assert both.kind == "a tlog of MAVLink, system 1 alone; it also has 7"
+    np.testing.assert_array_equal(both.tables["ATTITUDE"].stamp_ns, one.tables["ATTITUDE"].stamp_ns)
+
+
 def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     with pytest.raises(ParameterError, match="found a CSV file, expected a DataFlash log"):
@@ -184,6 +202,9 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
     path = tmp_path / "cut.ulg"
     path.write_bytes(ulog(tmp_path / "flight.ulg", flight).read_bytes()[:100])
     with pytest.raises(ParameterError, match="a ULog of PX4"):
+        read_vehicle_log(path)
+    path.write_bytes(path.read_bytes()[:10])
+    with pytest.raises(ParameterError, match="a ULog of PX4 that cannot be decoded"):
         read_vehicle_log(path)
     for name, map_name, sentence in (
         ("flight.ulg", "ardupilot", "inputs.elevator: found no joy.axes"),

@@ -9,7 +9,8 @@ and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from flight_log.file_kinds import file_kind
 DEGREE = math.pi / 180.0
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 STICKS, SERVOS = 16, 16  # channels that are read
+ULOG_HEAD = 16  # bytes: magic, version and time
 
 
 class Table(NamedTuple):
@@ -214,31 +216,43 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
 
     wanted = _wanted(TLOG)
     parameters: dict[str, float] = {}
+    autopilots: dict[int, None] = {}  # systems in the order of their heartbeats
 
     def samples() -> Iterator[tuple[str, int, Any]]:
-        vehicle = None  # the first autopilot in the log
         with closing(mavutil.mavlink_connection(str(path), dialect="ardupilotmega")) as reader:
             while (message := reader.recv_match(type=[*wanted, "PARAM_VALUE"])) is not None:
                 name = message.get_type()
                 if message.get_srcComponent() != AUTOPILOT:
                     continue
-                if vehicle is None and name == "HEARTBEAT":
-                    vehicle = message.get_srcSystem()
-                if message.get_srcSystem() != vehicle:
+                if name == "HEARTBEAT":
+                    autopilots[message.get_srcSystem()] = None
+                if message.get_srcSystem() != next(iter(autopilots), None):
                     continue
                 if name == "PARAM_VALUE":
                     parameters[message.param_id] = float(message.param_value)
                 else:
                     yield name, round(NANOSECONDS * message._timestamp), message
 
-    return VehicleLog(kind, _tables(samples(), wanted), parameters, TLOG)
+    tables = _tables(samples(), wanted)
+    first, *others = map(str, autopilots) if autopilots else ("none",)
+    left_out = f", system {first} alone; it also has {', '.join(others)}" if others else ""
+    return VehicleLog(kind + left_out, tables, parameters, TLOG)
 
 
 def _read_ulog(path: Path, kind: str) -> VehicleLog:
     require_package("pyulog")
     from pyulog import ULog  # noqa: PLC0415 - an extra
+    from pyulog.core import ULogException  # noqa: PLC0415
 
-    log = ULog(str(path))
+    if path.stat().st_size < ULOG_HEAD:
+        raise ValueError("its head is cut")
+    try:
+        with redirect_stdout(StringIO()):  # pyulog prints that a file is damaged
+            log = ULog(str(path))
+    except ULogException as error:
+        raise ValueError(error) from None
+    if log.file_corruption:
+        kind += ", damaged: what can be read"
     tables = {}
     for data in log.data_list:
         if data.multi_id == 0:

@@ -87,7 +87,7 @@ def _messages(log: VehicleLog, quantity: str) -> str:
     from flight_log.vehicle_log import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
-    return " or ".join(at.message for at in sources.get(quantity, ())) or "one that the format has"
+    return " or ".join(dict.fromkeys(at.message for at in sources.get(quantity, ()))) or "one that the format has"
 
 
 class _Reader(NamedTuple):
@@ -130,7 +130,8 @@ def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool)
         before = Line(before.sign * scaled.sign, before.scale * scaled.scale, to_channel(scaled.offset, before))
         return _Reader(log, source, before, row.line)
     source = Source(log.format.sticks.message, log.format.sticks.field.format(number))
-    require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", "the transmitter's channel")
+    expected = "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
+    require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", expected)
     return _Reader(log, source, before, row.line)
 
 
