@@ -23,7 +23,17 @@ from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, blank, kind
 
 from autopilot_bridge.bridge import Bridge
-from autopilot_bridge.channel_map import STEP, Line, get_field, message_type, read_raw, set_field, to_channel, to_raw
+from autopilot_bridge.channel_map import (
+    STEP,
+    Line,
+    get_field,
+    message_type,
+    read_raw,
+    set_field,
+    to_channel,
+    to_raw,
+    version_faults,
+)
 from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
@@ -170,6 +180,18 @@ def test_each_map_is_dry_run_by_default_and_names_source_of_each_row(name: str) 
     for row in channel_map.inputs.values():
         assert row.release == (None if RELEASED[name] is None else pytest.approx(RELEASED[name], nan_ok=True))
         assert row.neutral == "trim" or to_channel(row.neutral, row.line) == pytest.approx(row.trim, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("version", "topic", "expected"),
+    [(1, "vehicle_status_v1", ""), (2, "vehicle_status_v1", "vehicle_status_v2"), (0, "vehicle_status_v1", "vehicle_status")],
+)
+def test_topic_of_px4_has_the_version_of_the_installed_definition(version: int, topic: str, expected: str) -> None:
+    status = Message(VehicleStatus=type("VehicleStatus", (), {"MESSAGE_VERSION": version}))
+    faults = version_faults([(f"/fmu/out/{topic}", "px4_msgs/msg/VehicleStatus")], lambda _: status)
+    assert [fault.split("whose topic is ")[1].split(":")[0] for fault in faults] == (
+        [f"/fmu/out/{expected}"] if expected else []
+    )
 
 
 def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:

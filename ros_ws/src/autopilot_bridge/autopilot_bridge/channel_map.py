@@ -9,7 +9,8 @@ array.array or NumPy arrays.
 import importlib
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -22,6 +23,7 @@ from flight_core.vectors import ChannelError
 # The path of a field: names separated by dots, each with an optional index in brackets.
 PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?")
+VERSION = re.compile(r"_v\d+$")  # at the end of a topic of PX4
 SEA_LEVEL_DENSITY = 1.225  # kg/m^3, ISO 2533. With it the speed of a dynamic pressure is the indicated airspeed.
 
 
@@ -157,3 +159,27 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
     if not isinstance(message_class, type):
         raise ParameterError(f"{name}: found no {kind} in the installed {package}, expected another version of {package}")
     return message_class
+
+
+def version_fault(topic: str, message_class: Any) -> str:
+    """What is wrong with the version in a topic of PX4, /fmu/.../NAME_vVERSION, as a sentence; empty where nothing is.
+
+    Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
+    """
+    version = getattr(message_class, "MESSAGE_VERSION", None)
+    if version is None or not topic.startswith("/fmu/"):
+        return ""
+    expected = VERSION.sub("", topic) + (f"_v{version}" if version else "")
+    definition = f"the installed {message_class.__name__} has version {version}"
+    return (
+        "" if topic == expected else f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"
+    )
+
+
+def version_faults(topics: Iterable[tuple[str, str]], load: Callable[[str], Any] = importlib.import_module) -> list[str]:
+    """`version_fault` of topics and types, for the message packages that are installed; the rest is not known."""
+    faults = []
+    for topic, kind in dict.fromkeys(topics):
+        with suppress(ParameterError):
+            faults.append(version_fault(topic, message_type(kind, load)))
+    return [fault for fault in faults if fault]

@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from autopilot_bridge import mavlink_link
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
-from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field
+from autopilot_bridge.channel_map import get_field, message_type, read_raw, set_field, version_fault
 from autopilot_bridge.mavlink_link import MavlinkPublisher, MavlinkReader
 from autopilot_bridge.params import (
     MAVLINK,
@@ -87,6 +87,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             kind = _message_type(rows[0][1].type)
             for name, row in rows:
                 _require_field(kind(), name, row)
+            if fault := version_fault(topic, kind):
+                self.get_logger().warning(fault)
             self._readers.append((self._reader(Topic(topic, kind, foreign=True)), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
@@ -342,6 +344,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
             return next(filter(None, (subscription.link.problem(subscription.message_name), *refused)), "no such message comes")
         publishers = self.get_publishers_info_by_topic(subscription.name)
+        if not publishers and (fault := version_fault(subscription.name, subscription.topic.type)):
+            return f"no publisher. {fault}"
         if not publishers:
             profile = os.environ.get(PROFILE_VARIABLE, "")
             return f"no publisher. The autopilot's agent needs the same DDS profile, {PROFILE_VARIABLE}={profile}"

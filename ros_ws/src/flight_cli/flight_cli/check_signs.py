@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
+from autopilot_bridge.channel_map import version_faults
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
@@ -36,6 +37,8 @@ def check_signs(
     Exit status: 0 agreement, 1 contradiction, 2 bad input.
     """
     channel_map = load_map(map_name)
+    for fault in version_faults((topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")):
+        print(f"warning: {fault}", file=sys.stderr)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
     if bag is not None:
