@@ -140,6 +140,14 @@ def test_score_of_campaign_is_that_of_single_process_simulation(wind: str, short
         np.testing.assert_allclose(found.rms, rms, rtol=2e-3)
 
 
+def test_scenario_with_turbulence_is_compared_in_its_own(short: Benchmark) -> None:
+    own = short.scenario.vary(flight={"duration": 0.1}, aircraft={"turbulence": {"altitude": 3000.0, "sigma": 1.5, "seed": 9}})
+    flown = tuning.build_benchmark(own, 3).scenarios[TURBULENCE].aircraft
+    assert flown.turbulence is not None
+    assert (flown.turbulence.altitude, flown.turbulence.sigma, flown.turbulence.seed) == (3000.0, 1.5, 3)
+    assert flown.gusts == {}
+
+
 def test_more_aircraft_do_not_change_results_of_first_ones(short: Benchmark) -> None:
     one = {"pi": {"gust": initial("pi", short)}}
     few, more = (next(iter(law_comparison.compare(short, one, count, [0.3, 0.5], 7))) for count in (2, 3))

@@ -146,7 +146,9 @@ def _function(text: str) -> tuple[Enter, str]:
     try:
         function = resolve_name(text)
     except (ImportError, AttributeError, ValueError, SyntaxError) as error:
-        raise ParameterError(f"ENTRY: found {text!r} ({error}), expected MODULE:FUNCTION of an installed package") from None
+        raise ParameterError(
+            f"ENTRY: found {text!r} ({error}), expected MODULE:FUNCTION, of a package or a file here"
+        ) from None
     require(callable(function), "ENTRY", text, "a function of a task")
     return function, hashlib.sha256(_source(function)).hexdigest()
 

@@ -93,7 +93,7 @@ class Benchmark(NamedTuple):
 def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE_SEED) -> Benchmark:
     """The benchmark of a scenario: its manoeuvre, actuators and noise; y, y_m and law at one rate, topics without delay.
 
-    Its winds are those of the scenario, and moderate turbulence of `turbulence_seed` alone. Raises ParameterError for a
+    Its winds are those of the scenario, and turbulence of `turbulence_seed` alone, `turbulence_of`. Raises ParameterError for a
     scenario that a campaign cannot fly, and for outputs whose unit has no score.
     """
     scenario = scenario.vary(
@@ -104,7 +104,8 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     airframe, _ = scenario.aircraft.load()
     controller = scenario.controller
     with_model = scenario.vary(controller=with_feedforward(controller, airframe).model_dump())
-    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": MODERATE | {"seed": turbulence_seed}})
+    air = turbulence_of(scenario) | {"seed": turbulence_seed}
+    turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": air})
     rows, columns = law_order(airframe, controller)
     actuators, m = scenario.aircraft.actuators, len(controller.inputs)
 
@@ -132,6 +133,12 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
         DELAY_TICKS if any(controller.lag) else 1,
     )
+
+
+def turbulence_of(scenario: Scenario) -> dict[str, float]:
+    """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at 100 m where it has none."""
+    own = scenario.aircraft.turbulence
+    return MODERATE if own is None else own.model_dump(exclude={"seed"}, exclude_none=True)
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS, Law
 from flight_analysis.closed_loop.margins import loop_assessment, scenario_loop
@@ -40,7 +39,7 @@ NOTES = """
 sees: measurements beside y_m. y alone is gyros and airspeed; a full state is y and the other states without error;
   vanes give alpha and beta relative to the air without error. No real sensor is as good
 knows: data of the nominal aircraft beside D; Omega_ii alone as the scale of the inputs
-gust: the wind of the scenario. turbulence: Dryden at {altitude:g} m, {wind:g} m/s of wind at 20 ft
+gust: the wind of the scenario. turbulence: Dryden at {altitude:g} m, {intensity}
 score: sum of rms of the true error over {unit}; mean (worst) of the aircraft of a level, every entry of A and B off by up to
   the level, rows of angles known; a few % are noise of the tuning
 lost: share of the aircraft that lose track in gusts, a score above 10; a diverged aircraft is lost and makes the mean infinite
@@ -231,6 +230,8 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
     slews = zip(controller.inputs, benchmark.activity_unit.tolist(), strict=True)
     delay = 1e3 * benchmark.model.period * benchmark.delay
+    air = gain_tuning.turbulence_of(scenario)
+    parts = {"wind": "m/s of wind at 20 ft", "sigma": "m/s rms at high altitude"}
     costs = []
     for aim in aims:
         objective = gain_tuning.OBJECTIVES[aim]
@@ -245,7 +246,8 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
         uncertain=gain_tuning.UNCERTAIN_AIRCRAFT,
         level=100.0 * gain_tuning.UNCERTAINTY,
         seeds=len(SEEDS),
-        **MODERATE,
+        altitude=air["altitude"],
+        intensity=", ".join(f"{air[key]:g} {text}" for key, text in parts.items() if key in air),
     )
 
 
