@@ -283,10 +283,13 @@ class GuidanceConfig(NodeConfig):
         return Notices(self.wind, self.max_age, lambda speed: largest_wind(speed, self.wind, self.bank), link_timeout)
 
     def climb_limits(self) -> tuple[float, float]:
-        """Largest climb and sink rate, m/s: 0.4 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0."""
+        """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0.
+
+        The rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back where the rest is too little.
+        """
         down, up = self.throttle_authority or (math.inf, math.inf)
         steepest, lift = STEEPEST * self.speed, self.speed / GRAVITY
-        return self.climb or min(0.4 * up * lift, steepest), self.sink or min(0.5 * down * lift, steepest)
+        return self.climb or min(0.7 * up * lift, steepest), self.sink or min(0.5 * down * lift, steepest)
 
     def params(self) -> GuidanceParams:
         """The numbers of the equations."""
