@@ -32,6 +32,7 @@ from flight_analysis.design.bridge_identification import (
     map_text,
     measured_trims,
     require_envelope,
+    within_range,
 )
 from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.response_identification import Response, identify_response
@@ -386,6 +387,24 @@ def test_experiment_stays_within_part_of_limits_of_map() -> None:
     for name, amplitude in zip(planned.inputs, planned.amplitude, strict=True):
         row = MAP.inputs[name]
         assert amplitude == pytest.approx(0.2 * min(-row.lower, row.upper))
+
+
+def test_trim_near_a_stop_narrows_the_limits_and_says_what_to_change() -> None:
+    thrust = MAP.inputs["thrust"]
+    trims = {name: row.trim for name, row in MAP.inputs.items()}
+    assert within_range(MAP, trims)[1] == []
+    narrower, sentences = within_range(MAP, trims | {"thrust": 0.85})
+    assert narrower.inputs["thrust"].lower == thrust.lower
+    assert narrower.inputs["thrust"].upper == pytest.approx(0.15, rel=1e-3)
+    expected = (
+        "thrust: its trim is 0.85, so that the upper limit is 0.15 in place of 0.3: fly slower, or trim the aircraft otherwise"
+    )
+    assert sentences == [expected]
+    assert ChannelMap.validate_mapping(yaml.safe_load(map_text(narrower, {"thrust": 0.85}, "a log")), "map")
+    with pytest.raises(
+        ParameterError, match=r"inputs\.thrust: found a trim of 1 at its stop, expected room on both sides: fly slower"
+    ):
+        within_range(MAP, trims | {"thrust": 1.0})
 
 
 QUADROTOR = REPOSITORY / "examples" / "px4_quadrotor"

@@ -28,6 +28,7 @@ from flight_analysis.design.bridge_identification import (
     map_text,
     measured_trims,
     require_envelope,
+    within_range,
 )
 from flight_analysis.design.log_import import COMMANDS, median_trims
 from flight_analysis.design.open_loop_fit import FASTEST_ZERO, ChannelModel
@@ -73,6 +74,9 @@ def identify_behind_bridge(
         trims, response, found = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
         raise ParameterError("; ".join(filter(None, (str(error), ended)))) from None
+    channel_map, narrower = within_range(channel_map, trims)
+    for sentence in narrower:
+        console.print(sentence, highlight=False, soft_wrap=True)
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()), needed)
     require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --accept beside --bridge")

@@ -394,6 +394,25 @@ def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int)
     return {name: to_channel(float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line) for name, row in rows}
 
 
+def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[ChannelMap, list[str]]:
+    """A map whose limits around trims stay in the ranges of the fields, and a sentence for each narrower one.
+
+    Raises ParameterError for a trim at a stop.
+    """
+    values, sentences = channel_map.model_dump(exclude_unset=True), []
+    for name, trim in trims.items():
+        row = channel_map.inputs[name]
+        low, high = sorted(to_channel(raw, row.line) for raw in row.range)
+        key, way_on = f"map {channel_map.name}: inputs.{name}", "fly slower, or trim the aircraft otherwise"
+        require(low < trim < high, key, f"a trim of {trim:.4g} at its stop", f"room on both sides: {way_on}")
+        for side, limit, room in (("lower", row.lower, low - trim), ("upper", row.upper, high - trim)):
+            if abs(limit) > abs(room):
+                values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")  # the trim is rounded too
+                found = f"{name}: its trim is {trim:.3g}, so that the {side} limit is {room:.3g} in place of {limit:.3g}"
+                sentences.append(f"{found}: {way_on}")
+    return ChannelMap.validate_mapping(values, f"map {channel_map.name}"), sentences
+
+
 def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
     """The text of a channel map with measured trims. A captured trim is measured again at every engagement."""
     values = channel_map.model_dump(exclude_unset=True)
