@@ -456,8 +456,8 @@ EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"):
 """Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
 AT_STOP = ("f16", "r")
 """Its rudder is at the stop in turns, so that r misses its limit."""
-LATE = 8.0
-"""Limit of the bank beyond its limit with a poor pose, deg: 0.2 s at p_max = 0.35 rad/s are 4 deg, and so are 5 Hz."""
+LATE = 5.0
+"""Limit of the bank beyond its limit with a poor pose, deg. A pose 0.4 s old costs 8 deg at p_max where nothing predicts."""
 
 
 class Row(NamedTuple):

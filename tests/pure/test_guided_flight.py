@@ -466,6 +466,13 @@ def test_guided_flight_commands_every_step() -> None:
     assert tape["u_m"].names == ("q", "V", "p", "r", "phi", "theta")
 
 
+def test_late_pose_costs_little_bank() -> None:
+    """At 0.35 rad/s a pose up to 0.4 s old would cost 8 deg; the rates of y bring the attitude to now."""
+    rough = calm(8.0, program=program(heading=math.pi / 2.0), max_age=0.6).vary(aircraft={"pose": {"rate": 5.0, "delay": 0.2}})
+    tape = simulate(rough)
+    assert 29.0 < math.degrees(np.abs(tape["pose"]["phi"]).max()) < 33.0
+
+
 def test_replay_names_first_different_step() -> None:
     """Replay computes every step of guidance again."""
     scenario = calm(4.0, program=program(heading=0.5))

@@ -30,6 +30,9 @@ from flight_guidance.wind import Wind, wind_estimate, wind_of
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
 
+LONGEST_LEAD = 0.5
+"""s. Largest age of a pose over which its attitude is brought to now: the rates change within a second."""
+
 EXIT = 0.5
 """s of flight beyond the end of a circle within which an aircraft leaves; later it flies another turn."""
 
@@ -342,8 +345,9 @@ def step(
 ) -> tuple[GuidanceState, Commands]:
     """A step: attitude, commands, u_m.
 
-    1. Attitude: phi and theta of pose. While pose is stale: Euler's kinematics with p, q, r of y (`Mode.DEAD_RECKONING`). After
-       `hold` the attitude is unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
+    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics with p, q, r of y. While pose
+       is stale: Euler's kinematics alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until
+       pose returns; then wings level and the altitude of then.
     2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a circle that touches the leg at
        the start, unless the aircraft is near; a leg whose end the aircraft passes far away is missed.
     3. The fence: the last safe turn, then home, in place of the lateral mode.
@@ -436,15 +440,15 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
             lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
             level = state._replace(lateral=lateral, vertical=Vertical.ALTITUDE, target=state.target._replace(**after_loss))
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
-        return state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
-    lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
+        state = state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
+        since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
+    else:
+        lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
+        state, since = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING), dt
     p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
     phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
-    return state._replace(
-        mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING,
-        phi=math.remainder(state.phi + dt * phi_dot, 2.0 * math.pi),
-        theta=state.theta + dt * theta_dot,
-    )
+    phi, theta = state.phi + since * phi_dot, state.theta + since * theta_dot
+    return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta)
 
 
 def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Motion:
@@ -452,7 +456,7 @@ def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, p
     return Motion(
         pose["north"],
         pose["east"],
-        pose["phi"],
+        state.phi,
         pose["psi"] + pose["beta"],
         speed,
         state.wind,
