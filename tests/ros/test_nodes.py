@@ -162,4 +162,4 @@ def test_an_installed_executable_runs(package: str, executable: str) -> None:
     script = REPOSITORY / "ros_ws" / "install" / package / "lib" / package / executable
     process = subprocess.run([script], capture_output=True, text=True, timeout=60, check=False)
     assert process.returncode == 2
-    assert f"error: {executable}." in process.stderr
+    assert f"error: {executable}: found no parameters" in process.stderr

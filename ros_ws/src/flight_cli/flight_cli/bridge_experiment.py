@@ -60,10 +60,8 @@ def identify_behind_bridge(
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
     channel_map = load_map(map_name)
     require(0.0 < amplitude <= 1.0, "--amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
-    if has_airspeed(channel_map):
-        require(speed is not None, "--speed", "none", "the airspeed in trim, m/s: the map has one")
-    else:
-        require(speed is None, "--speed", f"{speed}", "none: the map has no airspeed")
+    known = speed is not None or not has_airspeed(channel_map)
+    require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
     require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
     console = Console(quiet=as_json)
     if log is None:
