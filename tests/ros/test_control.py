@@ -6,6 +6,7 @@ import json
 import re
 import time
 import urllib.request
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -52,12 +53,19 @@ class Page:
 
     def until(self, flight: Process, **expected: Any) -> dict[str, Any]:
         """Ask for the state until it has these values."""
+        return self._until(flight, lambda found: found | expected == found)
+
+    def until_flown(self, flight: Process) -> dict[str, Any]:
+        """Ask for the state until the log has the digest that the page knows of the controller."""
+        return self._until(flight, lambda found: "digest" in found and found["digest"] == found["logged"])
+
+    def _until(self, flight: Process, is_expected: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         found: dict[str, Any] = {}
 
         def as_expected() -> bool:
             nonlocal found
             found = self.post("state")[1]
-            return found | expected == found
+            return is_expected(found)
 
         flight.until(as_expected)
         return found
@@ -83,8 +91,8 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
     watch = start("flight_cli.cli", "watch", str(run), "--control", "--port", "0").wait_for("http://")
     key = next(line for line in watch.lines if line.startswith("control key: ")).rpartition(" ")[2]
     page = Page(next(line for line in watch.lines if line.startswith("http://")), key)
-    state = page.until(flight, nodes=["aircraft", "controller"])
-    state = page.until(flight, logged=state["digest"])
+    page.until(flight, nodes=["aircraft", "controller"])
+    state = page.until_flown(flight)
     k_g = next(gain["values"][0] for gain in state["gains"] if gain["name"] == "k_g")
 
     status, changed = page.post("gains", digest=state["digest"], values={"k_g": [1.2 * k_g], "softening": [2.5]})

@@ -236,7 +236,8 @@ class Control:
         """State for the page: lease, nodes, gains with their ranges, digests, faults, the bridge."""
         nodes, scenario = self._link.nodes(), self._flight.scenario
         shown: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
-        if scenario is not None and "controller" in nodes and gains_of(scenario.controller):
+        known = scenario is not None and self._digest and "controller" in nodes  # the digest is that of a refresh
+        if scenario is not None and known and gains_of(scenario.controller):
             shown |= {"gains": self._gains(scenario), "digest": f"{self._digest:012x}", "logged": f"{self._flight.digest:012x}"}
         if scenario is not None and "aircraft" in nodes:
             channels = scenario.aircraft.channels()
