@@ -112,8 +112,10 @@ def tracking_error(tape: Tape) -> Signal:
 
 
 def _controlled(tape: Tape) -> tuple[str, ...]:
-    """The channels of y that y_m has: y may have more."""
-    return tuple(name for name in tape["y"].names if name in tape["y_m"].names)
+    """The channels of y that y_m has: y may have more. Raises ParameterError where they share none."""
+    names = tuple(name for name in tape["y"].names if name in tape["y_m"].names)
+    require(bool(names), "the log", f"y of {', '.join(tape['y'].names)}", f"a channel of y_m: {', '.join(tape['y_m'].names)}")
+    return names
 
 
 def true_error(tape: Tape) -> Signal | None:
