@@ -44,7 +44,7 @@ CHUNK = 50  # aircraft of a set that fly at once
 class Definition(Config):
     """All inputs of the scores, except the arithmetic of the CPU."""
 
-    version: int
+    version: int = Field(ge=1, le=10_000, description="the version of the sets")
     digest: str  # of the sets
     release: str = Field(description="the hash that fresh seeds come from; empty: the fixed seeds")
     aircraft: int = Field(ge=1, le=100_000, description="how many aircraft a set has")
