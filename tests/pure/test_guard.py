@@ -120,6 +120,17 @@ def test_controller_refuses_stamp_ahead_of_clock(signal: str) -> None:
     take(sample(AGE), 0)
 
 
+def test_y_of_at_most_a_period_after_newest_y_m_is_used() -> None:
+    controller = Controller(PARAMS)
+    for ms in (0, 10, 20, 30):
+        controller.take_y(sample(ms), 30 * MS)
+    for ms in (0, 10):  # y_m is late: at 30 ms it has no value, at 20 ms it can be extrapolated
+        controller.take_y_m(sample(ms), 30 * MS)
+    output = controller.tick(30 * MS)
+    assert output is not None
+    assert output.stamp_ns == 20 * MS
+
+
 def test_new_sample_is_step_of_law() -> None:
     """A new y is one step of the law, with the measured dt."""
     first, second = run((0, sample(0, 1.0), [sample(0)]), (12, sample(12, 1.1), [sample(12)]))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.closed_loop import law_params
 
 from flight_core.vectors import FloatArray
-from rise_di_controller.law import LawParams, LawState, Sign, engage, gain, step
+from rise_di_controller.law import LawParams, LawState, Sign, control, engage, gain, retune, step
 
 pytestmark = pytest.mark.package("rise_di_controller")
 
@@ -117,3 +117,10 @@ def test_a_step_changes_none_of_its_arguments() -> None:
     step(state, y, y_m, np.array(DT), params)
     arguments: tuple[FloatArray, ...] = (*state, y, y_m)
     assert [float(value[0]) for value in arguments] == [1.0, 2.0, 3.0, 4.0, 1.5, 0.5]
+
+
+def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() -> None:
+    old, new = one_channel(Sign.LITERAL, D=-1.0), one_channel(Sign.LITERAL, D=1.0)._replace(K=np.array([5.0]))
+    state, _ = step(engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old)
+    retuned = retune(state, old, new)
+    assert control(retuned, retuned, new) == pytest.approx(control(state, state, old), abs=1e-15)
