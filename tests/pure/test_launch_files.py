@@ -223,6 +223,14 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
 
+def test_end_of_learner_is_said_and_does_not_end_flight(tmp_path: Path) -> None:
+    actions, context = started("fly", scenario="osprey_learn", runs=tmp_path)
+    learner = nodes(all_ready(actions, context))["learner"]
+    assert learner.on_exit is not None
+    (said,) = learner.on_exit(ProcessExited("learner-5", -9), context)
+    assert said.msg == "learner-5 ended before the flight did: the law flies on with the model that it has"
+
+
 def test_node_of_another_flight_does_not_start_second_stage(tmp_path: Path) -> None:
     actions, context = started("fly", runs=tmp_path)
     for key in (f"/controller#{os.getpid()}", f"/controller#{os.getppid()}", "/controller#0", "/controller", "/controller#x"):

@@ -4,10 +4,12 @@
 
 import math
 import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flight_bringup.graph import LEARNER, parameter_overrides, second_stage
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -175,3 +177,15 @@ def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None
 def test_latency_above_shortest_spacing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"learn\.latency: found 6 s, expected at most 5 s"):
         find_scenario("osprey_learn").vary(controller={"learn": {"latency": 6.0}})
+
+
+def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behind_a_bridge(tmp_path: Path) -> None:
+    scenario = find_scenario("osprey_learn")
+    assert LEARNER in second_stage(scenario)
+    assert LEARNER not in second_stage(scenario.vary(controller={"learn": None}))
+    assert parameter_overrides(LEARNER, scenario, tmp_path, 0.0, lockstep=True) == {
+        "lockstep": True,
+        "scenario_file": str(scenario.path),
+    }
+    with pytest.raises(ValueError, match=r"controller\.learn: found a bridge, expected a simulated aircraft"):
+        second_stage(scenario, bridge=True)

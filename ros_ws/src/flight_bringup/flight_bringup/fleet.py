@@ -56,7 +56,7 @@ class FleetConfig(Config):
     origin: Annotated[tuple[Degrees, ...], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="latitude and longitude of north = east = 0, degrees; by default the home of each route"
     )
-    aircraft: Annotated[dict[str, AircraftOfFleet], Field(min_length=1)] = Field(description="the aircraft by name")
+    aircraft: Annotated[dict[str, AircraftOfFleet | None], Field(min_length=1)] = Field(description="the aircraft by name")
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,8 @@ def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
     require(isinstance(content, Mapping), str(path), "no mapping", A_FLEET)
     config = FleetConfig.validate_mapping(content, path.stem)
     members = []
-    for name, aircraft in config.aircraft.items():
+    for name, given in config.aircraft.items():
+        aircraft = given or AircraftOfFleet()
         try:
             namespace = absolute_namespace(name)
             require(namespace.count("/") == 1, "name", repr(name), "one word")

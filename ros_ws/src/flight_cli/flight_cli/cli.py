@@ -43,6 +43,7 @@ COMMANDS = MappingProxyType(
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
         "guidance": "Hold, skip a waypoint, resume, fly home or another route, in a running guided flight.",
+        "flightgear": "Show the aircraft of a running flight in FlightGear.",
         "network": "Write the profile of the middleware for nodes on several hosts, and check the network.",
         "engage": "Engage or disengage the autopilot behind a running bridge.",
         "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",

@@ -86,6 +86,20 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
     return (up - up_0) * math.cos(lat) - outward * math.sin(lat), out * math.sin(turn)
 
 
+def geographic(north: float, east: float, origin: Origin) -> Origin:
+    """Latitude and longitude, deg, of a position on the ellipsoid north and east of the origin, m: the inverse of `local`.
+
+    Each step of the iteration leaves a hundredth of the error within 50 km of an origin below 80 deg of latitude.
+    """
+    latitude, longitude = origin
+    for _ in range(8):
+        there = local(latitude, longitude, origin)
+        out, _up = _meridian(math.radians(latitude))
+        latitude += math.degrees((north - there[0]) / SEMI_MAJOR)
+        longitude += math.degrees((east - there[1]) / out)
+    return Origin(latitude, longitude)
+
+
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
     """Whether a position is on the half of the Earth around the origin; the antipodal half has the same north and east."""
     lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)

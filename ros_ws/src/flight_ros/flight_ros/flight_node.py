@@ -197,6 +197,7 @@ class FlightNode(Node, Generic[P]):
         ]
         for change in changes:
             if not self.has_parameter(change.name):
+                self._adopted = self.parameters  # declared without a check
                 self.declare_parameter(change.name, None, ParameterDescriptor(dynamic_typing=True))
         self._adopted = parameters
         self.set_parameters_atomically(changes)

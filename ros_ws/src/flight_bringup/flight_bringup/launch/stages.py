@@ -46,7 +46,6 @@ from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
 SHUTDOWN_DELAY = 0.05  # s
-LEARNER_ENDED = "learner ended: the law flies on with the model that it has"
 
 
 class NodeStateEvent(Event):
@@ -126,7 +125,7 @@ def flight_node(spec: NodeSpec, scenario: Scenario, overrides: ParameterOverride
         namespace=LaunchConfiguration("namespace"),
         parameters=[str(scenario.path), overrides],
         output="screen",
-        on_exit=[LogInfo(msg=LEARNER_ENDED)] if spec is LEARNER else partial(fail_on_exit, run=run),
+        on_exit=say_on_exit if spec is LEARNER else partial(fail_on_exit, run=run),
     )
 
 
@@ -154,6 +153,12 @@ def fail_on_exit(event: ProcessExited, context: LaunchContext, run: Path) -> Non
         reason = f"{event.process_name} ended before the flight did"
         leave_outcome(run, reason)
         raise RuntimeError(reason)
+
+
+def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
+    """Say that the learner has ended before the flight."""
+    ended = f"{event.process_name} ended before the flight did: the law flies on with the model that it has"
+    return [] if context.is_shutdown else [LogInfo(msg=ended)]
 
 
 def on_state(

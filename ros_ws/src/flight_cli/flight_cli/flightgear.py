@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di flightgear`: a running flight seen in FlightGear."""
+
+import math
+import re
+from typing import Annotated
+
+import typer
+
+from flight_cli.route_options import parse_origin
+from flight_core.environment import require_ros_environment
+from flight_core.installation import require_package
+from flight_core.parameters import require
+
+
+def flightgear(
+    origin: Annotated[str, typer.Option(metavar="LAT,LON", help="Where north = east = 0, degrees.")],
+    altitude: Annotated[
+        float, typer.Option(help="Altitude above sea of altitude 0 of the flight, m; 0 for an aircraft of JSBSim.")
+    ] = 0.0,
+    namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
+    to: Annotated[str, typer.Option(metavar="HOST:PORT", help="Where FlightGear listens.")] = "127.0.0.1:5500",
+    rate: Annotated[float, typer.Option(min=1.0, max=100.0, help="Packets a second.")] = 30.0,
+) -> None:
+    """Send the pose of a running flight to FlightGear, until the flight ends or Ctrl-C.
+
+    Exit status: 0 the flight ended, 2 bad input or no flight, 130 interrupted.
+    """
+    place = parse_origin(origin)
+    require(math.isfinite(altitude), "--altitude", altitude, "a number")
+    host, _, port = to.rpartition(":")
+    fits = bool(host) and re.fullmatch(r"[0-9]{1,5}", port) is not None and 0 < int(port) < 1 << 16
+    require(fits, "--to", repr(to), "an address and a port, as in 127.0.0.1:5500")
+    require_package("rclpy", "")
+    require_ros_environment()
+    from flight_bringup.client import FlightGearClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
+
+    if place is not None:
+        with FlightGearClient(namespace) as client:
+            client.wait()
+            print(f"sending to {to}; start FlightGear: fgfs --fdm=null --native-fdm=socket,in,{rate:g},,{port},udp", flush=True)
+            client.send((host, int(port)), place, altitude, rate)
