@@ -45,7 +45,7 @@ from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
-from flight_view.watch import newest_run, require_log, runs_in_recording
+from flight_view.watch import namespaces, newest_run, require_log, runs_in_recording
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
 
@@ -851,6 +851,23 @@ def test_no_run_and_no_log_are_sentences(tmp_path: Path) -> None:
         require_log(tmp_path)
 
 
+def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
+    """The places of both are topics of one answer; the page of the second shows its samples alone, without a note."""
+    with BagWriter(tmp_path) as bag:
+        for name, east in (("uav1", 1.0), ("uav2", 2.0)):
+            for topic, names in (("y", ["q", "V"]), ("pose", ["north", "east"])):
+                bag.write(bag.add_topic(f"/{name}/{topic}", JOINT_STATE, ""), 5, 5, 0, vector(5, names, [0.0, east]))
+    flights = [Flight(tmp_path, namespace=name) for name in namespaces(tmp_path)]
+    server = Server(flights, TOKEN, fleet=True)
+    for flight in flights:
+        flight.update()
+    head, columns = decoded(server.answer(server.flights[2], {}))
+    assert (head["flight"], head["start"]) == ({"aircraft": [["uav1", 5e-9], ["uav2", 5e-9]]}, 5e-9)
+    assert {name: values[0, 1] for name, (_, values) in columns.items()} == {"0": 1.0, "1": 2.0}
+    head, columns = decoded(server.answer(server.flights[1], {}))
+    assert (head["fleet"], head["ghost"], head["faults"], columns["pose"][1][0, 1]) == (2, False, [], 2.0)
+
+
 # The command
 
 
@@ -886,6 +903,8 @@ def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
     for words, expected in (
         (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
         ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
+        ((recorded,) * 3, "error: RUN: found 3 runs, expected a run and a ghost, or --fleet\n"),
+        (("--fleet",), "error: --fleet: runs: found no run in recording, expected each RUN by its name\n"),
         ((recorded, "--namespace", "n"), f"error: {recorded}: found aircraft in the namespaces /, expected one in 'n'\n"),
     ):
         ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)

@@ -48,7 +48,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 @contextmanager
-def serving(*runs: Path, control: Callable[[Flight], Control] | None = None) -> Iterator[str]:
+def serving(*runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False) -> Iterator[str]:
     """Serve runs from a thread of this process; the address with the token."""
     ready, address = threading.Event(), ""
     loop = asyncio.new_event_loop()
@@ -56,7 +56,7 @@ def serving(*runs: Path, control: Callable[[Flight], Control] | None = None) -> 
     async def serve() -> None:
         nonlocal address
         flights = [Flight(run) for run in runs]
-        server = Server(flights, TOKEN, control(flights[0]) if control else None)
+        server = Server(flights, TOKEN, control(flights[0]) if control else None, fleet=fleet)
         server.listen(0)
         address = f"http://127.0.0.1:{server.port}/#token={TOKEN}"
         ready.set()
@@ -78,9 +78,11 @@ def serving(*runs: Path, control: Callable[[Flight], Control] | None = None) -> 
 
 
 @contextmanager
-def shown(browser: Browser, *runs: Path, control: Callable[[Flight], Control] | None = None) -> Iterator[str]:
+def shown(
+    browser: Browser, *runs: Path, control: Callable[[Flight], Control] | None = None, fleet: bool = False
+) -> Iterator[str]:
     """Serve finished runs and open the page; leave it before the server ends."""
-    with serving(*runs, control=control) as address:
+    with serving(*runs, control=control, fleet=fleet) as address:
         try:
             browser.open(address)
             browser.wait_for(f"{DRAWN} > 1 && {STATE} === 'ENDED'")
@@ -347,6 +349,28 @@ def test_second_run_drawn_as_ghost(browser: Browser, recorded: Path, tape: Tape,
                 assert browser.console == []
         finally:
             browser.call("Emulation.setEmulatedMedia", features=[])
+
+
+def test_fleet_on_one_map_with_choice_of_aircraft(browser: Browser, tmp_path: Path) -> None:
+    """uav2 begins 2 s after uav1 and flies north, 300 m east of uav1: the choice of the other keeps the instant."""
+    names = ["phi", "theta", "psi", "north", "east", "altitude"]
+    for name, start_ns, east in (("uav1", 10_000_000_000, 0.0), ("uav2", 12_000_000_000, 300.0)):
+        with BagWriter(tmp_path / name) as bag:
+            pose = bag.add_topic(f"/{name}/pose", JOINT_STATE, "")
+            for k in range(101):
+                stamp_ns = start_ns + k * 100_000_000
+                bag.write(pose, stamp_ns, stamp_ns, k, vector(stamp_ns, names, [0.0, 0.0, 0.0, 2.0 * k, east + 0.3 * k, 50.0]))
+    place = "document.getElementById('aircraft')"
+    with shown(browser, tmp_path / "uav1", tmp_path / "uav2", fleet=True) as address:
+        browser.wait_for(f"{place}.options.length === 2")
+        assert browser.run(f"[...{place}.options].map(({{text}}) => text)") == ["uav1", "uav2"]
+        browser.wait_for(f"{PIXELS}('#scene', '--ghost') > 20")
+        browser.run(f"location.href = '{address.partition('#')[0]}#t=5'; location.reload()")
+        browser.wait_for(f"{TIME} === 5 && {place}.value === '0' && {place}.options.length === 2")
+        browser.run(f"{place}.value = '1'; {place}.dispatchEvent(new Event('change'))")
+        browser.wait_for(f"{TIME} === 3 && document.getElementById('name').textContent === 'uav2' && {place}.value === '1'")
+        browser.wait_for(f"{PIXELS}('#scene', '--ghost') > 20")
+        assert browser.console == []
 
 
 def test_names_that_are_html_shown_as_text(browser: Browser, tmp_path: Path) -> None:

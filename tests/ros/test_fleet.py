@@ -14,7 +14,7 @@ import pytest
 from tests.ros.conftest import Start
 
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.fleet import fly_fleet, read_fleet
+from flight_bringup.fleet import fly_fleet, new_runs, read_fleet
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.package("flight_bringup")
@@ -26,7 +26,8 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
         "{lockstep: true, composed: true, duration: 0.6, aircraft: {one: {}, two: {start: {east: 90.0, heading: 1.0}}}}",
         encoding="utf-8",
     )
-    for flown in fly_fleet(read_fleet(file), tmp_path / "runs", lambda name, t, shown: None):
+    fleet = read_fleet(file)
+    for flown in fly_fleet(fleet, new_runs(fleet, tmp_path / "runs"), lambda name, t, shown: None):
         assert flown.outcome == "completed"
         recorded, alone = read_run(flown.run), simulate(flown.member.scenario)
         assert {topic.split("/")[1] for topic in recorded.topics if topic.endswith(("/y", "/u"))} == {flown.member.name}

@@ -218,8 +218,15 @@ class Flown:
     outcome: str
 
 
-def fly_fleet(fleet: Fleet, runs: Path, progress: Callable[[str, float, str], None]) -> list[Flown]:
-    """Fly a fleet over topics. `progress` is called with the name of an aircraft, its flight time, s, and a text.
+def new_runs(fleet: Fleet, runs: Path) -> list[Path]:
+    """Create the folder of the run of each aircraft."""
+    return [new_run(member.scenario, runs, f"{member.name}-") for member in fleet.members]
+
+
+def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float, str], None]) -> list[Flown]:
+    """Fly a fleet over topics, with a run for each aircraft.
+
+    `progress` is called with the name of an aircraft, its flight time, s, and a text.
 
     In real time the aircraft share t = 0, which is set once every node is ready; each may begin later by its delay. An aircraft
     that ends early, or never begins, leaves the others untouched. Ctrl-C ends all. Raises ParameterError where none can begin.
@@ -230,8 +237,7 @@ def fly_fleet(fleet: Fleet, runs: Path, progress: Callable[[str, float, str], No
     flights: list[_Flight] = []
     with handle_signals(interrupt), ExitStack() as stack:
         try:
-            for member in fleet.members:
-                run = new_run(member.scenario, runs, f"{member.name}-")
+            for member, run in zip(fleet.members, runs, strict=True):
                 outputs, namespace = member.scenario.controller.outputs, absolute_namespace(member.name)
                 monitor = stack.enter_context(FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace))
                 flights.append(_Flight(member, run, monitor, partial(progress, member.name)))

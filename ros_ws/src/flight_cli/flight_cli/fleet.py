@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di fleet`: fly several aircraft at once, then show a line an aircraft."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -11,7 +12,7 @@ import typer
 from rich.console import Console
 
 from flight_analysis.report.run_folder import write_empty_summary, write_report
-from flight_bringup.fleet import Flown, fly_fleet, read_fleet
+from flight_bringup.fleet import Flown, fly_fleet, new_runs, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
@@ -24,10 +25,12 @@ SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 
 
 def fleet(
+    context: typer.Context,
     file: Annotated[Path, typer.Argument(help="File of the fleet (.yaml): docs/fleets.md.")],
     duration: Annotated[
         float | None, typer.Option(help="Flight time of each aircraft in s; by default that of the file.")
     ] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the fleet while it flies.")] = False,
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder of each aircraft is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summaries as JSON, by name, nothing else.")] = False,
 ) -> None:
@@ -39,6 +42,11 @@ def fleet(
     require_package("rclpy", "")
     require_ros_environment()
     chosen = read_fleet(file, duration)
+    chosen_runs = new_runs(chosen, runs)
+    if watch:
+        from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
+
+        print(*context.with_resource(watched(*chosen_runs, fleet=True)), sep="\n", file=sys.stderr)
     totals = {member.name: member.scenario.flight.duration for member in chosen.members}
     with progress_bar(NAME_COLUMN, *CLOCK_COLUMNS, quiet=as_json) as bar:
         tasks = {name: bar.add_task(name, total=total, clock="", shown="") for name, total in totals.items()}
@@ -46,7 +54,7 @@ def fleet(
         def progress(name: str, t: float, shown: str) -> None:
             bar.update(tasks[name], completed=t, clock=clock(t, totals[name]), shown=shown)
 
-        flown = fly_fleet(chosen, runs, progress)
+        flown = fly_fleet(chosen, chosen_runs, progress)
         for each in flown:
             bar.update(tasks[each.member.name], shown=f"{each.outcome}, report to write")
         results = {each.member.name: _report(each) for each in flown}

@@ -19,18 +19,27 @@ from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import missing
 from flight_core.parameters import ParameterError, require
-from flight_log.tape_reader import StoredFile, stored_scenario
-from flight_view.background import Line, read_background
+from flight_log.tape_reader import stored_scenario
+from flight_view.background import read_background
 from flight_view.flight import Flight
 from flight_view.text import show
-from flight_view.watch import DEFAULT_PORT, newest_run, require_log, runs_in_recording, serve
+from flight_view.watch import DEFAULT_PORT, namespaces, newest_run, require_log, runs_in_recording, serve
 
 
 def watch(
     run: Annotated[
-        Path | None, typer.Argument(help="Folder of a run, or an MCAP file; by default the run in progress, else the last one.")
+        list[Path] | None,
+        typer.Argument(
+            metavar="[RUN]...",
+            help="Folder of a run, or an MCAP file; by default the run in progress, else the last one. The second is a ghost.",
+        ),
     ] = None,
-    ghost: Annotated[Path | None, typer.Argument(metavar="[RUN2]", help="A second run, shown as a ghost.")] = None,
+    fleet: Annotated[
+        bool,
+        typer.Option(
+            "--fleet", help="Show the aircraft of each RUN on one map, and a choice of them; by default the runs in progress."
+        ),
+    ] = False,
     port: Annotated[
         int | None,
         typer.Option(min=0, max=65535, help="Port on this host; 0 takes any free one.", show_default=f"{DEFAULT_PORT}"),
@@ -62,9 +71,14 @@ def watch(
 
     The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
-    require(not wait or run is not None, "--wait", "no RUN", "the folder of a run that will be recorded")
+    require(not wait or bool(run), "--wait", "no RUN", "the folder of a run that will be recorded")
+    require(fleet or len(run or ()) < 3, "RUN", f"{len(run or ())} runs", "a run and a ghost, or --fleet")
+    controlled = control or control_real
+    require(
+        not (fleet and (text or foxglove or controlled)), "--fleet", "--text, --foxglove or --control beside it", "the page"
+    )
     given = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
-    chosen = [_newest(runs, namespace) if run is None else run, *([ghost] if ghost is not None else [])]
+    chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
     for folder in chosen:
         if not wait:
             require_log(folder, namespace)
@@ -72,16 +86,27 @@ def watch(
     lines = [] if background is None else read_background(background, parse_origin(origin))
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:
-        require(ghost is None, "--text", "two runs", "one run")
-        require(not (control or control_real), "--text", "--control beside it", "one of the two")
-        show(Flight(chosen[0], namespace=namespace, scenario=given))
-    elif foxglove:
-        require(ghost is None and not (control or control_real), "--foxglove", "a ghost or --control beside it", "RUN alone")
+        require(len(chosen) == 1, "--text", "two runs", "one run")
+        require(not controlled, "--text", "--control beside it", "one of the two")
+    if foxglove:
+        require(len(chosen) == 1 and not controlled, "--foxglove", "a ghost or --control beside it", "RUN alone")
         _serve_foxglove(chosen[0], port)
-    elif control or control_real:
-        _serve_with_control(chosen, ports, namespace or "", given, lines, real=control_real)
+        return
+    aircraft = [(folder, name) for folder in chosen for name in (namespaces(folder) if fleet else (namespace,))]
+    flights = [Flight(folder, namespace=name, scenario=given, background=lines) for folder, name in aircraft]
+    if text:
+        show(flights[0])
+    elif controlled:
+        _serve_with_control(flights, ports, namespace or "", real=control_real)
     else:
-        serve(chosen, ports, _announce, None, namespace, given, lines)
+        serve(flights, ports, _announce, fleet=fleet)
+
+
+def _in_progress(runs: Path) -> list[Path]:
+    """The runs in recording, in the order of their names. Raises ParameterError without one."""
+    recording = runs_in_recording(runs)[::-1]
+    require(bool(recording), f"--fleet: {runs}", "no run in recording", "each RUN by its name")
+    return recording
 
 
 def _newest(runs: Path, namespace: str | None) -> Path:
@@ -90,7 +115,7 @@ def _newest(runs: Path, namespace: str | None) -> Path:
     beside = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
     if beside and namespace is None:
         print(
-            f"note: shows {display_path(chosen)}; also in flight: {', '.join(beside)}: name one, or --namespace",
+            f"note: shows {display_path(chosen)}; also in flight: {', '.join(beside)}: name one, or --namespace, or --fleet",
             file=sys.stderr,
         )
     return chosen
@@ -110,15 +135,7 @@ def _serve_foxglove(run: Path, port: int | None) -> None:
     foxglove_server.serve(run, foxglove_server.DEFAULT_PORT if port is None else port, _announce)
 
 
-def _serve_with_control(
-    runs: Sequence[Path],
-    ports: Sequence[int],
-    namespace: str,
-    scenario: StoredFile | None,
-    background: Sequence[Line],
-    *,
-    real: bool,
-) -> None:
+def _serve_with_control(flights: Sequence[Flight], ports: Sequence[int], namespace: str, *, real: bool) -> None:
     from flight_analysis.closed_loop.margins import delay_margins  # noqa: PLC0415 - loads scipy, which a page without control lacks
     from flight_view.control import Control, new_key  # noqa: PLC0415 - as above
 
@@ -126,24 +143,20 @@ def _serve_with_control(
     from flight_view.control_client import ControlClient  # noqa: PLC0415 - loads rclpy, which a page without control lacks
 
     with ControlClient(namespace) as client:
-        key, controls = new_key(), []
-
-        def control(flight: Flight) -> Control:
-            controls.append(Control(flight, client, key, real=real, assess=delay_margins))
-            return controls[0]
-
+        key = new_key()
+        control = Control(flights[0], client, key, real=real, assess=delay_margins)
         _announce(f"control key: {key}")
         try:
-            serve(runs, ports, _announce, control, namespace or None, scenario, background)
+            serve(flights, ports, _announce, control)
         finally:
-            for opened in controls:
-                opened.close()
+            control.close()
 
 
 @contextmanager
-def watched(run: Path) -> Iterator[list[str]]:
-    """Serve the page of a run that will be recorded, by another process during the block. Yields its lines for the user."""
-    command = [*end_with_parent(), sys.executable, "-P", "-m", "flight_cli.cli", "watch", str(run), "--wait"]
+def watched(*runs: Path, fleet: bool = False) -> Iterator[list[str]]:
+    """Serve the page of runs that will be recorded, by another process during the block. Yields its lines for the user."""
+    options = ["--wait", *(["--fleet"] if fleet else [])]
+    command = [*end_with_parent(), sys.executable, "-P", "-m", "flight_cli.cli", "watch", *map(str, runs), *options]
     # In a process group of its own: Ctrl-C reaches the flight alone, whose end the page still shows.
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, process_group=0) as server:  # noqa: S603
         try:

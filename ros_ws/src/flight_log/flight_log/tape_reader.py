@@ -166,14 +166,14 @@ def stored_scenario(path: Path) -> StoredFile:
     return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
 
 
-def _aircraft(topics: Collection[str]) -> list[str]:
+def aircraft_namespaces(topics: Collection[str]) -> list[str]:
     """The namespaces of aircraft."""
     return sorted({topic.rpartition("/")[0] for topic in topics if topic.rpartition("/")[2] in AIRCRAFT_TOPICS})
 
 
 def chosen_namespace(topics: Collection[str], namespace: str | None, where: str) -> str:
     """The namespace of an aircraft, "" for the root and without an aircraft; `namespace` is the choice of the caller."""
-    aircraft = _aircraft(topics)
+    aircraft = aircraft_namespaces(topics)
     known = ", ".join(name or "/" for name in aircraft) or "none"
     if namespace is None:
         require(
@@ -187,7 +187,7 @@ def chosen_namespace(topics: Collection[str], namespace: str | None, where: str)
 
 def names_within(chosen: str, topics: Collection[str]) -> dict[str, str]:
     """Names within the namespace of an aircraft, by full topic name, without nested aircraft."""
-    nested = [f"{name}/" for name in _aircraft(topics) if name.startswith(f"{chosen}/")]
+    nested = [f"{name}/" for name in aircraft_namespaces(topics) if name.startswith(f"{chosen}/")]
     return {
         topic: topic.removeprefix(f"{chosen}/")
         for topic in topics

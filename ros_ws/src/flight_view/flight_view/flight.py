@@ -132,6 +132,7 @@ class Flight:
         self.bands: dict[str, float] = {}  # half-widths of the settling bands, SI
         self._follower = Follower(run, self._rate_of)
         self._topics: dict[str, _Topic] = {}  # by full name
+        self._asked = namespace is not None
         self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
         self._kinds: dict[str, str] = {}  # types of the topics of the log, by full name
         self._takes_routes = True  # whether guidance takes a route in flight
@@ -154,6 +155,11 @@ class Flight:
     def start_ns(self) -> int:
         """Stamp of flight time 0: by `truth`, else the first y_m, the origin of commands; else the earliest stamp."""
         return next((stamp for stamp in (self._start_ns, self._reference_ns, self._first_ns) if stamp is not None), 0)
+
+    @property
+    def aircraft(self) -> str:
+        """The namespace of the aircraft; without namespace the name of the run."""
+        return (self._namespace or "").strip("/") or self.name
 
     @property
     def end(self) -> float:
@@ -250,7 +256,8 @@ class Flight:
         if self._namespace is None:
             self._namespace = namespace
         if namespace != self._namespace:
-            self._note(f"another aircraft in the namespace {namespace or '/'} is not shown: --namespace {namespace or '/'}")
+            if not self._asked:
+                self._note(f"another aircraft in the namespace {namespace or '/'} is not shown: --namespace {namespace or '/'}")
             return 0.0
         return RATES[name]
 

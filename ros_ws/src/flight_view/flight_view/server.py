@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serves the page and the samples of one or two flights to browsers on this host, over HTTP.
+"""Serves the page and the samples of flights to browsers on this host, over HTTP.
 
 A browser asks for news, and draws the answer before the next request: nothing queues for a slow browser. After the first
 answer the browser asks by a WebSocket, with two fifths of the processor time of an HTTP request. Only GET is answered, for a
@@ -36,6 +36,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler, WebSocketP
 from flight_analysis.report.summary import finite_or_null
 from flight_core.rates import NANOSECONDS
 from flight_view.control import Control, RefusedError
+from flight_view.fleet import Fleet
 from flight_view.flight import Flight
 
 ADDRESS = "127.0.0.1"
@@ -69,16 +70,21 @@ BUDGET = 0.05  # s of reading between two answers
 
 
 class Server:
-    """The server of one or two flights, and the task to follow the logs."""
+    """The server of flights, and the task to follow the logs.
 
-    def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None) -> None:
-        self.flights = flights
+    A second flight is a ghost. With `fleet` each flight is an aircraft of a fleet, and the last number has the places of all
+    aircraft.
+    """
+
+    def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None, *, fleet: bool = False) -> None:
+        self.followed, self.fleet = flights, fleet
+        self.flights: Sequence[Flight | Fleet] = [*flights, Fleet(flights)] if fleet else flights
         self.control = control
         self.token = token
         self.port = 0
         self.streams: set[_News] = set()  # open WebSockets
         self._news = asyncio.Event()
-        names = [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([01])", _Data), (r"/news/([01])", _News)]
+        names = [(r"/(|[a-z]+\.[a-z]+)", _File), (r"/data/([0-9]{1,3})", _Data), (r"/news/([0-9]{1,3})", _News)]
         self.http = _LimitedServer(
             Application(
                 [*names, *([(r"/control", _Control)] if control else [])],
@@ -119,18 +125,18 @@ class Server:
         """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update` does."""
         looked = -math.inf
         while True:
-            changed, rest = [flight.update(BUDGET) for flight in self.flights], POLL_PERIOD
+            changed, rest = [flight.update(BUDGET) for flight in self.followed], POLL_PERIOD
             if any(changed):
                 self._news.set()
                 self._news.clear()
-                rest = 0.0 if any(flight.state() == "reading" for flight in self.flights) else REST
+                rest = 0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
             if any(changed) or time.monotonic() > looked + STATE_PERIOD:
                 looked = time.monotonic()
                 for stream in [*self.streams]:
                     stream.look()
             await asyncio.sleep(rest)
 
-    async def news(self, flight: Flight, known: Mapping[str, str]) -> bytes:
+    async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s for news."""
         deadline = time.monotonic() + MAX_WAIT
         while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
@@ -138,17 +144,19 @@ class Server:
                 await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
         return self.answer(flight, known)
 
-    def answer(self, flight: Flight, known: Mapping[str, str]) -> bytes:
+    def answer(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic. Raises HTTPError for too long a number."""
-        return answer(flight, known, ghost=len(self.flights) > 1, control=self.control is not None)
+        several = len(self.followed) > 1
+        fleet = len(self.followed) if self.fleet else 0
+        return answer(flight, known, ghost=several and not fleet, fleet=fleet, control=self.control is not None)
 
 
-def _epoch(flight: Flight) -> str:
+def _epoch(flight: Flight | Fleet) -> str:
     """Changes when rows known to a browser have changed: by thinning, or with the instant of flight time 0."""
     return f"{flight.start_ns}.{sum(samples.thinned for samples in flight.samples.values())}"
 
 
-def _first_rows(flight: Flight, known: Mapping[str, str]) -> dict[str, int]:
+def _first_rows(flight: Flight | Fleet, known: Mapping[str, str]) -> dict[str, int]:
     """The first row unknown to a browser, by topic. Raises HTTPError for too long a number."""
     same = known.get("epoch") == _epoch(flight)
     rows = {name: known.get(name, "") if same else "" for name in (*flight.samples, "events")}
@@ -157,7 +165,7 @@ def _first_rows(flight: Flight, known: Mapping[str, str]) -> dict[str, int]:
     return {name: int(text) if text.isascii() and text.isdigit() else 0 for name, text in rows.items()}
 
 
-def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
+def has_news(flight: Flight | Fleet, known: Mapping[str, str]) -> bool:
     """Whether a browser lacks a row, an event, or the state."""
     first = _first_rows(flight, known)
     return (
@@ -168,8 +176,12 @@ def has_news(flight: Flight, known: Mapping[str, str]) -> bool:
     )
 
 
-def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, control: bool = False) -> bytes:
+def answer(
+    flight: Flight | Fleet, known: Mapping[str, str], *, ghost: bool = False, fleet: int = 0, control: bool = False
+) -> bytes:
     """Data unknown to a browser: the length of a head as uint32, the head as JSON, then columns per topic of the head.
+
+    `fleet`: the number of the places of all aircraft; 0 without a fleet.
 
     Little endian; the head ends at a multiple of 8 bytes. Columns of a topic with `count` rows: flight time in s as float64,
     then the channels as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
@@ -190,6 +202,8 @@ def answer(flight: Flight, known: Mapping[str, str], *, ghost: bool = False, con
         "epoch": _epoch(flight),
         "state": flight.state(),
         "ghost": ghost,
+        "fleet": fleet,
+        "start": flight.start_ns / NANOSECONDS,
         "control": control,
         "faults": flight.faults(),
         "bands": finite_or_null(flight.bands),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finds the run to watch and serves the run until SIGINT or SIGTERM."""
+"""Finds the runs to watch, and serves flights until SIGINT or SIGTERM."""
 
 import asyncio
 import os
@@ -17,8 +17,7 @@ from flight_log.disk import is_locked
 from flight_log.named_vectors import JOINT_STATE, full_name
 from flight_log.open_log import log_files, log_topics
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.tape_reader import A_FLIGHT, StoredFile, chosen_namespace, listed
-from flight_view.background import Line
+from flight_log.tape_reader import A_FLIGHT, aircraft_namespaces, chosen_namespace, listed
 from flight_view.control import Control
 from flight_view.flight import RATES, Flight
 from flight_view.server import ADDRESS, Server
@@ -47,6 +46,13 @@ def newest_run(runs: Path, namespace: str | None = None) -> Path:
     return latest.resolve()
 
 
+def namespaces(run: Path) -> list[str | None]:
+    """The namespaces of the aircraft in the log of a run; of a log without aircraft None alone, the first aircraft to come."""
+    with suppress(ParameterError, OSError):
+        return [*aircraft_namespaces(log_topics(run))] or [None]
+    return [None]
+
+
 def require_log(run: Path, namespace: str | None = None) -> None:
     """Raise ParameterError unless a run has the log of a flight, or a log in recording, of an aircraft in the namespace."""
     with suppress(OSError):
@@ -61,32 +67,24 @@ def require_log(run: Path, namespace: str | None = None) -> None:
 
 
 def serve(
-    runs: Sequence[Path],
-    ports: Sequence[int],
-    announce: Callable[[str], None],
-    control: Callable[[Flight], Control] | None = None,
-    namespace: str | None = None,
-    scenario: StoredFile | None = None,
-    background: Sequence[Line] = (),
-) -> None:
-    """Serve a run, and a second run as a ghost, on the first free port, until SIGINT or SIGTERM.
-
-    `announce` gets two lines for the user. `control` lets the page command the first flight. `namespace`, `scenario` and
-    `background` as in `Flight`.
-
-    Raises ParameterError where no port is free, or a log is unreadable.
-    """
-    flights = [Flight(run, namespace=namespace, scenario=scenario, background=background) for run in runs]
-    asyncio.run(_serve(flights, ports, announce, control))
-
-
-async def _serve(
     flights: Sequence[Flight],
     ports: Sequence[int],
     announce: Callable[[str], None],
-    control: Callable[[Flight], Control] | None,
+    control: Control | None = None,
+    *,
+    fleet: bool = False,
 ) -> None:
-    server = Server(flights, secrets.token_urlsafe(16), None if control is None else control(flights[0]))
+    """Serve flights, as `Server` does, on the first free port, until SIGINT or SIGTERM.
+
+    `announce` gets two lines for the user. `control` lets the page command the first flight.
+
+    Raises ParameterError where no port is free, or a log is unreadable.
+    """
+    server = Server(flights, secrets.token_urlsafe(16), control, fleet=fleet)
+    asyncio.run(_serve(server, ports, announce))
+
+
+async def _serve(server: Server, ports: Sequence[int], announce: Callable[[str], None]) -> None:
     for port in ports:
         try:
             server.listen(port)

@@ -28,7 +28,7 @@ async function replay() {
     if (playing) t += Math.min(now - before, 250) / 1e3 * Number(speed.value);
     before = now;
     if (t >= end) { t = end; playing = false; }
-    scene.draw(flight, null, t, colour);
+    scene.draw(flight, [], t, colour);
     drawHorizon(horizon, poseAt(flight, t), colour);
     slider.value = t;
     const mode = flight.get("internals")?.at("mode", t);

@@ -36,7 +36,7 @@ export class Flight { // one flight of the server
   constructor(number) {
     this.number = number;
     this.socket = null;
-    this.head = {state: "", faults: [], bands: {}, described: "", ghost: false};
+    this.head = {state: "", faults: [], bands: {}, described: "", ghost: false, fleet: 0, start: 0};
     this.clear("");
   }
 
@@ -70,8 +70,8 @@ export class Flight { // one flight of the server
       if (head.events.length) this.events.sort((one, other) => one.t - other.t); // topics arrive one behind another
     }
     if (head.flight) this.info = {...this.info, ...head.flight};
-    const {state, faults, bands, described, ghost, control} = head;
-    this.head = {state, faults, bands, described, ghost, control};
+    const {state, faults, bands, described, ghost, fleet, start, control} = head;
+    this.head = {state, faults, bands, described, ghost, fleet, start, control};
     return head.topics.length > 0;
   }
 

@@ -16,11 +16,12 @@ const HEADINGS = {HEADING: "target.heading", COURSE: "target.course"}; // what t
 const SPANS = {speed: 0.5, height: 200}; // of the tapes: of the airspeed itself, and of the altitude, m
 const BADGES = {CONNECTING: "", WAITING: "warn", READING: "", LIVE: "good", "NO DATA": "bad", "NO SERVER": "bad", INTERRUPTED: "warn", ENDED: ""};
 
-const ASKED = parseFloat(new URLSearchParams(location.hash.slice(1)).get("t")); // s, of an address that ends with #t=12.5
+const ADDRESS = new URLSearchParams(location.hash.slice(1)); // that may end with #aircraft=2&t=12.5
+const ASKED = parseFloat(ADDRESS.get("t")); // s
 
 const $ = id => document.getElementById(id);
-const flight = new Flight(0);
-let ghost = null, charts = [], chartKey = "", colours = {}, dirty = true, shownEvents = -1;
+const flight = new Flight(Number(ADDRESS.get("aircraft") ?? 0));
+let ghost = null, fleet = null, charts = [], chartKey = "", colours = {}, dirty = true, shownEvents = -1;
 const clock = {t: 0, playing: false, speed: 1, live: true, started: false};
 const view = {kind: "window", from: 0, to: WINDOW};
 const link = {serving: false, refusal: "", samples: 0}; // the server answers; why it refuses; when, in ms, the last answer with samples came
@@ -66,7 +67,7 @@ function taken() { // a recording is followed at its end; a log that has ended s
   const recording = ["recording", "no data"].includes(flight.head.state);
   if (!clock.started && flight.end > -Infinity) {
     clock.started = flight.head.state !== "reading";
-    if (!cameraChosen && flight.get("guidance") && flight.get("pose")?.column("north")) scene.show("map");
+    if (!cameraChosen && (flight.get("guidance") || flight.head.fleet) && flight.get("pose")?.column("north")) scene.show("map");
     clock.live = recording;
     view.kind = recording ? "window" : "whole";
     if (!recording) seek(Number.isFinite(ASKED) ? ASKED : begin());
@@ -80,6 +81,36 @@ function taken() { // a recording is followed at its end; a log that has ended s
     ghost = new Flight(1);
     follow(ghost);
   }
+  if (flight.head.fleet && !fleet) {
+    fleet = new Flight(flight.head.fleet);
+    follow(fleet);
+  }
+  if (fleet) offerAircraft();
+}
+
+// ---- Fleet
+
+const aircraftOfFleet = () => fleet?.info.aircraft ?? []; // [name, flight time 0 by the clock of the stamps] each
+
+function offerAircraft() {
+  const names = aircraftOfFleet().map(([name]) => name), node = $("aircraft");
+  $("choice").hidden = !names.length;
+  if (node.dataset.shown === names.join("\n")) return;
+  node.dataset.shown = names.join("\n");
+  node.replaceChildren(...names.map((name, k) => new Option(name, k, false, k === flight.number)));
+}
+
+function choose(number) { // the page begins again with another aircraft, at the same instant
+  const t = clock.t + flight.head.start - aircraftOfFleet()[number][1];
+  location.hash = new URLSearchParams(clock.live ? {aircraft: number} : {aircraft: number, t});
+  location.reload();
+}
+
+function others() { // what the scene draws beside the flight: the ghost, or the other aircraft, of which the page has the poses
+  if (ghost) return [{flight: ghost, name: "", t: clock.t}];
+  const t = clock.t + flight.head.start - (fleet?.head.start ?? 0);
+  const poses = k => ({get: topic => (topic === "pose" ? fleet.get(`${k}`) : undefined), info: {units: {}, positive: {}}});
+  return aircraftOfFleet().map(([name], k) => ({flight: poses(k), name, t})).filter((_, k) => k !== flight.number);
 }
 
 const begin = () => (flight.begin < Infinity ? flight.begin : 0);
@@ -323,7 +354,7 @@ function frame(now) {
   if (dirty) {
     dirty = false;
     arrange();
-    scene.draw(flight, ghost, clock.t, colour);
+    scene.draw(flight, others(), clock.t, colour);
     drawState();
     drawHorizon($("horizon"), poseAt(flight, clock.t), colour);
     drawTapes(poseAt(flight, clock.t));
@@ -353,6 +384,7 @@ function start() {
     ["previous", () => jump(-1)], ["next", () => jump(1)], ["live", live], ["window", () => setView("window")], ["whole", () => setView("whole")]]) {
     $(id).addEventListener("click", action);
   }
+  $("aircraft").addEventListener("change", () => choose(Number($("aircraft").value)));
   const kept = localStorage.getItem("units");
   $("units").append(...Object.keys(UNITS).map(name => new Option(name, name, false, name === kept)));
   $("units").addEventListener("change", () => setUnits($("units").value));

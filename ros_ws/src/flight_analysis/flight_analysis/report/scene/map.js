@@ -10,9 +10,9 @@ const BESIDE = 12; // px, of the number of a leg beside its place
 const ARROW = 26; // px, of the wind
 const MARGIN = 16; // px, of the marks in the corners
 
-// The part of the world that shows the route, the fence, home and the path: centre in m, px a metre.
-export function extentOf(flight, width, height) {
-  const {route = [], fence = [], home = null} = flight.info, pose = flight.get("pose"), places = route.map(([north, east]) => [north, east]);
+// The part of the world that shows the route, the fence and home of the first flight, and the paths of all: centre in m, px a metre.
+export function extentOf(flights, width, height) {
+  const {route = [], fence = [], home = null} = flights[0].info, places = route.map(([north, east]) => [north, east]);
   if (home) places.push(home);
   for (const zone of fence) {
     zone.north.forEach((north, k) => {
@@ -20,10 +20,12 @@ export function extentOf(flight, width, height) {
       places.push([north - reach, zone.east[k] - reach], [north + reach, zone.east[k] + reach]);
     });
   }
-  const [north, east] = ["north", "east"].map(name => pose?.column(name)), step = Math.ceil(pose ? pose.count / SAMPLED : 1);
-  for (let k = 0; north && east && k < pose.count + step - 1; k += step) {
-    const row = Math.min(k, pose.count - 1);
-    if (Number.isFinite(north[row] + east[row])) places.push([north[row], east[row]]);
+  for (const pose of flights.map(flight => flight.get("pose"))) {
+    const [north, east] = ["north", "east"].map(name => pose?.column(name)), step = Math.ceil(pose ? pose.count / SAMPLED : 1);
+    for (let k = 0; north && east && k < pose.count + step - 1; k += step) {
+      const row = Math.min(k, pose.count - 1);
+      if (Number.isFinite(north[row] + east[row])) places.push([north[row], east[row]]);
+    }
   }
   if (!places.length) places.push([0, 0]);
   const [low, high] = [Math.min, Math.max].map(of => [0, 1].map(axis => places.reduce((value, place) => of(value, place[axis]), places[0][axis])));
@@ -85,7 +87,7 @@ function mark(ctx, [x, y], text, fill, colour) { // a letter on a disc
   label(ctx, text, x, y, colour("--paper"), "center");
 }
 
-function label(ctx, text, x, y, fill, align) {
+export function label(ctx, text, x, y, fill, align) {
   ctx.fillStyle = fill;
   ctx.font = "600 11px system-ui, sans-serif";
   ctx.textAlign = align;

@@ -1,7 +1,7 @@
 // The aircraft in three dimensions on a 2-D canvas, and the artificial horizon. No WebGL.
 // World: north, east, down (m). Body: forward, right, down. Angles in rad; matrices are rows.
 import {MODE_COLOURS, prepared} from "./canvas.js";
-import {drawGround, drawMarks, drawMission, extentOf, mapped, mapSpan} from "./map.js";
+import {drawGround, drawMarks, drawMission, extentOf, label, mapped, mapSpan} from "./map.js";
 import {indexAt} from "./series.js";
 import {UNITS} from "./units.js";
 
@@ -15,6 +15,7 @@ const MAX_GAP = 0.5; // s between two poses, above which nothing is interpolated
 const WRAPPED = new Set(["phi", "psi"]); // in (-pi, pi]
 export const ON_ROUTE = 4; // flight_guidance.modes.Lateral.ROUTE
 const MAX_WIND = 10; // m/s, drawn as one span
+const NAME_BESIDE = 14; // px, of the name of another aircraft
 
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -165,7 +166,8 @@ export class Scene {
     return camera(plus(place, ahead, -this.distance), ahead);
   }
 
-  draw(flight, ghost, t, colour) {
+  // `others` are further flights, each with its name, "" for a ghost, and its flight time.
+  draw(flight, others, t, colour) {
     const {ctx, width, height} = prepared(this.canvas), focal = 0.9 * Math.min(width, 1.6 * height);
     ctx.fillStyle = colour("--backdrop");
     ctx.fillRect(0, 0, width, height);
@@ -175,17 +177,21 @@ export class Scene {
       return;
     }
     const map = this.mode === "map", eye = map ? null : this.eye(pose);
-    if (map) this.shownMap = this.map ?? extentOf(flight, width, height);
+    if (map) this.shownMap = this.map ?? extentOf([flight, ...others.map(beside => beside.flight)], width, height);
     const see = map ? mapped(this.shownMap, width, height) : point => project(eye, point, focal, width, height);
     if (map) {
       this.legend = "";
       drawGround(ctx, see, this.shownMap, flight.info, colour);
     } else this.grid(ctx, see, pose, flight, colour);
     this.route(ctx, see, flight, pose, colour);
-    if (ghost) this.trail(ctx, see, ghost, ghost.end, () => colour("--ghost"), 0.6);
+    for (const beside of others) this.trail(ctx, see, beside.flight, Infinity, () => colour("--ghost"), 0.6);
     this.trail(ctx, see, flight, t, mode => MODE_COLOURS[mode] ?? colour("--plant"), 1);
-    const other = ghost && poseAt(ghost, t);
-    if (other) this.aircraft(ctx, see, other, deflections(ghost, t), colour, 0.35);
+    for (const beside of others) {
+      const placed = poseAt(beside.flight, beside.t), at = placed && see(placed.place);
+      if (!at) continue;
+      this.aircraft(ctx, see, placed, deflections(beside.flight, beside.t), colour, beside.name ? 0.7 : 0.35);
+      label(ctx, beside.name, at[0] + NAME_BESIDE, at[1] - NAME_BESIDE, colour("--ghost"), "left");
+    }
     const guidance = flight.get("guidance"), winds = ["wind.north", "wind.east"].map(name => guidance?.at(name, t) ?? NaN);
     if (map) drawMission(ctx, see, flight.info, guidance?.at("mode.lateral", t) === ON_ROUTE ? guidance.at("leg", t) : -1, this.units, colour);
     this.aircraft(ctx, see, pose, deflections(flight, t), colour, 1);

@@ -1,0 +1,47 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The places of all aircraft of a fleet, for the map of a page with the flight of a single aircraft."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from flight_core.rates import NANOSECONDS
+from flight_view.flight import POSE, Event, Flight
+from flight_view.series import Series
+
+
+class Fleet:
+    """The poses of several flights as topics of a single `Flight`, "0" the first."""
+
+    def __init__(self, flights: Sequence[Flight]) -> None:
+        self.flights = flights
+        self.events: list[Event] = []
+        self.bands: Mapping[str, float] = {}
+
+    @property
+    def samples(self) -> dict[str, Series]:
+        """The poses by number of the aircraft."""
+        return {str(k): flight.samples[POSE] for k, flight in enumerate(self.flights) if POSE in flight.samples}
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of flight time 0 of the first aircraft that has begun: the clock of the stamps is common."""
+        return min((flight.start_ns for flight in self.flights if flight.samples), default=0)
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Name and flight time 0 of each aircraft, by the clock of the stamps, s."""
+        return {"aircraft": [[flight.aircraft, flight.start_ns / NANOSECONDS] for flight in self.flights]}
+
+    @property
+    def described(self) -> int:
+        """Changes with `description`."""
+        return hash(tuple(map(tuple, self.description["aircraft"])))
+
+    def state(self) -> str:
+        """Nothing: each flight has a state."""
+        return ""
+
+    def faults(self) -> list[str]:
+        """Nothing: each flight has faults."""
+        return []
