@@ -19,7 +19,7 @@ from flight_analysis.closed_loop.margins import LinearLoop, margins
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import Manoeuvre
-from flight_analysis.design.requirement import NAMES, Requirement, conditions, least_fraction, requirement
+from flight_analysis.design.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
 from flight_analysis.design.trade import linear_error, trade
 from flight_analysis.metrics import best_error, error_metrics
 from flight_bringup.scenarios import find_scenario
@@ -173,6 +173,23 @@ def test_trade_predicts_the_flight() -> None:
     rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
     np.testing.assert_allclose(row.rms, rms, rtol=0.05)
     assert row.found >= row.phase_margin
+
+
+def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
+    # y_dot = eta_1 + u beside an oscillator of 5 rad/s that y does not drive: its damping is that of the zeros
+    def asked(damping: float) -> float:
+        A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -25.0, -10.0 * damping]])
+        return above_zeros(Requirement(), LinearPlant(A, np.eye(3)[:, :1], np.eye(3)[:1])).damping
+
+    assert asked(0.9) == Requirement().damping
+    assert 0.19 < asked(0.2) < 0.2
+
+
+def test_search_for_observer_of_flying_wing_ends() -> None:
+    # Its Dutch roll, a zero without a rudder, has a damping of 0.396, below the 0.4 that is asked for.
+    found = select_gains("x8_elevons", "x8_elevons", samples=2, observer=True)
+    assert not found.engineering.unmet
+    assert "delay margin 51 ms" in found.origin
 
 
 def rise_di(*arguments: str) -> Result:

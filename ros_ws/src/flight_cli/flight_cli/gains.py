@@ -104,7 +104,7 @@ def gains(
     )
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     answers: dict[str, Assessment]
-    with console.status("simulating the ideal control on uncertain airframes"), options(*loop, *PARTS):
+    with console.status("selecting gains on uncertain airframes"), options(*loop, *PARTS):
         if check:
             for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
                 require(not given, option, "it beside --check", "one of them: --check selects nothing to write")

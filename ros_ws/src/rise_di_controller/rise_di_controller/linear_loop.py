@@ -174,10 +174,12 @@ def is_stable(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArray)
     return spectral_radius(closed_loop(plant, law, loop, extra)) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
 
 
-def delay_margin(plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | None = None) -> float:
+def delay_margin(
+    plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | None = None, longest: float = MAX_DELAY_MARGIN
+) -> float:
     """Delay margin: pure delay beyond loop.delay, s, at the limit of stability of the loop, in all channels or in `channel`.
 
-    0 if the loop is unstable without extra delay, infinite if the loop tolerates half a second. The search takes steps of half
+    0 if the loop is unstable without extra delay, infinite if the loop tolerates `longest`, s. The search takes steps of half
     a period, then bisects down to 0.1 ms.
     """
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
@@ -186,7 +188,7 @@ def delay_margin(plant: LinearPlant, law: LinearLaw, loop: Loop, channel: int | 
     lower, stride = 0.0, loop.period / 2.0
     while is_stable(plant, law, loop, (lower + stride) * delayed):
         lower += stride
-        if lower > MAX_DELAY_MARGIN:
+        if lower > longest:
             return math.inf
     while stride > 1e-4:
         stride /= 2.0

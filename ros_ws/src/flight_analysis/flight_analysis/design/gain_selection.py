@@ -41,6 +41,7 @@ from flight_analysis.design.requirement import (
     OBSERVER_REQUIREMENT,
     Candidate,
     Requirement,
+    above_zeros,
     conditions,
     within_requirement,
 )
@@ -508,11 +509,12 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
         theorem, of_loop, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
         return GainAssessment(controller, theorem, of_loop, bounds, None, study)
-    margins = loop_assessment(linear_loop(controller, study.airframe, study.A, study.B))
+    loop = linear_loop(controller, study.airframe, study.A, study.B)
+    margins = loop_assessment(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     of_loop += (Condition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
-        observer, needed = controller.observer, setting.requirement
+        observer, needed = controller.observer, above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
         needed = needed if observer is None else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
         of_loop += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))

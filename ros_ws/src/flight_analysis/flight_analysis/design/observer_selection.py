@@ -26,10 +26,16 @@ from control_laws.observer_design import (
     extended_state_observer,
 )
 from flight_analysis.closed_loop.margins import law_order, loop_of
-from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K
+from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K, Condition, failing
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
-from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, Requirement, least_fraction
+from flight_analysis.design.requirement import (
+    OBSERVER_REQUIREMENT,
+    Requirement,
+    above_zeros,
+    least_fraction,
+    nominal_conditions,
+)
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import DecompositionError, signs
@@ -45,7 +51,8 @@ RELAXATION = 1.05
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
-
+PATIENCE, PROGRESS = 20, 1.01  # the search ends after so many steps in which the margins do not grow by this factor
+DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 
 WORST_OF, WORST_UNCERTAINTY, WORST_SEED = 50, 0.3, 1  # uncertain aircraft whose least phase margin counts
 
@@ -246,14 +253,17 @@ def _within_margin(
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
     The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
+    The damping asked for is at most that of the zeros of the aircraft, which no feedback moves.
     """
     loop = Loop(model.lag, 0.0, model.period)  # the delay margin counts the declared delay too
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
+    needed = above_zeros(needed, nominal)
 
     def relaxed(relaxation: FloatArray) -> SelectedObserver:
         controller = _parameters(base, model, gains, design(relaxation), relaxation)
         law = linear_law(controller.tuned_law(), m, model.period)
-        delay, margins = delay_margin(nominal, law, loop), loop_margins(nominal, law, loop_of(controller), together=False)
+        delay = delay_margin(nominal, law, loop, longest=DELAYS * margin)
+        margins = loop_margins(nominal, law, loop_of(controller), together=False)
         of_delay = delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
         return SelectedObserver(
             controller, delay, float(margins.phase.min()), min(of_delay, least_fraction(margins, needed)), relaxation
@@ -267,22 +277,36 @@ def _within_margin(
         return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])
 
     selected = relaxed(np.ones(m))
+    fractions = [selected.fraction]
     while True:
-        if selected.relaxation.max() > MAX_RELAXATION:
-            phase = np.degrees(selected.phase_margin)
-            found = f"at most {1e3 * selected.delay_margin:.0f} ms of delay and {phase:.0f} deg of phase"
-            expected = f"less than {1e3 * margin:g} ms and {np.degrees(needed.phase):.0f} deg"
-            raise ParameterError(f"--margin: found {found}, expected {expected}")
+        ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
+        if selected.relaxation.max() > MAX_RELAXATION or ended:
+            raise ParameterError(f"--margin: {_lacking(selected, nominal, loop, margin, needed)}")
         if selected.fraction < 1.0:
             best = max((stepped(channel) for channel in range(m)), key=lambda candidate: candidate.fraction)
             selected = best if best.fraction > selected.fraction else relaxed(selected.relaxation * RELAXATION)
+            fractions.append(selected.fraction)
         elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
-            selected = stepped(int(np.argmin(worst)))
+            selected, fractions = stepped(int(np.argmin(worst))), []
         else:
             break
     checked = selected.controller.model_dump()
     checked["observer"]["margin"] = margin
-    return selected._replace(controller=RiseDiConfig.validate_mapping(checked, "controller"))
+    found = RiseDiConfig.validate_mapping(checked, "controller")
+    return selected._replace(
+        controller=found, delay_margin=delay_margin(nominal, linear_law(found.tuned_law(), m, model.period), loop)
+    )
+
+
+def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
+    """What the last step of the search lacks, in sentences."""
+    law = linear_law(selected.controller.tuned_law(), len(loop.lag), loop.period)
+    margins = loop_margins(nominal, law, loop_of(selected.controller), together=False)
+    phase = np.degrees(needed.of_uncertain)
+    phases = f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
+    delay = Condition("delay margin (ms)", None, 1e3 * selected.delay_margin, 1e3 * margin)
+    lacking = failing((delay, *nominal_conditions(margins, needed)))
+    return "; ".join(condition.sentence(selected.controller.outputs) for condition in lacking) or phases
 
 
 def _parameters(

@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.margins import LinearLoop, LoopMargins
+from flight_analysis.design.airframe_properties import invariant_zeros
 from flight_analysis.design.gain_conditions import Condition, failing
 from flight_core.arguments import as_number
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
+from rise_di_controller.linear_loop import LinearPlant
 from rise_di_controller.margins import Margins, loop_margins
 from rise_di_controller.params import ControllerConfig
 
@@ -32,6 +34,8 @@ STEP = 1.05  # factor of the integral, and of the bandwidth, in a step of the se
 MAX_SLOWER, MAX_LOWER = 4.0, 18.0  # largest factors of the search, by which the integral and the bandwidth fall
 WORST_STEP = math.radians(2.5)  # by which the nominal phase margin rises while the worst aircraft has too little
 MAX_WORST_STEPS = 8
+
+OF_ZERO, NO_MOTION = 0.98, 1e-3  # of the damping of a zero that is asked for; 1/s, of a zero at the origin up to rounding
 
 
 class Requirement(NamedTuple):
@@ -72,6 +76,17 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
     return Requirement(math.radians(phase_margin))
 
 
+def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
+    """A requirement with a damping that a loop around an aircraft can have: at most about that of its zeros.
+
+    No feedback moves a zero, and a loop with small errors has modes near the zeros.
+    """
+    zeros = invariant_zeros(plant.A, plant.B, plant.C)
+    modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
+    least = float(np.min(-modes.real / np.abs(modes), initial=1.0))
+    return needed._replace(damping=min(needed.damping, OF_ZERO * max(least, 0.0)))
+
+
 def fractions(margins: Margins, needed: Requirement) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What is found over what is needed, at least 1 where the requirement holds, for m inputs, (..., m), (..., m), (...).
 
@@ -96,7 +111,15 @@ def least_fraction(margins: Margins, needed: Requirement) -> float:
 
 def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ...]:
     """The requirement as conditions, input by input, the nominal aircraft first."""
-    nominal = margins.nominal
+    of_nominal = nominal_conditions(margins.nominal, needed)
+    if margins.worst is None:
+        return of_nominal
+    worst = math.degrees(float(margins.worst.phase.min()))
+    return (*of_nominal, Condition(NAMES[4], None, worst, math.degrees(needed.of_uncertain)))
+
+
+def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition, ...]:
+    """The requirement on the margins of the nominal aircraft as conditions, input by input."""
     with np.errstate(divide="ignore"):
         decibels = 20.0 * np.log10(nominal.gain)
     rows: list[tuple[str, FloatArray, float, bool]] = [
@@ -104,16 +127,12 @@ def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ..
         (NAMES[1], decibels, 20.0 * math.log10(needed.gain), True),
         (NAMES[2], nominal.sensitivity, needed.sensitivity, False),
     ]
-    found = [
+    found = (
         Condition(name, i, float(value), bound, at_least)
         for name, values, bound, at_least in rows
         for i, value in enumerate(values)
-    ]
-    found.append(Condition(NAMES[3], None, float(nominal.damping), needed.damping))
-    if margins.worst is not None:
-        worst = math.degrees(float(margins.worst.phase.min()))
-        found.append(Condition(NAMES[4], None, worst, math.degrees(needed.of_uncertain)))
-    return tuple(found)
+    )
+    return (*found, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
 
 
 def unmet(margins: LoopMargins, needed: Requirement, outputs: Sequence[str]) -> str:
