@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each effector of the scenarios with an allocation fails once at a random time, under RISE-DI, PI and the observer.
 
-python -m benchmarks.effectors --seeds 3
+python -m benchmarks.effectors --seeds 3 --faults lost,stuck
 """
 
 import argparse
-from collections.abc import Mapping
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,8 +35,9 @@ class Flight(NamedTuple):
     """A flight with a fault."""
 
     score: float  # from the begin of the fault on; infinite for an early end
+    worst: str  # the output with the largest part of the score
     beyond: float  # largest excess of u over its stops, SI
-    held: float  # part of the time in which an effector is at its stop
+    held: float  # part of the time after the fault in which an effector is at its stop
 
 
 def laws(scenario: Scenario, *, with_observer: bool) -> dict[str, ControllerConfig]:
@@ -69,10 +73,27 @@ def fly(scenario: Scenario, begin: float) -> Flight:
     after = (error.stamp_ns - tape.start_ns) / 1e9 >= begin
     units = score_units(error.names, scenario.aircraft.channels().outputs)
     rms = np.sqrt(np.mean(error.values[after] ** 2, axis=0))[:, None]
-    limits = scenario.controller.effector_limits()
-    excess = np.maximum(limits.lower - tape["u"].values, tape["u"].values - limits.upper).max()
-    held = ((tape["u"].values <= limits.lower) | (tape["u"].values >= limits.upper)).any(axis=1).mean()
-    return Flight(float(score(rms, units)[0]) if tape.outcome == COMPLETED else np.inf, float(excess), float(held))
+    limits, u = scenario.controller.effector_limits(), tape["u"].values
+    excess = np.maximum(limits.lower - u, u - limits.upper).max()
+    at_stop = ((u <= limits.lower) | (u >= limits.upper)).any(axis=1)
+    held = at_stop[(tape["u"].stamp_ns - tape.start_ns) / 1e9 >= begin].mean()
+    worst = error.names[int(np.argmax(rms[:, 0] / units))]
+    return Flight(float(score(rms, units)[0]) if tape.outcome == COMPLETED else np.inf, worst, float(excess), float(held))
+
+
+def summarised(flown: Sequence[Flight]) -> dict[str, Any]:
+    """The figures of the flights of one fault under one law."""
+    scores = np.array([flight.score for flight in flown])
+    lost = [flight for flight in flown if flight.score > SCORE_LOST]
+    return {
+        "flights": len(flown),
+        "mean": float(scores.mean()),
+        "worst": float(scores.max()),
+        "lost": len(lost),
+        "output": Counter(flight.worst for flight in lost).most_common(1)[0][0] if lost else "",
+        "held": float(np.mean([flight.held for flight in flown])),
+        "beyond": max(flight.beyond for flight in flown),
+    }
 
 
 def shortened(name: str) -> Scenario:
@@ -88,31 +109,30 @@ def main() -> None:
     parser.add_argument("--scenarios", default=",".join(SCENARIOS))
     parser.add_argument("--without-observer", action="store_true")
     parser.add_argument("--faults", default=",".join(FAULTS))
+    parser.add_argument("--json", type=Path, help="file for the figures")
     given = parser.parse_args()
-    console, beyond = wide_console(), 0.0
+    console, rows = wide_console(), []
     for name in given.scenarios.split(","):
         scenario = shortened(name)
         controllers = laws(scenario, with_observer=not given.without_observer)
-        effectors, kinds = list(scenario.controller.effectors), given.faults.split(",")
-        none = {law: fly(scenario.vary(controller=controller), FROM).score for law, controller in controllers.items()}
         title = f"{name}: score after the fault, mean (worst), {given.seeds} seeds"
         table = new_table(title, ("effector", "fault", *controllers), 2)
-        table.add_row("none", "", *(f"{value:.2f}" for value in none.values()))
-        for effector in effectors:
-            for kind in kinds:
-                cells = []
-                for controller in controllers.values():
-                    flown = [
-                        fly(*with_fault(replace(scenario, controller=controller), kind, effector, seed))
-                        for seed in range(1, given.seeds + 1)
-                    ]
-                    scores = np.array([flight.score for flight in flown])
-                    beyond = max(beyond, *(flight.beyond for flight in flown))
-                    lost = int((scores > SCORE_LOST).sum())
-                    cells.append(f"{scores.mean():.2f} ({scores.max():.2f})" + (f", {lost} lost" if lost else ""))
-                table.add_row(effector, kind, *cells)
+        faults = [(effector, kind) for effector in scenario.controller.effectors for kind in given.faults.split(",")]
+        for effector, kind in [("none", ""), *faults]:
+            cells = []
+            for law, controller in controllers.items():
+                flies = replace(scenario, controller=controller)
+                seeds = range(1, given.seeds + 1)
+                flown = [fly(*with_fault(flies, kind, effector, seed)) for seed in seeds] if kind else [fly(flies, FROM)]
+                found = summarised(flown)
+                rows.append({"scenario": name, "effector": effector, "fault": kind, "law": law, **found})
+                lost = f", {found['lost']} lost in {found['output']}" if found["lost"] else ""
+                cells.append(f"{found['mean']:.2f} ({found['worst']:.2f}){lost}")
+            table.add_row(effector, kind, *cells)
         console.print(table)
-    console.print(f"largest u beyond its end stop: {beyond:.3g}")
+        if given.json is not None:
+            given.json.write_text(json.dumps({"seeds": given.seeds, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+    console.print(f"largest u beyond its end stop: {max(row['beyond'] for row in rows):.3g}")
 
 
 if __name__ == "__main__":

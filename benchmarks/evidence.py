@@ -96,6 +96,7 @@ SECURITY = (*PYTEST, "tests/ros/test_security.py")
 HYPOTHESIS = (*PYTEST, "-n", "auto", "tests/fuzz")
 CAMPAIGN_OF = ("rise-di", "campaign", "--uncertainty", "0.3", "--seed", "7", "--json")
 FLEET, MISSIONS = ((*CAMPAIGN_OF, name, "--aircraft") for name in ("osprey_servo", "osprey_route"))
+EFFECTORS = (PYTHON, "-m", "benchmarks.effectors", "--json", FILE, "--faults", "lost", "--seeds")
 MARGINS = (PYTHON, "-m", "benchmarks.margins", "--json", FILE, "--aircraft")
 COMPARE = ("rise-di", "compare", "osprey_servo", "--tuning", "gust,gust_turbulence,delay", "--json", FILE, "--aircraft")
 
@@ -119,6 +120,7 @@ MEASUREMENTS = (
     Measurement("cluster", CLUSTER, (*CLUSTER, "--aircraft", "1000"), evidence_rows.cluster, "1 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), evidence_rows.compare, "5 min"),
     Measurement("margins", (*MARGINS, "200"), (*MARGINS, "10"), evidence_rows.margins, "15 min"),
+    Measurement("effectors", (*EFFECTORS, "50"), (*EFFECTORS, "1"), evidence_rows.effectors, "60 min", long=True),
     Measurement("view", VIEW, QUICK_VIEW, evidence_rows.view, "15 min", timed=True),
     Measurement("replay", REPLAY, (*REPLAY, "--seconds", "5"), evidence_rows.replay, "2 min"),
     Measurement(

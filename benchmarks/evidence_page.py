@@ -79,6 +79,7 @@ TOPICS = (
             "cluster": "a campaign on a cluster of dask with faults",
             "compare": "other laws on the same aircraft and course",
             "margins": "the cost of a phase margin under five laws",
+            "effectors": "each effector lost at a random time",
         },
         "[Experiments](experiments.md#other-laws) describes laws, scores and costs. "
         "All laws have the same aircraft, winds and tuning.",

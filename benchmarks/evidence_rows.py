@@ -224,6 +224,21 @@ def margins(result: Any) -> Iterator[Row]:
             yield row(f"{law}: lost, {spread}, u late by 20 ms", 100.0 * of["lost_late"][level], "%")
 
 
+def effectors(result: Any) -> Iterator[Row]:
+    """Of benchmarks/effectors.py: by scenario, effector, fault and law."""
+    yield row("flights of a fault under a law", result["seeds"])
+    yield row("largest u beyond its end stop", max(of["beyond"] for of in result["rows"]), "SI", at_most=0)
+    for of in result["rows"]:
+        fault = f" {of['fault']}" if of["fault"] else ""
+        about = f"{of['scenario']}, {of['effector']}{fault}, {of['law']}"
+        yield row(f"{about}: score, mean", of["mean"])
+        yield row(f"{about}: score, worst", of["worst"])
+        yield row(f"{about}: loss of track, a score above 10", of["lost"])
+        yield row(f"{about}: an effector at its stop", 100.0 * of["held"], "% of the time")
+        if of["lost"]:
+            yield row(f"{about}: output that is lost", of["output"])
+
+
 def _score(value: float | None) -> float | str:
     return "diverged" if value is None else value
 
