@@ -238,6 +238,7 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(flight: RecordedFlig
 
 def test_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:
     t = flight.tape.time("y")
+    assert flight.scenario is not None
     assert set(part_masks(t, transients(flight.scenario, flight.tape))) == {"whole", "calm", "capture", "turn", "gust"}
     tables = {table.caption: table for table in flight_tables(flight.summary, {}, [])}
     assert [row[0] for row in tables["Guidance by segment"].rows] == ["leg 0"]

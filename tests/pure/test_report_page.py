@@ -49,7 +49,7 @@ def page(servo: RecordedFlight, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-def recorded(name: str, scenario: Scenario, tape: Tape) -> RecordedFlight:
+def recorded(name: str, scenario: Scenario | None, tape: Tape) -> RecordedFlight:
     return RecordedFlight(name, scenario, tape, summarise(tape, scenario))
 
 

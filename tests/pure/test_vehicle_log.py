@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the aircraft."""
 
+import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +21,7 @@ from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
+from flight_view.flight import Flight as View
 
 pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
 
@@ -175,6 +178,34 @@ def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_pat
     assert tape["pose"].names == ("phi", "theta", "psi")
     assert tape["pose"].values[0] == pytest.approx(np.radians([5.0, -2.0, -10.0]), abs=1e-6)
     assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
+
+
+def test_report_of_imported_flight_shows_y_and_u_and_no_error(flight: Flight, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    result = CliRunner().invoke(app, ["report", str(bag), "--png", str(tmp_path / "flight.png"), "--json"])
+    assert result.exit_code == 0, result.output
+    summary = json.loads(result.output)
+    assert (summary["outcome"], summary["scenario"], summary["errors"]) == ("imported", None, {})
+    assert summary["duration"] == pytest.approx(DURATION, abs=2.0 / RATE)
+    for key, values in (("outputs", flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0]), ("inputs", flight.u)):
+        rms = [metrics["whole"]["rms"] for metrics in summary[key].values()]
+        assert rms == pytest.approx(np.sqrt(np.mean(values**2, axis=0)), rel=1e-3)
+    page = (bag / "report.html").read_text(encoding="utf-8")
+    assert re.findall("<h2>([^<]*)</h2>", page) == ["Replay", "Output y", "Input u", "Pose", "Spectrum of u"]
+    assert "flight.bin, a DataFlash log of ArduPilot, by the map ardupilot" in page
+    shown = View(bag)
+    shown.update()
+    assert shown.description["units"]["q"]["unit"] == "mrad/s"
+    for command, sentence in (
+        (["replay", str(bag)], "found an imported log, expected a flight of the stack"),
+        (
+            ["report", str(bag), str(bag)],
+            "found an imported log, expected a flight of the stack: a comparison is of tracking errors",
+        ),
+    ):
+        assert sentence in str(CliRunner().invoke(app, command).exception)
 
 
 def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path) -> None:

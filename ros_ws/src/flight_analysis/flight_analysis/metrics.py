@@ -366,15 +366,15 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
 
 
 def inputs_by_part(
-    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL
+    tape: Tape, transients: Sequence[Transient], settle: float = SETTLING_DWELL, topic: str = "u"
 ) -> dict[str, dict[str, InputMetrics]]:
-    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot).
+    """Control effort by input and part: rms and max abs(u) about trim, and mean abs(u_dot); of y with `topic`.
 
     mean abs(u_dot) = sum abs(u_k - u_(k-1)) / sum (t_k - t_(k-1)) over the steps with an end in the part; NaN without a step.
     """
-    if "u" not in tape:
+    if topic not in tape:
         return {}
-    u, t = tape["u"], tape.time("u")
+    u, t = tape[topic], tape.time(topic)
     masks, times = part_masks(t, transients, settle), sample_times(u.stamp_ns)
 
     def metrics(values: FloatArray, mask: NDArray[np.bool_]) -> InputMetrics:

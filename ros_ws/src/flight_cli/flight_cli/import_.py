@@ -9,13 +9,15 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from autopilot_bridge.params import load_map
+from autopilot_bridge.params import UNITS, find_map, load_map
 from flight_analysis.design.log_import import Window, imported
+from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table, options
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import LogAttachments
+from flight_log.bag import CHANNEL_UNITS, IMPORTED, LogAttachments
+from flight_log.provenance import provenance
 from flight_log.tape_writer import write_run
 from flight_log.vehicle_log import read_vehicle_log
 
@@ -34,8 +36,8 @@ def import_(
 ) -> None:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
-    By default it takes the longest stretch in the air, for sticks in MANUAL. `check-signs --bag` and `identify --bridge --log`
-    read the bag. u is the deviation from the median of the stretch, `commands` is the whole.
+    By default it takes the longest stretch in the air, for sticks in MANUAL. `check-signs --bag`, `identify --bridge --log`,
+    `report` and `watch` read the bag. u is the deviation from the median of the stretch, `commands` is the whole.
 
     Exit status: 0, or 2 bad input.
     """
@@ -50,7 +52,12 @@ def import_(
     with writing("--output", folder, "a folder that can"):
         folder.mkdir(parents=True)
         write_file(folder / PARAMETERS, dump_yaml(dict(sorted(read.parameters.items())), flow=False))
-    bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS,)))
+        records = {
+            IMPORTED: {"log": log.name, "kind": read.kind, "map": channel_map.name},
+            CHANNEL_UNITS: {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()},
+        }
+        write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
+    bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE))
     table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left=("topic",))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS

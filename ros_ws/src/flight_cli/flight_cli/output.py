@@ -23,7 +23,6 @@ from flight_analysis.report.summary import (
     RecordedFlight,
     columns_of,
     command_results,
-    display_units,
     finite_or_null,
     format_seconds,
     format_value,
@@ -42,7 +41,10 @@ LATEST = Path("runs/latest")  # the run of a command that is given none
 
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
-    summary, units = flight.summary, display_units(flight.scenario)
+    summary, units = flight.summary, flight.units
+    if flight.scenario is None:
+        _show_imported(console, flight)
+        return
     if busy := (summary["account"] or {}).get("busy"):
         console.print(busy, style="bold", highlight=False, soft_wrap=True)
     title = f"Tracking error ({summary['error']}), {format_seconds(summary['duration'])} flown{taken_over(summary, 'errors')}"
@@ -61,6 +63,17 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
     for line in (*_timing(summary), *(f"note: {note}" for note in summary["notes"] if note != busy)):
         console.print(line, highlight=False)
+
+
+def _show_imported(console: Console, flight: RecordedFlight) -> None:
+    """Print y and u of a flight that the stack did not fly."""
+    summary = flight.summary
+    for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
+        columns = columns_of(INPUT_COLUMNS, summary[key])
+        caption = f"{title} about trim, {format_seconds(summary['duration'])}"
+        console.print(grouped_table(caption, "channel", columns, table_rows(summary[key], columns, flight.units)))
+    for note in summary["notes"]:
+        console.print(f"note: {note}", highlight=False)
 
 
 def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:

@@ -10,6 +10,7 @@ INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the l
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
 NOT_FLOWN = "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
 LANDED = " landed "  # in an outcome, between the aircraft and the time
+IMPORT = "imported"  # of a log that an autopilot wrote
 NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED, STATUS_ENDED_EARLY = 130, 3  # exit statuses of a flight, 0 completed or landed

@@ -26,6 +26,8 @@ SCENARIO_MEDIA_TYPE, FILE_MEDIA_TYPE = "application/yaml", "text/yaml"  # of att
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
+IMPORTED = "rise_di_imported"  # name of the metadata record of a log that the stack did not fly: "log", "kind", "map"
+CHANNEL_UNITS = "rise_di_units"  # name of the metadata record with the SI units of channels, for a log without a scenario
 LOST_MESSAGES = "rise_di_lost"  # name of the metadata record that counts the messages the recorder lost, by topic
 CHUNK_BYTES = 256 * 1024
 

@@ -23,7 +23,7 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
-from flight_log.bag import LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
+from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
@@ -96,6 +96,8 @@ class RecordedRun(NamedTuple):
         """The scenario in the log. Raises ParameterError for a log without one."""
         if self.scenario is None:
             where = "the log" if self.path is None else str(self.path)
+            if IMPORTED in self.metadata:
+                raise ParameterError(f"{where}: found an imported log, expected a flight of the stack, which has a scenario")
             expected = "a run that was flown from one, or the scenario: --scenario FILE"
             raise ParameterError(f"{where}: found a log without its scenario, expected {expected}")
         return self.scenario

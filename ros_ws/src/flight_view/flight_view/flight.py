@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenar
 from flight_analysis.metrics import settling_bands
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.run_folder import log_account
-from flight_analysis.report.summary import display_units, pulse_edges
+from flight_analysis.report.summary import display_unit, display_units, pulse_edges
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
@@ -30,7 +30,7 @@ from flight_guidance import modes as guidance
 from flight_guidance.odometry import ROUTE_FRAMES
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
-from flight_log.bag import LOST_MESSAGES, SCENARIO_MEDIA_TYPE
+from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
@@ -274,6 +274,10 @@ class Flight:
             if record.name == LOST_MESSAGES:
                 for topic, count in record.metadata.items():
                     self._note(f"{topic}: the recorder lost {count} messages")
+            elif record.name == CHANNEL_UNITS and "units" not in self.description:
+                units = {name: display_unit(unit) for name, unit in record.metadata.items()}
+                self.description |= {"units": {name: unit._asdict() for name, unit in units.items()}}
+                self.described += 1
         elif record.media_type == SCENARIO_MEDIA_TYPE and "units" not in self.description:
             self._take_scenario(record.data)
 

@@ -58,9 +58,9 @@ def picture(flight: Flight) -> RenderableType:
 
 def _outputs(flight: Flight) -> Table:
     table = _table("output", "y", "y_m", "e", "band")
-    for name in _names(flight, "e"):
+    for name in _names(flight, "y"):
         unit, factor = _unit(flight, name)
-        values = [_newest(flight, "internals", f"{group}.{name}") for group in ("y", "y_m", "e")]
+        values = [_newest_of(flight, group, name) for group in ("y", "y_m", "e")]
         inside = abs(values[2]) <= flight.bands.get(name, math.inf)
         cells = [_number(value * factor) for value in (*values, flight.bands.get(name, math.nan))]
         table.add_row(f"{name} {unit}", *cells, style="" if inside else "yellow")
@@ -71,7 +71,7 @@ def _inputs(flight: Flight) -> Table:
     table = _table("input", "u", "before limits", "saturated")
     for name in _names(flight, "u"):
         unit, factor = _unit(flight, name)
-        values = [_newest(flight, "internals", f"{group}.{name}") * factor for group in ("u", "u_free")]
+        values = [_newest_of(flight, group, name) * factor for group in ("u", "u_free")]
         saturated = SATURATED.get(_newest(flight, "internals", f"limited.{name}"), "")
         table.add_row(f"{name} {unit}", *map(_number, values), saturated, style="yellow" if saturated else "")
     return table
@@ -82,7 +82,8 @@ def _attitude(flight: Flight) -> str:
     altitude, climb = (_newest(flight, "pose", name) for name in ("altitude", "climb"))
     turned = f"{round(heading) % 360:03d}" if math.isfinite(heading) else "-"  # a pose may have no psi
     angles = f"roll {roll:+.1f} deg, pitch {pitch:+.1f} deg, heading {turned} deg"
-    return f"{angles}, altitude {altitude:.1f} m, climb {climb:+.1f} m/s"
+    placed = f", altitude {altitude:.1f} m, climb {climb:+.1f} m/s" if math.isfinite(altitude) else ""
+    return angles + placed
 
 
 def _table(first: str, *others: str) -> Table:
@@ -94,9 +95,15 @@ def _table(first: str, *others: str) -> Table:
 
 
 def _names(flight: Flight, group: str) -> Sequence[str]:
-    """Names of the channels "group.name" of the ticks."""
-    names = flight.samples["internals"].names if "internals" in flight.samples else ()
-    return [name.partition(".")[2] for name in names if name.startswith(f"{group}.")]
+    """Names of the channels "group.name" of the ticks, in a log without ticks of the topic."""
+    if "internals" not in flight.samples:
+        return flight.samples[group].names if group in flight.samples else ()
+    return [name.partition(".")[2] for name in flight.samples["internals"].names if name.startswith(f"{group}.")]
+
+
+def _newest_of(flight: Flight, group: str, name: str) -> float:
+    """The newest value of a channel in the ticks, in a log without ticks in the topic."""
+    return _newest(flight, *(("internals", f"{group}.{name}") if "internals" in flight.samples else (group, name)))
 
 
 def _unit(flight: Flight, name: str) -> tuple[str, float]:

@@ -65,7 +65,7 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
     """Units by channel, of the first flight with the channel."""
-    return {name: unit for flight in reversed(flights) for name, unit in summary.display_units(flight.scenario).items()}
+    return {name: unit for flight in reversed(flights) for name, unit in flight.units.items()}
 
 
 # ---- Tables
@@ -129,7 +129,7 @@ def plot_context(flights: Sequence[RecordedFlight]) -> PlotContext:
     """The context of the flights, from t = 0 of every flight on, with shaded gusts."""
     intervals: dict[Interval, None] = {}
     for flight in flights:
-        intervals |= dict.fromkeys(figures.gust_intervals(flight.tape, flight.scenario.gust_windows()))
+        intervals |= dict.fromkeys(figures.gust_intervals(flight.tape, flight.gusts))
     end = max(figures.flight_end(flight.tape) for flight in flights)
     return PlotContext(Tape({}), units(flights), list(intervals), end, SampleStore())
 

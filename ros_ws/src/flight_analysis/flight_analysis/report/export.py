@@ -51,19 +51,19 @@ def write_parquet(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 
 class _PlotColumn(NamedTuple):
-    """A column of the PNG: a signal of the tapes with a topic."""
+    """A column of the PNG: a signal of the tapes with some topics, with the channels of the first."""
 
     title: str
-    topic: str
+    topics: tuple[str, ...]
     signal: Callable[[Tape], Signal]
     style: dict[str, Any]
     reference: bool = False
 
 
 PLOT_COLUMNS = (
-    _PlotColumn("y, over y_m", "y", lambda tape: tape["y"], {}, reference=True),
-    _PlotColumn("e = y - y_m", "y", lambda tape: best_error(tape)[1], {}),
-    _PlotColumn("u", "u", lambda tape: tape["u"], {"drawstyle": "steps-post"}),
+    _PlotColumn("y, over y_m", ("y",), lambda tape: tape["y"], {}, reference=True),
+    _PlotColumn("e = y - y_m", ("y", "y_m"), lambda tape: best_error(tape)[1], {}),
+    _PlotColumn("u", ("u",), lambda tape: tape["u"], {"drawstyle": "steps-post"}),
 )
 
 
@@ -72,7 +72,7 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     require(path.suffix.lower() in {"", ".png"}, "png", path.name, "a name that ends in .png; figure writes .pdf and .svg")
-    columns = [(column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topic))]
+    columns = [(column, names) for column in PLOT_COLUMNS if (names := _channels(flights, column.topics))]
     rows = max(len(names) for _, names in columns)
     figure = Figure(figsize=(FIGURE_WIDTH, ROW_HEIGHT * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, len(columns), sharex=True, squeeze=False)
@@ -90,8 +90,9 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
         figure.savefig(stream, dpi=DPI, format="png")
 
 
-def _channels(flights: Sequence[RecordedFlight], topic: str) -> list[str]:
-    return list(dict.fromkeys(name for flight in flights if topic in flight.tape for name in flight.tape[topic].names))
+def _channels(flights: Sequence[RecordedFlight], topics: Sequence[str]) -> list[str]:
+    tapes = [flight.tape for flight in flights if {*topics} <= {*flight.tape.signals}]
+    return list(dict.fromkeys(name for tape in tapes for name in tape[topics[0]].names))
 
 
 def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str) -> None:
@@ -103,12 +104,13 @@ def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _Plot
         axes.plot((signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[name] * factor, **style)
 
     first = flights[0]
-    for gust in gust_intervals(first.tape, first.scenario.gust_windows()):
+    for gust in gust_intervals(first.tape, first.gusts):
         axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
-    if column.reference and name in first.tape["y_m"].names:
+    if column.reference and "y_m" in first.tape and name in first.tape["y_m"].names:
         plot(first.tape, first.tape["y_m"], color=REFERENCE, linewidth=4.0, label="y_m")
-    for (label, colour), (_, _, tape, _) in zip(comparison.colours(flights).items(), flights, strict=True):
-        if column.topic in tape and name in tape[column.topic].names:
+    for (label, colour), flight in zip(comparison.colours(flights).items(), flights, strict=True):
+        tape = flight.tape
+        if {*column.topics} <= {*tape.signals} and name in tape[column.topics[0]].names:
             plot(tape, column.signal(tape), color=colour, linewidth=1.0, label=label, **column.style)
     axes.set_ylabel(channel_label(name, units))
     axes.grid(alpha=0.3)

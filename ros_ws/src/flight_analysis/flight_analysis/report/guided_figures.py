@@ -52,9 +52,9 @@ def guided_context(context: PlotContext) -> PlotContext:
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
 
 
-def bounds_of(scenario: Scenario) -> Bounds:
+def bounds_of(scenario: Scenario | None) -> Bounds:
     """Limits of the commands of guidance."""
-    if scenario.guidance is None:
+    if scenario is None or scenario.guidance is None:
         return {}
     limits = scenario.guidance.params().limits
     return {
@@ -65,9 +65,9 @@ def bounds_of(scenario: Scenario) -> Bounds:
     }
 
 
-def flown_routes(scenario: Scenario, tape: Tape) -> list[Route]:
+def flown_routes(scenario: Scenario | None, tape: Tape) -> list[Route]:
     """The flown routes by the log: of the scenario and of the topic `route`."""
-    if scenario.guidance is None:
+    if scenario is None or scenario.guidance is None:
         return []
     flown = set(tape["guidance"]["route"].tolist())
     return [route for digest, route in known_routes(tape, scenario.guidance).items() if digest in flown]

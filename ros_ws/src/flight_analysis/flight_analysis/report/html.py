@@ -14,14 +14,15 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.margins import LinearLoop, loop_assessment, scenario_loop
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report import comparison, figures, guided_figures, margins, plotting, tables
-from flight_analysis.report.plotting import Figure, SampleStore, pack
+from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
 from flight_analysis.report.replay import Replay, replay
 from flight_analysis.report.summary import (
     INPUT_COLUMNS,
+    QUANTITY_UNITS,
     RecordedFlight,
     command_results,
-    display_units,
     finite_or_null,
     format_seconds,
     format_value,
@@ -77,7 +78,12 @@ class Page(NamedTuple):
 
 def write_page(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the page of a flight, or the comparison of several."""
-    page = _flight_page(flights[0]) if len(flights) == 1 else _comparison_page(flights)
+    if len(flights) > 1:
+        page = _comparison_page(flights)
+    elif flights[0].scenario is None:
+        page = _imported_page(flights[0])
+    else:
+        page = _flight_page(flights[0], flights[0].scenario)
     _write(path, page)
 
 
@@ -92,20 +98,45 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     _write(path, Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore()))
 
 
-def _flight_page(flight: RecordedFlight) -> Page:
-    units, gusts = display_units(flight.scenario), flight.scenario.gust_windows()
-    context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(flight)
+def _imported_page(flight: RecordedFlight) -> Page:
+    """What an autopilot logged of y, u and the pose."""
+    tape, source = flight.tape, flight.summary["source"]
+    context, of_flight = figures.plot_context(tape, flight.units, {}), tables.imported_tables(flight.summary, flight.units)
+    colour, pose = figures.PLANT, None
+    spectrum = figures.spectrum_figure({"u": (tape, flight.period_ns)}, {"u": colour}, flight.units)
+    if "pose" in tape:
+        pose = time_series_figure(context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2)
+    text = f"{format_seconds(flight.summary['duration'])} of {source['log']}, {source['kind']}, by the map {source['map']}."
+    return Page(
+        f"Flight {flight.name}",
+        [Line(text)],
+        [TableGroup(of_flight)],
+        [
+            Section("Output y", "about trim", time_series_figure(context, {"y": Curve(tape["y"], colour)})),
+            Section("Input u", "about trim", figures.input_figure(context, {})),
+            Section("Pose", "", pose),
+            Section("Spectrum of u", "amplitude spectral density", spectrum, over_time=False),
+        ],
+        context.samples,
+        flight.summary["notes"],
+        replay(flight, context),
+    )
+
+
+def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
+    units, gusts = flight.units, flight.gusts
+    context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(scenario)
     of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts))
     return Page(
         f"Flight {flight.name}",
         [
             Line(
-                f"{'; '.join(filter(None, [_description(flight), command_results(flight.summary)]))}.",
+                f"{'; '.join(filter(None, [_description(flight, scenario), command_results(flight.summary)]))}.",
                 flight.summary["outcome"],
             )
         ],
         [TableGroup([*of_flight, *([] if loop is None else [margins.margin_table(loop_assessment(loop))])])],
-        [*_sections(flight, context), *([] if loop is None else _loop_sections(loop))],
+        [*_sections(flight, scenario, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,
         flight.summary["notes"],
         replay(flight, context),
@@ -114,10 +145,11 @@ def _flight_page(flight: RecordedFlight) -> Page:
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     context, colours = comparison.plot_context(flights), comparison.colours(flights)
+    scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
     runs = {label: (flight.tape, flight.period_ns) for label, flight in zip(colours, flights, strict=True)}
     lines = []
-    for (label, colour), flight in zip(colours.items(), flights, strict=True):
-        text = f"{flight.scenario.name}: {_description(flight)} ({flight.summary['error']})"
+    for (label, colour), flight, scenario in zip(colours.items(), flights, scenarios, strict=True):
+        text = f"{scenario.name}: {_description(flight, scenario)} ({flight.summary['error']})"
         lines.append(Line(text, flight.summary["outcome"], label, colour))
     palette = list(colours.values())
     legend = ". ".join(dict.fromkeys([*(parts_legend(flight.summary) for flight in flights), tables.ERROR_LEGEND]))
@@ -143,18 +175,18 @@ def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
     return Page(f"{len(flights)} flights compared", lines, groups, sections, context.samples)
 
 
-def _description(flight: RecordedFlight) -> str:
-    controller = flight.scenario.controller
+def _description(flight: RecordedFlight, scenario: Scenario) -> str:
+    controller = scenario.controller
     return f"{format_seconds(flight.summary['duration'])} flown at {controller.rate:g} Hz with the {controller.summary()}"
 
 
-def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
+def _sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
-    limits = figures.input_limits(flight.scenario, flight.tape)
+    limits = figures.input_limits(scenario, flight.tape)
     run, colour = (flight.tape, flight.period_ns), figures.PLANT
     spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
     return [
-        *_guidance_sections(flight, context),
+        *_guidance_sections(flight, scenario, context),
         Section("Output y over the reference y_m", "", figures.tracking_figure(context)),
         Section(
             "Tracking error e = y - y_m",
@@ -189,10 +221,10 @@ def _sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Sec
     ]
 
 
-def _linear_loop(flight: RecordedFlight) -> LinearLoop | None:
-    """The linear loop of the flight's scenario; None without one: the literal sign, an aircraft without a model."""
+def _linear_loop(scenario: Scenario) -> LinearLoop | None:
+    """The linear loop of a scenario; None without one: the literal sign, an aircraft without a model."""
     try:
-        return scenario_loop(flight.scenario, flight.scenario.controller)
+        return scenario_loop(scenario, scenario.controller)
     except ParameterError:
         return None
 
@@ -210,12 +242,12 @@ def _loop_sections(loop: LinearLoop) -> list[Section]:
     ]
 
 
-def _guidance_sections(flight: RecordedFlight, context: plotting.PlotContext) -> list[Section]:
+def _guidance_sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
     if flight.summary["guidance"] is None:
         return []
-    speed, bounds = flight.scenario.aircraft.channels().speed, guided_figures.bounds_of(flight.scenario)
-    guidance = flight.scenario.guidance
-    routes, context = guided_figures.flown_routes(flight.scenario, flight.tape), guided_figures.guided_context(context)
+    speed, bounds = scenario.aircraft.channels().speed, guided_figures.bounds_of(scenario)
+    guidance = scenario.guidance
+    routes, context = guided_figures.flown_routes(scenario, flight.tape), guided_figures.guided_context(context)
     return [
         Section(
             "Ground track",

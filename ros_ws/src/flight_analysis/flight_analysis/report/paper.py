@@ -20,7 +20,6 @@ from flight_analysis.report.summary import (
     RecordedFlight,
     channel_label,
     columns_of,
-    display_units,
     table_rows,
 )
 from flight_core.arguments import as_names
@@ -96,7 +95,7 @@ def write_figure(
     metres = in_si(width, "width", "m")
     require(NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm")
     outputs, inputs = _names(flights, "y"), _names(flights, "u")
-    known = [*outputs, *inputs, *(f"e.{name}" for name in outputs)]
+    known = [*outputs, *inputs, *(f"e.{name}" for name in outputs if _names(flights, "y_m"))]
     wanted = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
     for name in wanted:
         require(name in known, "channels", f"{name!r}", one_of(known, name))
@@ -131,7 +130,7 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
     def plot(tape: Tape, signal: Signal, **style: Any) -> None:
         axes.plot((signal.stamp_ns - tape.start_ns) / NANOSECONDS, signal[plain] * factor, **style)
 
-    for gust in gust_intervals(first.tape, first.scenario.gust_windows()):
+    for gust in gust_intervals(first.tape, first.gusts):
         axes.axvspan(gust.start, gust.stop, color=GUST, alpha=0.2, linewidth=0)
     if is_output and not is_error and "y_m" in first.tape and plain in first.tape["y_m"].names:
         plot(first.tape, first.tape["y_m"], color=REFERENCE, linewidth=3.0 * LINE_WIDTH, label="y_m")
@@ -174,8 +173,9 @@ def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
         t = (signal.stamp_ns - flight.tape.start_ns) / NANOSECONDS
         structure[topics[topic]] = {"stamp_ns": signal.stamp_ns.astype(np.int64), "t": t, **columns}
         original[topics[topic]] = {given: name for name, given in names.items()}
-    units = {name: unit.unit for name, unit in display_units(flight.scenario).items()}
-    notes: dict[str, Any] = {"name": flight.name, "outcome": str(flight.summary["outcome"]), "scenario": flight.scenario.name}
+    units = {name: unit.unit for name, unit in flight.units.items()}
+    notes: dict[str, Any] = {"name": flight.name, "outcome": str(flight.summary["outcome"])}
+    notes |= {"scenario": flight.summary["scenario"] or ""}
     free = matlab_names(("info",), taken=structure)
     notes |= {"units_of_report": {matlab_names((name,))[name]: unit for name, unit in units.items()}, "channels": original}
     return structure | {free["info"]: notes}
@@ -217,7 +217,7 @@ def write_latex(path: Path, flights: Sequence[RecordedFlight]) -> None:
     """Write the tables of errors and of inputs as LaTeX, a tabular each, with the rules of booktabs."""
     parts = []
     for label, flight in zip(comparison.labels(flights), flights, strict=True):
-        units = display_units(flight.scenario)
+        units = flight.units
         for title, key, known in (("Tracking error", "errors", ERROR_COLUMNS), ("Inputs about trim", "inputs", INPUT_COLUMNS)):
             if not flight.summary[key]:
                 continue

@@ -46,12 +46,13 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
         return None
     if "internals" in tape:
         topics["internals"] = _topic(context, tape["internals"], {"mode": ""})
-    routes = flown_routes(flight.scenario, tape) if flight.summary["guidance"] is not None else []
+    scenario = flight.scenario
+    routes = flown_routes(scenario, tape) if flight.summary["guidance"] is not None else []
     info = {
         "units": {name: {"unit": unit.unit} for name, unit in context.units.items()},
-        "positive": flight.scenario.aircraft.channels().positive,
+        "positive": {} if scenario is None else scenario.aircraft.channels().positive,
         "modes": {int(mode): mode.name for mode in Mode},
-        **({} if (section := flight.scenario.guidance) is None else mission_drawing(section, routes)),
+        **({} if scenario is None or scenario.guidance is None else mission_drawing(scenario.guidance, routes)),
     }
     return Replay({"topics": topics, "info": info}, pack(_code().encode()), (SCENE / "scene.css").read_text(encoding="utf-8"))
 

@@ -86,6 +86,9 @@ def report(
         page, flights = result.report, [result.flight]
     else:
         flights = [read_flight(folder, namespace=namespace, scenario=scenario) for folder in folders]
+        for folder, flight in zip(folders, flights, strict=True):
+            expected = "a flight of the stack: a comparison is of tracking errors"
+            require(len(flights) == 1 or flight.scenario is not None, str(folder), "an imported log", expected)
         if html is None:
             files.insert(0, ("html", folders[0].absolute().parent / "comparison.html", write_page))
         page = files[0][1]

@@ -15,7 +15,7 @@ from aircraft_sim.jsbsim_aircraft import model_archive
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
 from flight_analysis.report.account import Account, account, flown, outcome_of_log
-from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise
+from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise, summarise_imported
 from flight_core.arguments import FilePath
 from flight_core.files import dump_yaml, read_file, write_file, writing
 from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
@@ -24,7 +24,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import bounded, printable
-from flight_log.bag import OUTCOME_FILE, LogAttachments
+from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments
 from flight_log.engagements import Engagement
 from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
@@ -91,7 +91,13 @@ def read_flight(
 
 def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
     recorded.require()
-    folder, scenario = _folder(run), _scenario_in(recorded, run)
+    folder, name = _folder(run), printable(run.resolve().name if run.is_dir() else run.stem)
+    if (source := recorded.metadata.get(IMPORTED)) is not None:
+        recorded.require("y", "u")
+        require(recorded.scenario is None, "scenario", "an imported log", "none: nothing of a scenario was flown")
+        summary = summarise_imported(recorded.tape, source)
+        return RecordedFlight(name, None, recorded.tape, summary, recorded.metadata.get(CHANNEL_UNITS, {}))
+    scenario = _scenario_in(recorded, run)
     signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
     log = replace(recorded.tape, signals=signals)
     engagements = recorded.engagements
@@ -99,7 +105,6 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
     tape, of = flown(log), account(log, scenario, outcome, simulated=engagements is None)
-    name = printable(folder.name if run.is_dir() else run.stem)
     engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
     summary = summarise(engaged if has_figures else tape, scenario, outcome, of)
@@ -113,6 +118,8 @@ def log_account(recorded: RecordedRun) -> Account | None:
     """What a log lacks; None for a log without a flight, and without a scenario that can be read."""
     if not {*AIRCRAFT_TOPICS} & {*recorded.tape.signals}:
         return None
+    if IMPORTED in recorded.metadata:
+        return account(recorded.tape, None)
     try:
         scenario = parse_recorded_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
     except ParameterError:
@@ -186,7 +193,7 @@ def write_report(
     flight, folder = _flight(recorded, run, outcome), output or _folder(run)
     with writing("", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
-        if scenario is None:
+        if scenario is None and flight.scenario is not None:
             _write_scenario(recorded, folder / flight.scenario.path.name)
         write_file(folder / SUMMARY, json.dumps(flight.summary, indent=2, allow_nan=False) + "\n")
         write_page(folder / REPORT, [flight])

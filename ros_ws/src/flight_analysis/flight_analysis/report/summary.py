@@ -32,6 +32,7 @@ from flight_analysis.metrics import (
 )
 from flight_analysis.report.account import Account, Commands, account, account_of_json, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
+from flight_core.outcome import IMPORT
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
@@ -104,14 +105,29 @@ class RecordedFlight(NamedTuple):
     """A flight under the name of its run: the input of figures, tables, exports and comparisons."""
 
     name: str
-    scenario: Scenario
+    scenario: Scenario | None  # None: an imported flight
     tape: Tape
-    summary: dict[str, Any]  # of `summarise`
+    summary: dict[str, Any]  # of `summarise`, or of `summarise_imported`
+    si_units: Mapping[str, str] = {}  # by channel, of an imported flight
 
     @property
     def period_ns(self) -> int:
-        """Period of the controller's ticks, ns."""
+        """Period of the controller's ticks, of an imported flight the median interval of u, ns."""
+        if self.scenario is None:
+            return max(int(np.median(np.diff(self.tape["u"].stamp_ns))), 1)
         return period_ns(self.scenario.controller.rate, "controller.rate")
+
+    @property
+    def units(self) -> dict[str, DisplayUnit]:
+        """Units of tables and figures by channel of y and u."""
+        if self.scenario is None:
+            return {name: display_unit(unit) for name, unit in self.si_units.items()}
+        return display_units(self.scenario)
+
+    @property
+    def gusts(self) -> dict[str, tuple[float, float]]:
+        """Start and end of each gust of the scenario, s."""
+        return {} if self.scenario is None else self.scenario.gust_windows()
 
 
 def summarise(
@@ -154,6 +170,21 @@ def summarise(
         "account": of.as_json(),
         "notes": [*([of.busy] if of.busy else []), *tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
+    return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
+    """The metrics of a flight that the stack did not fly: of y and u about trim, and the account of the topics.
+
+    It has no reference, and so no error. `source`: of `rise-di import`, the metadata record IMPORTED.
+    """
+    of = account(tape, None)
+    deviations = {
+        key: {name: {"whole": parts["whole"]._asdict()} for name, parts in inputs_by_part(tape, (), topic=topic).items()}
+        for key, topic in (("outputs", "y"), ("inputs", "u"))
+    }
+    summary = empty_summary(None, IMPORT) | deviations | {"duration": of.end, "account": of.as_json()}
+    summary |= {"source": dict(source), "notes": [*of.notes(), *tape.notes]}
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 
@@ -224,10 +255,10 @@ def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -
     return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
 
 
-def empty_summary(scenario: Scenario, outcome: str) -> dict[str, Any]:
+def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
     """The summary of a flight with an end before the first sample."""
     return {
-        "scenario": scenario.name,
+        "scenario": None if scenario is None else scenario.name,
         "outcome": outcome,
         "duration": None,
         "error": None,

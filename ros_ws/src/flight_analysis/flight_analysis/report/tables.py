@@ -37,6 +37,7 @@ ERROR_LEGEND = (
     f" {MIN_BAND_NOISE_FLOORS:g} noise floors if it is measured; the slowest"
 )
 NOISE_FLOOR_LEGEND = ". noise floor: of y; a smaller error cannot be distinguished from noise or rounding"
+IMPORTED_LEGEND = "about trim, the median; rate: mean abs of the derivative, in the unit of the row per second"
 INPUT_LEGEND = "u about trim; rate: mean abs(u_dot), in the unit of the row per second"
 GUIDANCE_LEGEND = (
     "a segment has the same modes, commands and leg of the route. overshoot: the largest error beyond the command;"
@@ -108,6 +109,21 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
         _process_table(summary),
     )
     return [table for table in tables if table.rows]
+
+
+def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[Table]:
+    """Tables of y and u, and of the topics, of an imported flight."""
+    tables = []
+    for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
+        columns = columns_of(INPUT_COLUMNS, summary[key])
+        tables.append(Table(title, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND))
+    of = account_of_json(summary)
+    rows = []
+    for name, topic in ({} if of is None else of.topics).items():
+        length = (topic.last or 0.0) - (topic.first or 0.0)
+        rate = (topic.found - 1) / length if length else None
+        rows.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
+    return [*tables, Table("Topics", [Column("", head) for head in ("samples", "Hz", "longest gap (s)")], rows)]
 
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:

@@ -55,7 +55,8 @@ export function chartsOf(flight, ghost) {
       line(...timed(flight, `y.${name}`), "y", "--plant", 1.4, {factor}),
     ];
     if (ghost) lines.splice(1, 0, line(...timed(ghost, `y.${name}`), "y of the ghost", "--ghost", 1.2, {factor, flight: ghost, dash: [5, 3]}));
-    charts.push({title: `${name}: y over y_m`, unit: unit(name).unit, lines});
+    const referenced = names("y_m").length || flight.get("y_m");
+    charts.push({title: referenced ? `${name}: y over y_m` : name, unit: unit(name).unit, lines});
   }
   for (const name of names("e")) {
     const {factor, unit: text} = unit(name), band = flight.head.bands[name];
