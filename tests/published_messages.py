@@ -39,7 +39,7 @@ PUBLISHED: dict[str, dict[str, str]] = {
     "px4_msgs/msg/VehicleTorqueSetpoint": {"xyz": "float32[3]"},
     "px4_msgs/msg/VehicleThrustSetpoint": {"xyz": "float32[3]"},
     "px4_msgs/msg/OffboardControlMode": dict.fromkeys(MODES, "bool"),
-    "px4_msgs/msg/ManualControlSetpoint": {"aux1": "float32"},
+    "px4_msgs/msg/ManualControlSetpoint": {"aux1": "float32", "valid": "bool"},
     "px4_msgs/msg/VehicleStatus": {"arming_state": "uint8", "nav_state": "uint8"},
     "px4_msgs/msg/VehicleCommand": {
         "command": "uint32",

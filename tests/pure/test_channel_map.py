@@ -7,8 +7,10 @@ rosflight_msgs and rosplane_msgs may not be installed. Tests with real messages 
 test_published_messages.py.
 """
 
+import json
 import math
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace as Message
 from typing import Any
 
@@ -21,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PACKAGES, PUBLISHED, blank, kind
+from typer.testing import CliRunner
 
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.channel_map import (
@@ -35,6 +38,7 @@ from autopilot_bridge.channel_map import (
     version_faults,
 )
 from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -192,6 +196,36 @@ def test_topic_of_px4_has_the_version_of_the_installed_definition(version: int, 
     assert [fault.split("whose topic is ")[1].split(":")[0] for fault in faults] == (
         [f"/fmu/out/{expected}"] if expected else []
     )
+
+
+def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> None:
+    """By definitions as a release publishes them. "2" has another topic for the status, and no true airspeed."""
+    versions = {"1": {"VehicleStatus": 1}, "2": {"VehicleStatus": 4}}
+    for release, of_release in versions.items():
+        messages = tmp_path / release / "msg"
+        messages.mkdir(parents=True)
+        (messages.parent / "package.xml").write_text("<package><name>px4_msgs</name></package>", encoding="utf-8")
+        for type_name, fields in PUBLISHED.items():
+            if type_name.startswith("px4_msgs/"):
+                name = type_name.rpartition("/")[2]
+                lines = [f"uint32 MESSAGE_VERSION = {of_release.get(name, 0)}", "uint8 ARMING_STATE_ARMED = 2"]
+                lines += [f"{of} {field}" for field, of in fields.items() if (release, field) != ("2", "true_airspeed_m_s")]
+                (messages / f"{name}.msg").write_text("\n".join(lines), encoding="utf-8")
+    options = [word for release in versions for word in ("--definitions", str(tmp_path / release))]
+    result = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", *options, "--json"])
+    assert result.exit_code == 1
+    status = "/fmu/out/vehicle_status_v1: version 4, whose topic is /fmu/out/vehicle_status_v4"
+    found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
+    assert found == {
+        "outputs.V": ["", "no true_airspeed_m_s"],
+        "conditions.armed": ["", status],
+        "conditions.offboard": ["", status],
+    }
+    alone = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", *options[:2]])
+    assert alone.exit_code == 0
+    assert "1: 24 of 24 rows hold" in alone.output
+    refused = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", "--definitions", str(tmp_path / "1" / "msg")])
+    assert "expected a folder with the sources of a message package" in str(refused.exception)
 
 
 def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:

@@ -161,15 +161,20 @@ def message_type(name: str, load: Callable[[str], Any] = importlib.import_module
     return message_class
 
 
-def version_fault(topic: str, message_class: Any) -> str:
-    """What is wrong with the version in a topic of PX4, /fmu/.../NAME_vVERSION, as a sentence; empty where nothing is.
+def versioned_topic(topic: str, version: int) -> str:
+    """The topic of PX4 for a version of its definition, /fmu/.../NAME_vVERSION; other topics stay.
 
     Definitions state it as MESSAGE_VERSION, and version 0 has no suffix. Source: PX4 guide, PX4 ROS 2 message translation node.
     """
+    return VERSION.sub("", topic) + (f"_v{version}" if version else "") if topic.startswith("/fmu/") else topic
+
+
+def version_fault(topic: str, message_class: Any) -> str:
+    """What is wrong with the version in a topic of PX4, as a sentence; empty where nothing is."""
     version = getattr(message_class, "MESSAGE_VERSION", None)
-    if version is None or not topic.startswith("/fmu/"):
+    if version is None:
         return ""
-    expected = VERSION.sub("", topic) + (f"_v{version}" if version else "")
+    expected = versioned_topic(topic, version)
     definition = f"the installed {message_class.__name__} has version {version}"
     return (
         "" if topic == expected else f"{topic}: {definition}, whose topic is {expected}: change the map, or install the release"

@@ -375,6 +375,21 @@ class ChannelMap(Config):
         rows = self._readers() | {"messages": self.messages}
         return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
 
+    def used_fields(self) -> list[tuple[str, str, str, str]]:
+        """(key of the row, topic, type, path of the field) of each field that is read or set."""
+        fields = []
+        for kind, named in self._readers().items():
+            for name, row in named.items():
+                fields.append((f"{kind}.{name}", row.topic, row.type, row.field))
+                if getattr(row, "stamp", "") == "header":
+                    fields.append((f"{kind}.{name}", row.topic, row.type, "header.stamp"))
+        set_fields = [("inputs", name, row.message, row.field) for name, row in self.inputs.items()]
+        for name, row in self.messages.items():
+            set_fields += [("messages", name, name, path) for path in (*row.values, *(["header.stamp"] if row.stamped else []))]
+        for kind, name, message, path in set_fields:
+            fields.append((f"{kind}.{name}", self.messages[message].topic, self.messages[message].type, path))
+        return fields
+
 
 ROUNDING = 1e-6  # tolerance for limits with six digits that are the ends of a range
 

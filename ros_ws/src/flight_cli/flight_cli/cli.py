@@ -40,6 +40,7 @@ COMMANDS = MappingProxyType(
         "airframe": "Make an airframe of your own from matrices, with a scenario that flies.",
         "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
         "learn": "Repeat the learner on the log of a flight, with other settings, and write the model.",
+        "check-map": "Tell for which releases of an autopilot the rows of a channel map hold.",
         "check-signs": "Compare the signs of a channel map with the D of the controller.",
         "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
         "guidance": "Hold, skip a waypoint, resume, fly home or another route, in a running guided flight.",

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which rows of a channel map hold for a release of an autopilot, by its message definitions.
+
+A row holds where the definition has its field, where its topic has the version of the definition (PX4), and where a constant
+that the source of a condition names is one of the values.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import TypesysError, get_types_from_msg
+
+from autopilot_bridge import mavlink_link
+from autopilot_bridge.channel_map import STEP, versioned_topic
+from autopilot_bridge.params import MAVLINK, ChannelMap
+from flight_core.files import read_file
+from flight_core.parameters import ParameterError, require
+from flight_log.message_definitions import definition
+from flight_log.named_vectors import typestore
+
+Types = Mapping[str, tuple[Any, Any]]
+"""Constants (name, type, value) and fields (name, type) by the full name of a message, as of rosbags."""
+
+PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
+CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
+VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
+
+
+class CheckedRow(NamedTuple):
+    """A field that a row of a map reads or sets, and why the row does not hold, by release; empty where it holds."""
+
+    key: str
+    topic: str
+    field: str
+    faults: tuple[str, ...]
+
+
+def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
+    """Message types and those that they contain, of the packages below a folder. Raises ParameterError where it has none."""
+    expected = "a folder with the sources of a message package: package.xml and msg/*.msg"
+    require(folder.is_dir(), "--definitions", f"{folder}, which is no folder", expected)
+    packages = {}
+    for path in sorted(folder.rglob("package.xml")):
+        if (match := PACKAGE.search(read_file(path, str(path), "a package.xml"))) and (path.parent / "msg").is_dir():
+            packages[match[1].decode()] = path.parent / "msg"
+    require(bool(packages), "--definitions", f"{folder} without one", expected)
+    types: dict[str, tuple[Any, Any]] = {}
+    waiting = list(kinds)
+    while waiting:
+        kind = waiting.pop()
+        package, _, name = kind.split("/")
+        path = packages.get(package, folder) / f"{name}.msg"
+        if kind in types or package not in packages or not path.is_file():
+            continue
+        types |= _parsed(read_file(path, str(path), "a message definition").decode(errors="replace"), kind)
+        waiting += [_element(field)[1] for _, field in types[kind][1] if _element(field)[0] is Nodetype.NAME]
+    return types
+
+
+def installed_definitions(kinds: Iterable[str]) -> Types:
+    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is absent."""
+    types: dict[str, tuple[Any, Any]] = {}
+    for kind in kinds:
+        try:
+            if kind.startswith(f"{MAVLINK}/"):
+                fields = mavlink_link.message_type(kind.rpartition("/")[2]).fields
+                types[kind] = [], [(name, (Nodetype.BASE, ("float64", 0))) for name in fields]
+            else:
+                types |= _parsed(definition(kind).text, kind)
+        except ParameterError:
+            continue
+    return types
+
+
+def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
+    """Each field that a map uses, against the definitions of some releases. A definition without a version has version 0."""
+    types = list(releases)
+    rows = []
+    for key, topic, kind, path in channel_map.used_fields():
+        faults = tuple(_fault(of, topic, kind, path) or _constant_fault(of, channel_map, key, kind) for of in types)
+        rows.append(CheckedRow(key, topic, path, faults))
+    return rows
+
+
+def is_known(types: Types, kind: str) -> bool:
+    """Whether a message is defined there, or in ROS 2 Jazzy."""
+    return kind in types or kind in typestore().fielddefs
+
+
+def _parsed(text: str, kind: str) -> Types:
+    try:
+        return get_types_from_msg(text, kind)
+    except (TypesysError, ValueError, LookupError) as error:
+        raise ParameterError(f"{kind}: found a definition that cannot be read ({error}), expected one of ROS 2") from None
+
+
+def _element(field: Any) -> tuple[Nodetype, Any]:
+    """The type of a field, of an array that of its elements."""
+    node, content = field
+    return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
+
+
+def _fault(types: Types, topic: str, kind: str, path: str) -> str:
+    known = {**typestore().fielddefs, **types}
+    if not is_known(types, kind):
+        return f"no {kind}"
+    version = next((value for name, _, value in known[kind][0] if name == VERSION), 0)
+    if (expected := versioned_topic(topic, version)) != topic:
+        return f"{topic}: version {version}, whose topic is {expected}"
+    at = kind
+    for step in path.split("."):
+        match = STEP.fullmatch(step)
+        fields = dict(known[at][1]) if at in known else {}
+        if match is None or match[1] not in fields:
+            return f"no {step}"
+        node, content = fields[match[1]]
+        if match[2] is not None and node is Nodetype.ARRAY and int(match[2]) >= content[1]:
+            return f"{match[1]} of {content[1]}"
+        element = _element((node, content))
+        at = element[1] if element[0] is Nodetype.NAME else ""
+    return ""
+
+
+def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) -> str:
+    section, _, name = key.partition(".")
+    row = channel_map.conditions.get(name) if section == "conditions" else None
+    if row is None or not row.one_of or kind not in types:
+        return ""
+    values = {constant: value for constant, _, value in types[kind][0]}
+    named = [constant for constant in CONSTANT.findall(row.source) if constant in values]
+    wrong = [f"{constant} = {values[constant]}" for constant in named if values[constant] not in row.one_of]
+    return ", ".join(wrong)
