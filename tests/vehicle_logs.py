@@ -15,11 +15,16 @@ FMT = struct.Struct("<3sBB4s16s64s")  # ArduPilot, AP_Logger/LogStructure.h, log
 HEAD = b"\xa3\x95"
 
 
-def write_dataflash(path: Path, messages: Mapping[str, tuple[Sequence[str], Rows]], parameters: Mapping[str, float]) -> None:
-    """A DataFlash log: every field a float. Messages are in the order of their stamps, the parameters before them."""
+def write_dataflash(
+    path: Path, messages: Mapping[str, tuple[Sequence[str], Rows]], parameters: Mapping[str, float], firmware: str
+) -> None:
+    """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and parameters before them."""
     packets: list[tuple[int, bytes]] = [
         (-1, FMT.pack(HEAD + b"\x80", 0x80, FMT.size, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"))
     ]
+    text = struct.Struct("<3sQ64s")
+    packets.append((-1, FMT.pack(HEAD + b"\x80", 0x7F, text.size, b"MSG", b"QZ", b"TimeUS,Message")))
+    packets.append((0, text.pack(HEAD + b"\x7f", 0, firmware.encode())))
     row = struct.Struct("<3sQ16sf")
     packets.append((-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value")))
     packets += [(0, row.pack(HEAD + b"\x81", 0, name.encode(), value)) for name, value in parameters.items()]

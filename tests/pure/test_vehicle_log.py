@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from tests.conftest import REPOSITORY
 from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
 from typer.testing import CliRunner
 
@@ -95,7 +96,26 @@ def dataflash(path: Path, flight: Flight, mode: int = 0) -> Path:
         for n in range(1, 5)
         for end, value in (("MIN", 1000.0), ("MAX", 2000.0))
     }
-    write_dataflash(path, messages, parameters | ends | {"SERVO2_REVERSED": 1.0})
+    write_dataflash(path, messages, parameters | ends | {"SERVO2_REVERSED": 1.0}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    return path
+
+
+def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (2a3dc4b7)") -> Path:
+    """The channels of the flight as those of a multicopter, in STABILIZE, which has the number of MANUAL of a plane."""
+    parts = (on_ground(flight), flight)
+    stamps = [stamp for part in parts for stamp in part.stamp_us]
+    y, u = np.concatenate([part.y for part in parts]), np.concatenate([part.u for part in parts])
+    lift = u[:, 1] + THROTTLE * (np.array(stamps) >= flight.stamp_us[0])
+    messages = {
+        "MODE": (("Mode", "ModeNum"), [(1, (0, 0))]),
+        "IMU": (("GyrX", "GyrY", "GyrZ"), list(zip(stamps, y[:, [2, 0, 3]], strict=True))),
+        "XKF1": (("VD",), list(zip(stamps, -y[:, [1]], strict=True))),
+        "RATE": (
+            ("POut", "ROut", "YOut", "AOut"),
+            list(zip(stamps, np.column_stack([u[:, [0, 2, 3]], lift]), strict=True)),
+        ),
+    }
+    write_dataflash(path, messages, {}, firmware)
     return path
 
 
@@ -130,7 +150,30 @@ def ulog(path: Path, flight: Flight) -> Path:
     return path
 
 
-WRITERS = {"flight.bin": (dataflash, "ardupilot"), "flight.tlog": (tlog, "ardupilot"), "flight.ulg": (ulog, "px4")}
+def ulog_of_2020(path: Path, flight: Flight) -> Path:
+    """As PX4 1.9 logs: actuator_controls_0, airspeed and the gyro in sensor_combined."""
+
+    def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
+        return list(zip(flight.stamp_us, values, strict=True))
+
+    elevator, thrust, aileron, rudder = flight.u.T
+    controls = np.column_stack([aileron / FULL, elevator / FULL, rudder / FULL, THROTTLE + thrust])
+    topics = {
+        "sensor_combined": ("float[3] gyro_rad;", rows(flight.y[:, [2, 0, 3]])),
+        "airspeed": ("float true_airspeed_m_s;", rows(flight.y[:, [1]] + SPEED)),
+        "actuator_controls_0": ("float[4] control;", rows(controls)),
+    }
+    write_ulog(path, topics, {})
+    return path
+
+
+WRITERS = {
+    "flight.bin": (dataflash, "ardupilot"),
+    "flight.tlog": (tlog, "ardupilot"),
+    "flight.ulg": (ulog, "px4"),
+    "2020.ulg": (ulog_of_2020, "px4"),
+    "tlog.bin": (tlog, "ardupilot"),  # the content tells the kind, not the name
+}
 
 
 @pytest.mark.parametrize("name", WRITERS)
@@ -143,7 +186,7 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
     assert (tape["y"].names, tape["u"].names) == (OUTPUTS, INPUTS)
     assert len(tape["y"].stamp_ns) == len(flight.y)  # of the flight, without the time on the ground
     assert tape["y"].values == pytest.approx(flight.y - [0.0, np.median(flight.y[:, 1]), 0.0, 0.0], abs=1e-5)  # float32
-    resolution = 0.5 / 500.0 * FULL if name == "flight.tlog" else 0.0  # rad: pulses are whole us in MAVLink
+    resolution = 0.5 / 500.0 * FULL if write is tlog else 0.0  # rad: pulses are whole us in MAVLink
     assert tape["u"].values == pytest.approx(flight.u, abs=resolution + 1e-6)
     assert np.median(tape["commands"].values, axis=0) == pytest.approx([0.0, THROTTLE, 0.0, 0.0], abs=1e-6)
 
@@ -167,6 +210,33 @@ def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: P
     assert not bag.exists()
     assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
+
+
+def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(flight: Flight, tmp_path: Path) -> None:
+    """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half of the usual thrust."""
+    quadrotor, bag = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml"), tmp_path / "bag"
+    command = ["import", str(multicopter(tmp_path / "flight.bin", flight)), "--map", quadrotor, "--output", str(bag)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    tape = read_run(bag).tape
+    assert (tape["y"].names, tape["u"].names) == (("q", "vertical_speed", "p", "r"), ("pitch", "thrust", "roll", "yaw"))
+    assert len(tape["y"].stamp_ns) == len(flight.y)  # without the time on the ground
+    assert tape["y"].values == pytest.approx(flight.y, abs=1e-5)
+    assert tape["u"].values == pytest.approx(flight.u, abs=1e-6)
+    rover = multicopter(tmp_path / "rover.bin", flight, "ArduRover V4.5.7 (2a3dc4b7)")
+    for arguments, sentence in (
+        ([*command[:-2], "--servos"], "--servos: found a multicopter, expected none"),
+        (["import", str(rover), *command[2:4]], "found one of a rover, expected one of a plane or a multicopter"),
+    ):
+        assert sentence in str(CliRunner().invoke(app, arguments).exception)
+
+
+def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path: Path) -> None:
+    whole = dataflash(tmp_path / "whole.bin", flight)
+    short = dataflash(tmp_path / "short.bin", Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200]))
+    (tmp_path / "both.bin").write_bytes(short.read_bytes() + whole.read_bytes())
+    both, alone = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
+    assert both.kind == "a DataFlash log of ArduPilot, the longest of 2 parts: its clock goes back"
+    np.testing.assert_array_equal(both.tables["IMU"].stamp_ns, alone.tables["IMU"].stamp_ns)
 
 
 def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:

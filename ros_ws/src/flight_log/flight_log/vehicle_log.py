@@ -7,6 +7,7 @@ and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 """
 
 import math
+import re
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, redirect_stdout
@@ -61,6 +62,7 @@ class Format(NamedTuple):
     sticks: Source  # its field has the number of the channel in place of {}
     servos: Source
     mode: tuple[Source, ...]
+    torques: Sources = MappingProxyType({})  # of a multicopter's rate controllers, normalised, by what responds to them
 
 
 def _sources(**places: tuple[Source, ...] | Source) -> Sources:
@@ -90,6 +92,9 @@ DATAFLASH = Format(
     sticks=Source("RCIN", "C{}"),
     servos=Source("RCOU", "C{}"),
     mode=(Source("MODE", "ModeNum"), Source("MODE", "Mode")),
+    torques=_sources(
+        q=Source("RATE", "POut"), p=Source("RATE", "ROut"), r=Source("RATE", "YOut"), climb=Source("RATE", "AOut")
+    ),
 )
 TLOG = Format(
     sources=_sources(
@@ -111,11 +116,17 @@ TLOG = Format(
     servos=Source("SERVO_OUTPUT_RAW", "servo{}_raw"),
     mode=(Source("HEARTBEAT", "custom_mode"),),
 )
+
+
+def _rate(axis: int) -> tuple[Source, ...]:
+    return Source("vehicle_angular_velocity", f"xyz[{axis}]"), Source("sensor_combined", f"gyro_rad[{axis}]")  # before 1.10
+
+
 ULOG_SOURCES = _sources(
-    q=Source("vehicle_angular_velocity", "xyz[1]"),
-    p=Source("vehicle_angular_velocity", "xyz[0]"),
-    r=Source("vehicle_angular_velocity", "xyz[2]"),
-    V=Source("airspeed_validated", "true_airspeed_m_s"),
+    q=_rate(1),
+    p=_rate(0),
+    r=_rate(2),
+    V=(Source("airspeed_validated", "true_airspeed_m_s"), Source("airspeed", "true_airspeed_m_s")),
     phi=Source("vehicle_attitude", "phi"),
     theta=Source("vehicle_attitude", "theta"),
     psi=Source("vehicle_attitude", "psi"),
@@ -128,6 +139,28 @@ ULOG_SOURCES = _sources(
 )
 
 
+ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
+    {("vehicle_torque_setpoint", f"xyz[{axis}]"): Source("actuator_controls_0", f"control[{axis}]") for axis in range(3)}
+    | {("vehicle_thrust_setpoint", "xyz[0]"): Source("actuator_controls_0", "control[3]")}
+    | {("vehicle_thrust_setpoint", "xyz[2]"): Source("actuator_controls_0", "control[3]", -1.0)}
+)
+"""Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch, yaw, thrust)."""
+
+PLANE, COPTER = "plane", "multicopter"
+FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
+FIRMWARES = MappingProxyType({"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"})
+MAV_TYPES: Mapping[int, str] = MappingProxyType(
+    dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), PLANE)  # fixed wing, VTOL
+    | dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), COPTER)
+    | dict.fromkeys((10, 11), "rover")
+    | {12: "submarine"}
+)
+"""Kinds of vehicles by MAV_TYPE, common.xml."""
+
+PX4, PX4_MANUAL = 12, 1 << 16  # MAV_AUTOPILOT_PX4, and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
+BACK_NS = NANOSECONDS  # a clock that goes back by more has started again
+
+
 class VehicleLog(NamedTuple):
     """A log of an autopilot. `format` is None for a ULog, whose messages have the names of PX4's topics."""
 
@@ -135,6 +168,8 @@ class VehicleLog(NamedTuple):
     tables: Mapping[str, Table]
     parameters: Mapping[str, float]
     format: Format | None
+    vehicle: str = PLANE
+    manual: int = 0  # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane (mode.h)
 
     def source(self, quantity: str) -> Source | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""
@@ -181,22 +216,29 @@ def _read_dataflash(path: Path, kind: str) -> VehicleLog:
     wanted = _wanted(DATAFLASH)
     wanted.setdefault("CTUN", set()).add("E2T")
     parameters: dict[str, float] = {}
+    firmwares: dict[str, None] = {}
 
     def samples() -> Iterator[tuple[str, int, Any]]:
+        stamp_us = 0.0
         reader = DFReader.DFReader_text(str(path)) if "text" in kind else DFReader.DFReader_binary(str(path))
         with closing(reader):
-            while (message := reader.recv_match(type=[*wanted, "PARM"])) is not None:
+            while (message := reader.recv_match(type=[*wanted, "PARM", "MSG"])) is not None:
                 name = message.get_type()
                 if name == "PARM":
                     parameters[message.Name] = float(message.Value)
+                elif name == "MSG":
+                    firmwares.update(dict.fromkeys(FIRMWARE.findall(str(message.Message))))
                 elif not (getattr(message, "I", 0) or getattr(message, "C", 0)):  # of the first sensor and of the first core
-                    yield name, round(1e3 * message.TimeUS), message
+                    # Logs of 2014 and before have ms, and MODE has no time: that of the message before.
+                    stamp_us = getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us))
+                    yield name, round(1e3 * stamp_us), message
 
-    tables = _tables(samples(), wanted)
+    tables, parts = _tables(samples(), wanted)
     _true_airspeed(tables)
+    vehicle = FIRMWARES[next(iter(firmwares), "Plane")]
     if (attitude := tables.get("ATT")) is not None:
         attitude.fields["Yaw"][:] = np.remainder(attitude.fields["Yaw"] + 180.0, 360.0) - 180.0
-    return VehicleLog(kind, tables, parameters, DATAFLASH)
+    return VehicleLog(kind + parts, tables, parameters, DATAFLASH, vehicle)
 
 
 def _true_airspeed(tables: Mapping[str, Table]) -> None:
@@ -216,16 +258,17 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
 
     wanted = _wanted(TLOG)
     parameters: dict[str, float] = {}
-    autopilots: dict[int, None] = {}  # systems in the order of their heartbeats
+    autopilots: dict[int, tuple[int, int]] = {}  # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
 
     def samples() -> Iterator[tuple[str, int, Any]]:
-        with closing(mavutil.mavlink_connection(str(path), dialect="ardupilotmega")) as reader:
+        mavutil.set_dialect("ardupilotmega")
+        with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name
             while (message := reader.recv_match(type=[*wanted, "PARAM_VALUE"])) is not None:
                 name = message.get_type()
                 if message.get_srcComponent() != AUTOPILOT:
                     continue
                 if name == "HEARTBEAT":
-                    autopilots[message.get_srcSystem()] = None
+                    autopilots.setdefault(message.get_srcSystem(), (message.autopilot, message.type))
                 if message.get_srcSystem() != next(iter(autopilots), None):
                     continue
                 if name == "PARAM_VALUE":
@@ -233,10 +276,12 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
                 else:
                     yield name, round(NANOSECONDS * message._timestamp), message
 
-    tables = _tables(samples(), wanted)
+    tables, parts = _tables(samples(), wanted)
     first, *others = map(str, autopilots) if autopilots else ("none",)
     left_out = f", system {first} alone; it also has {', '.join(others)}" if others else ""
-    return VehicleLog(kind + left_out, tables, parameters, TLOG)
+    autopilot, mav_type = next(iter(autopilots.values()), (0, 1))
+    vehicle, manual = MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}"), PX4_MANUAL if autopilot == PX4 else 0
+    return VehicleLog(kind + left_out + parts, tables, parameters, TLOG, vehicle, manual)
 
 
 def _read_ulog(path: Path, kind: str) -> VehicleLog:
@@ -272,7 +317,7 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
 
 def _wanted(of: Format) -> dict[str, set[str]]:
     """The fields that are read, by message."""
-    places = [at for ats in of.sources.values() for at in ats] + list(of.mode)
+    places = [at for sources in (of.sources, of.torques) for ats in sources.values() for at in ats] + list(of.mode)
     for at, count in ((of.sticks, STICKS), (of.servos, SERVOS)):
         places += [Source(at.message, at.field.format(number)) for number in range(1, count + 1)]
     wanted: dict[str, set[str]] = {}
@@ -281,8 +326,24 @@ def _wanted(of: Format) -> dict[str, set[str]]:
     return wanted
 
 
-def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
-    """Tables of messages: name, stamp in ns, message. A field that its first message lacks is absent."""
+def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> tuple[dict[str, Table], str]:
+    """Tables of messages: name, stamp in ns, message; and a note. A field that its first message lacks is absent.
+
+    Where the clock goes back by more than BACK_NS, as of an autopilot that started again, the longest part counts alone.
+    """
+    parts, newest_ns = [list[tuple[str, int, Any]]()], 0
+    for sample in samples:
+        if sample[1] < newest_ns - BACK_NS:
+            parts.append([])
+            newest_ns = 0
+        newest_ns = max(newest_ns, sample[1])
+        parts[-1].append(sample)
+    note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
+    longest = max(parts, key=len)
+    return _columns(longest, wanted), note
+
+
+def _columns(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
     stamps: dict[str, list[int]] = {}
     columns: dict[str, dict[str, list[float]]] = {}
     for name, stamp_ns, message in samples:

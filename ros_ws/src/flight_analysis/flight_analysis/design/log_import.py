@@ -9,17 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from autopilot_bridge.channel_map import Line, to_channel
-from autopilot_bridge.params import ChannelMap
+from autopilot_bridge.params import ChannelMap, InputRow
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_log.vehicle_log import SERVOS, Source, VehicleLog
+from flight_log.vehicle_log import COPTER, PLANE, SERVOS, ULOG_TORQUES, Source, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
-MANUAL = 0  # ArduPlane/mode.h: in this mode the sticks are the commands
-AIRBORNE = 0.5  # of the typical airspeed: below, the aircraft is on the ground
-TYPICAL = 90.0  # percentile of the airspeed of a log, which may have more time on the ground than in the air
+AIRBORNE = 0.5  # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
+TYPICAL = 90.0  # percentile of either in a log, which may have more time on the ground than in the air
 CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")  # of a transmitter: Rc.msg from 0, MAVLink from 1
 FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}  # SERVOn_FUNCTION by RCMAP: aileron, elevator, throttle, rudder
 LEAST = 2.0  # s of flight that are worth a bag
@@ -39,16 +38,21 @@ def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos
     """y, u, `commands` and the pose of a log, as the bridge would have published them.
 
     y and the pose hold the newest values at the stamps of the map's `instant` and of the first channel of the pose. u is the
-    command less its median: the setpoint of the map (PX4), else the stick in MANUAL, or with `servos` the servo's position,
-    scaled as the stick. Without a window the longest stretch in the air is taken, for sticks in MANUAL. Raises
-    ParameterError for a channel that the log does not have, and for a log without such a stretch.
+    command less its median: the setpoint of the map (PX4) or of the rate controllers (ArduCopter), else the stick in MANUAL, or
+    with `servos` the servo's position, scaled as the stick. Without a window the longest stretch in the air is taken, for
+    sticks in MANUAL. Raises ParameterError for a channel that the log does not have, for another vehicle, and without such a
+    stretch.
     """
+    require(log.vehicle in {PLANE, COPTER}, "the log", f"one of a {log.vehicle}", "one of a plane or a multicopter")
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
     readers = {name: _commands(channel_map, log, name, servos) for name in channel_map.inputs}
     speed = next((log.at(sources[name], stamps) for name, row in rows.items() if row.motion[0] == "V"), None)
-    needs_manual = log.format is not None and not servos
+    if speed is None:  # a multicopter: its thrust
+        lifts = {name: row.motion[1] for name, row in channel_map.inputs.items() if row.motion[0] == "climb"}
+        speed = next((sign * readers[name].at(stamps) for name, sign in lifts.items()), None)
+    needs_manual = log.format is not None and not servos and log.vehicle == PLANE
     first, last = _flight(log, stamps, speed, window, needs_manual=needs_manual)
     y_stamps = stamps[(stamps >= first) & (stamps <= last)]
     y = np.column_stack([row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()])
@@ -113,9 +117,13 @@ def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool)
     if log.format is None:
         topic = channel_map.messages[row.message].topic.rpartition("/")[2]
         source = Source(topic, row.field)
+        before_1_14 = ULOG_TORQUES.get((topic, row.field), source)
+        source = source if log.has(source) or not log.has(before_1_14) else before_1_14
         require(log.has(source), f"inputs.{name}", f"no {topic}.{row.field} in the log", "it: the map and the log fit together")
         require(not servos, "--servos", "a ULog", "none: its setpoints of torque and thrust are the commands")
         return _Reader(log, source, same, row.line)
+    if log.vehicle == COPTER:
+        return _torque(log, name, row, servos)
     trim = channel_map.trims.get(name)
     match = CHANNEL.fullmatch(row.field if trim is None else trim.field)
     if match is None:
@@ -133,6 +141,17 @@ def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool)
     expected = "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
     require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", expected)
     return _Reader(log, source, before, row.line)
+
+
+def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
+    """The output of a multicopter's rate controller: no mode has sticks that are commands. It is normalised as PX4's."""
+    quantity, sign = row.motion
+    source = next((at for at in log.format.torques.get(quantity, ()) if log.has(at)), None) if log.format else None
+    if source is None:
+        expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
+        raise ParameterError(f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected {expected}")
+    require(not servos, "--servos", "a multicopter", "none: the outputs of its rate controllers are the commands")
+    return _Reader(log, source, Line(1, 1.0, 0.0), Line(1 if sign > 0 else -1, row.scale, 0.0))
 
 
 def _servo(log: VehicleLog, number: int, name: str) -> tuple[Source, Line]:
@@ -174,13 +193,15 @@ def _flight(
         int(keep.sum()) > 1, "--from, --until", "no sample", f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log"
     )
     if speed is not None and window.start is None and window.stop is None:
+        require(bool(np.isfinite(speed).any()), "the log", "no airspeed or thrust at the samples of y", "a flight")
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if needs_manual:
         mode = next((at for at in log.format.mode if log.has(at)), None) if log.format is not None else None
         if mode is not None:
-            keep &= log.at(mode, stamps) == MANUAL
+            keep &= log.at(mode, stamps) == log.manual
         expected = "it, for only there the sticks are the commands, or --servos"
         require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
+    require(bool(keep.any()), "the log", f"no time in the air {where}", "a flight, or --from and --until")
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
     runs = [(int(stamps[first]), int(stamps[end - 1])) for first, end in zip(edges[::2], edges[1::2], strict=True)]
     first, last = max(runs, key=lambda run: run[1] - run[0])
