@@ -153,6 +153,10 @@ def wpl(*rows: tuple[float, ...]) -> str:
     return "\r\n".join(["QGC WPL 110", *texts, ""])
 
 
+def survey(items: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"type": "ComplexItem", "complexItemType": "survey", "TransectStyleComplexItem": {"Items": items}}
+
+
 def zipped(**files: str) -> bytes:
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as opened:
@@ -185,13 +189,17 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
         ("r.kml", kml(KML_LINE.replace(",", ", "))),
         ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),
         ("r.kmz", zipped(route_kml=kml(KML_LINE))),
+        ("r.kmz", zipped(route_kml=kml(KML_LINE), **{"__MACOSX/": "", "files/other_kml": "no"})),
         ("r.gpx", gpx(f"{WPT}<rte>{RTE}</rte><trk><trkseg>{TRK}</trkseg></trk>")),
         ("r.gpx", gpx(f"<trk><trkseg>{TRK}</trkseg><trkseg/></trk>")),
+        ("r.gpx", gpx(f"<rte><name>planned</name></rte><trk><trkseg>{TRK}</trkseg></trk>")),
         ("r.gpx", gpx(WPT)),
         ("r.plan", plan([mission_item(lat, lon, h) for lon, lat, h in SQUARE])),
+        ("r.plan", plan([survey([mission_item(lat, lon, h) for lon, lat, h in SQUARE])])),
         ("r.json", plan([mission_item(lat, lon, h + 400.0, frame=0) for lon, lat, h in SQUARE])),
         ("r.waypoints", wpl(*((3, 16, lat, lon, h) for lon, lat, h in SQUARE))),
         ("r.txt", wpl(*((0, 16, lat, lon, h + 400.0) for lon, lat, h in SQUARE))),
+        ("r.txt", wpl(*((3, 16, lat, lon, h) for lon, lat, h in SQUARE)).encode("utf-16")),
     ],
 )
 def test_files_of_other_programs_hold_same_route(name: str, content: Any, tmp_path: Path) -> None:
@@ -244,7 +252,16 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
         *((50.0, 50.0, 0.0), (50.0, 90.0, 0.0), (90.0, 90.0, 2.0), (90.0, 90.0, 0.0))
     ]
     # A loiter without end is the last orbit.
-    assert route.notes == ("not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), MAV_CMD 16 (item 7)",)
+    assert route.notes == ("not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)",)
+
+
+def test_camera_and_landing_of_plan_are_named_once(tmp_path: Path) -> None:
+    shots = [mission_item(0, 0, 0, frame=2, command=206)] * 2
+    landing = {"type": "ComplexItem", "complexItemType": "fwLandingPattern"}
+    path = tmp_path / "r.plan"
+    path.write_text(json.dumps(plan([survey([mission_item(47.4, 8.52, 50.0), *shots]), landing])), encoding="utf-8")
+    notes = read_route_file(path).notes
+    assert notes == ("not flown: fwLandingPattern (item 2)", "not flown: DO_SET_CAM_TRIGG_DIST (item 1)")
 
 
 def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
@@ -311,6 +328,33 @@ def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
         assert sections["home"] == pytest.approx(
             {"north": local(47.401, 8.5, ZURICH)[0], "east": local(47.401, 8.5, ZURICH)[1], "altitude": 40.0}
         )
+
+
+def test_home_is_return_point_of_fence_without_rally_points(tmp_path: Path) -> None:
+    there = local(47.405, 8.5, ZURICH)
+    path = tmp_path / "fence.plan"
+    fence = PLAN_FENCE["geoFence"] | {"breachReturn": [47.405, 8.5, 60.0]}
+    path.write_text(json.dumps(PLAN_FENCE | {"rallyPoints": {}, "geoFence": fence}), encoding="utf-8")
+    assert read_fence_file(path)["home"] == pytest.approx({"north": there[0], "east": there[1], "altitude": 60.0})
+    path = tmp_path / "fence.waypoints"
+    path.write_text(wpl((0, 5000, 47.405, 8.5, 0.0), *WPL_FENCE[:3]), encoding="utf-8")  # which has no altitude
+    assert read_fence_file(path, ZURICH)["home"] == pytest.approx({"north": there[0], "east": there[1]})
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        (WPL_FENCE[:2], "found 2 of the 3 corners of a polygon, expected all"),
+        ([*WPL_FENCE[:2], WPL_FENCE[4]], "item 3: found the command 5100 with 0, expected corners of a polygon"),
+        ([*WPL_FENCE[:2], (3, 5002, *WPL_FENCE[2][2:])], "item 3: found the command 5002 with 3, expected corners"),
+        ([(3, 5001, 47.39, 8.49, 0.0, math.nan)], "item 1: found the command 5001 with nan, expected corners"),
+    ],
+)
+def test_polygon_without_all_corners_is_no_smaller_fence(rows: Any, sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "fence.waypoints"
+    path.write_text(wpl(*rows), encoding="utf-8")
+    with pytest.raises(ParameterError, match=sentence):
+        read_fence_file(path, ZURICH)
 
 
 def test_file_without_fence_refused(tmp_path: Path) -> None:
@@ -381,7 +425,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.geojson", line([[47.4, 8.5, 500.0]]), "found latitude and longitude exchanged, by the origin"),
         ("r.geojson", line([[8.5, 147.4, 1.0]]), r"route\[0\]\.latitude: found 147\.4, expected .* from -90 to 90"),
         ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or Points alone"),
-        ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE, SQUARE]}, "found 2 Polygons, expected one, or Points alone"),
+        ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE, SQUARE]}, "found 2 rings of a Polygon, expected one"),
         (
             "r.geojson",
             {"type": "Curve", "coordinates": SQUARE},
@@ -405,8 +449,14 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ),
         (
             "r.plan",
-            plan([{"type": "ComplexItem", "complexItemType": "survey"}]),
-            "found a 'survey', expected waypoints",
+            plan([{"type": "ComplexItem", "complexItemType": "StructureScan"}]),
+            "item 1: found a 'StructureScan', expected waypoints, survey or CorridorScan",
+        ),
+        ("r.plan", plan([survey([])]), "item 1: found a survey without items, expected a saved plan"),
+        (
+            "r.waypoints",
+            wpl((3, 16, 47.4, 8.5, 9.0)).replace("\t16\t", "\tnan\t"),
+            "line 2: .*nan.*expected 12 numbers, the first four whole",
         ),
         (
             "r.plan",

@@ -184,8 +184,9 @@ def read_fence_file(
 ) -> dict[str, Any]:
     """The sections `fence` and `home` of guidance from a file, the arguments as of `read_route_file`.
 
-    Home is the rally point nearest to the origin, without rally points the home in the file, else not in the result. Raises
-    ParameterError for an unreadable file, a file without a zone, and a number missing or out of range.
+    Home is the rally point nearest to the origin, without rally points the return point of the fence, without both the home in
+    the file, else not in the result. Raises ParameterError for an unreadable file, a file without a zone, and a number missing
+    or out of range.
     """
     suffix = path.suffix.lower()
     require(
@@ -210,6 +211,12 @@ def read_fence_file(
     if rally:
         home = min(rally, key=lambda point: math.hypot(*point.point))
         sections["home"] = {"north": home.north, "east": home.east, "altitude": home.altitude}
+    elif read.back is not None:
+        level = read.back if read.back.altitude is not None else read.back._replace(altitude=0.0, above=Above.AS_POSE)
+        back = _placed(level._replace(key="return point"), origin, heights)
+        sections["home"] = {"north": back.north, "east": back.east}
+        if read.back.altitude is not None:
+            sections["home"]["altitude"] = back.altitude
     elif read.home is not None and origin is not None:
         north, east = local(read.home.latitude, read.home.longitude, origin)
         sections["home"] = {"north": north, "east": east}

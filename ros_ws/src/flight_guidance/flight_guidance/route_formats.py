@@ -7,6 +7,7 @@ Sources: RFC 7946 (GeoJSON); OGC 12-007r2 (KML); GPX 1.1 schema; QGroundControl 
 Formats and MAV_FRAME.
 """
 
+import codecs
 import io
 import json
 import math
@@ -101,7 +102,10 @@ POINTS = ("Point", "MultiPoint", "wpt")
 
 def _counted(kinds: Sequence[str]) -> str:
     """Kinds with their numbers: "2 LineStrings and 1 Polygon"."""
-    counts = [f"{count} {kind}{'s' * (count > 1)}" for kind, count in Counter(kinds).items()]
+    counts = []
+    for kind, count in Counter(kinds).items():
+        noun, *rest = kind.split(" ", 1)
+        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1)}", *rest]))
     return " and ".join(counts)
 
 
@@ -146,7 +150,8 @@ def _read_json(content: bytes, key: str) -> Places:
         kind, coordinates = _member(node, "type"), _member(node, "coordinates")
         if isinstance(kind, str) and kind in GEOJSON:
             parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
-            geometries += [_Geometry(kind, [_lon_lat(position, speed) for position in part]) for part in parts]
+            name = kind if len(parts) == 1 else PARTS.get(kind, kind)
+            geometries += [_Geometry(name, [_lon_lat(position, speed) for position in part]) for part in parts]
         elif node is not None:
             others.append(f"geometry of the type {short_repr(kind)}")
     return _one_route(key, geometries, others)
@@ -186,6 +191,13 @@ GEOJSON: Mapping[str, Callable[[list[Any]], list[list[Any]]]] = MappingProxyType
     }
 )
 """By the type of a geometry: its lines, or its points."""
+
+PARTS = {
+    "MultiLineString": "line of a MultiLineString",
+    "Polygon": "ring of a Polygon",
+    "MultiPolygon": "ring of a MultiPolygon",
+}
+"""What one of several parts is called."""
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
@@ -293,10 +305,11 @@ def _number_of(text: str | None) -> float | str | None:
 
 
 def _read_kmz(content: bytes, key: str) -> Places:
-    """The KML file of a KMZ archive: doc.kml, or the only one (OGC 12-007r2, Annex C)."""
+    """The KML file of a KMZ archive: doc.kml, or the only one, at the root where there is one (OGC 12-007r2, Annex C)."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
+            names = [name for name in names if "/" not in name] or names
             chosen = "doc.kml" if "doc.kml" in names else names[0] if len(names) == 1 else ""
             method = archive.getinfo(chosen).compress_type if chosen else zipfile.ZIP_STORED
             require(
@@ -321,12 +334,12 @@ LARGEST_GAP = 1000.0
 def _read_gpx(content: bytes, key: str) -> Places:
     """A route (rte), without one a track (trk), without both the waypoints (wpt)."""
     root = _parsed_xml(content, key, "a GPX file")
-    routes = [_gpx_places(element, "rtept") for element in root.iter() if _kind(element) == "rte"]
+    routes = [places for element in root.iter() if _kind(element) == "rte" and (places := _gpx_places(element, "rtept"))]
     tracks = [_gpx_track(element) for element in root.iter() if _kind(element) == "trk"]
     tracks = [segments for segments in tracks if segments]
     marks = _gpx_places(root, "wpt")
     kind = "rte" if routes else "trk"
-    lines = [places for places in routes if places] if routes else [[*chain(*segments)] for segments in tracks]
+    lines = routes or [[*chain(*segments)] for segments in tracks]
     require(len(lines) <= 1, key, f"{len(lines)} {kind}", "one: GPX of a single route or track")
     gaps = [] if routes else [_gap(before[-1], after[0]) for segments in tracks for before, after in pairwise(segments)]
     widest = max(gaps, default=0.0)
@@ -375,6 +388,7 @@ WAYPOINT, SPLINE, CHANGE_SPEED, AIRSPEED = 16, 82, 178, 0  # MAV_CMD, and SPEED_
 UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
 COMMANDS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
 COMMANDS |= {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
+COMMANDS |= {16: "NAV_WAYPOINT", 82: "NAV_SPLINE_WAYPOINT", 93: "NAV_DELAY", 178: "DO_CHANGE_SPEED"}
 COMMANDS |= {177: "DO_JUMP", 189: "DO_LAND_START", 206: "DO_SET_CAM_TRIGG_DIST", 201: "DO_SET_ROI", 183: "DO_SET_SERVO"}
 
 
@@ -408,7 +422,7 @@ def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequenc
             speed = item.params[1]
         else:
             skipped.append(f"{name} (item {item.number})")
-    told = [f"not flown: {', '.join(skipped)}"] * bool(skipped)
+    told = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
     return Places(places, (*notes, *told), home)
 
 
@@ -420,20 +434,39 @@ def _read_plan_tree(tree: Any, key: str) -> Places:
     mission = _member(tree, "mission")
     listed = _member(mission, "items")
     require(isinstance(listed, list), key, "no mission with items", "a plan of QGroundControl")
-    items = []
-    for k, entry in enumerate(listed or ()):
+    items, landings = [], []
+    for number, entry in _plan_items(listed or (), key):
         kind = _member(entry, "complexItemType") or _member(entry, "type")
-        simple = _member(entry, "type") == "SimpleItem"
-        require(simple, f"{key}: item {k + 1}", f"a {short_repr(kind)}", "waypoints alone")
+        if kind in LANDINGS:
+            landings.append(f"{kind} (item {number})")
+            continue
+        expected = f"waypoints, {' or '.join(TRANSECTS)} with their items, {' or '.join(LANDINGS)}"
+        require(kind == "SimpleItem", f"{key}: item {number}", f"a {short_repr(kind)}", expected)
         params = _member(entry, "params")
         frame, command = _member(entry, "frame"), _member(entry, "command")
         numbers = isinstance(params, list) and all(value is None or isinstance(value, int | float) for value in params)
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
-        require(fits, f"{key}: item {k + 1}", short_repr(entry), "frame, command and seven params")
-        items.append(_Item(k + 1, frame, command, params))
+        require(fits, f"{key}: item {number}", short_repr(entry), "frame, command and seven params")
+        items.append(_Item(number, frame, command, params))
     fence = _plan_fence(tree, key)
     notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
+    notes += [f"not flown: {', '.join(landings)}"] * bool(landings)
     return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
+
+
+TRANSECTS = ("survey", "CorridorScan")  # complexItemType, with the waypoints that QGroundControl made
+LANDINGS = ("fwLandingPattern", "vtolLandingPattern")  # as NAV_LAND, not flown
+
+
+def _plan_items(listed: Sequence[Any], key: str) -> Iterator[tuple[int, Any]]:
+    """The items of a plan with their numbers from 1 on, those inside of a survey with the number of the survey."""
+    for number, entry in enumerate(listed, start=1):
+        if _member(entry, "complexItemType") in TRANSECTS:
+            inside = _entries(_member(entry, "TransectStyleComplexItem"), "Items", key)
+            require(bool(inside), f"{key}: item {number}", f"a {entry['complexItemType']} without items", "a saved plan")
+            yield from ((number, item) for item in inside)
+        else:
+            yield number, entry
 
 
 class Area(NamedTuple):
@@ -450,6 +483,7 @@ class FencePlaces(NamedTuple):
     zones: list[Area]
     rally: list[Place] = []  # noqa: RUF012 - never changed
     home: Home | None = None
+    back: Place | None = None  # where a breach sends the aircraft
 
 
 def read_fence(content: bytes, key: str, suffix: str) -> FencePlaces:
@@ -473,7 +507,9 @@ def _plan_fence(tree: Any, key: str) -> FencePlaces:
         circle = _member(zone, "circle")
         zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not _member(zone, "inclusion")))
     rally = [_lat_lon(point, Above.HOME) for point in _entries(_member(tree, "rallyPoints"), "points", key)]
-    return FencePlaces(zones, rally, _home(_member(_member(tree, "mission"), "plannedHomePosition")))
+    back = _member(fence, "breachReturn")
+    home = _home(_member(_member(tree, "mission"), "plannedHomePosition"))
+    return FencePlaces(zones, rally, home, None if back is None else _lat_lon(back, Above.HOME))
 
 
 def _json_fence(tree: Any, key: str) -> FencePlaces:
@@ -497,28 +533,39 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
 
 
 def _wpl_fence(content: bytes, key: str) -> FencePlaces:
-    """The polygons, circles and rally points of MAVLink: MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT."""
+    """The polygons, circles, return point and rally points of MAVLink: MAV_CMD_NAV_FENCE_... and MAV_CMD_NAV_RALLY_POINT."""
     items, home = _wpl_items(content, key)
     zones: list[Area] = []
     rally: list[Place] = []
-    missing = 0.0
+    missing, back = 0, None
     for item in items:
         latitude, longitude, altitude = item.params[4:7]
         place, exclude = Place("fence", latitude, longitude, altitude), item.command in {FENCE_OUT, CIRCLE_OUT}
-        if item.command in {FENCE_IN, FENCE_OUT}:
-            if missing <= 0.0:
+        if missing or item.command in {FENCE_IN, FENCE_OUT}:
+            count = item.params[0]
+            fits = item.command in {FENCE_IN, FENCE_OUT} and count in range(3, MOST_CORNERS + 1)
+            fits = fits and (not missing or exclude == zones[-1].exclude)
+            expected = "corners of a polygon, each with their number, 3 or more"
+            require(fits, f"{key}: item {item.number}", f"the command {item.command} with {count:g}", expected)
+            if not missing:
                 zones.append(Area([], None, exclude))
-                missing = item.params[0]  # the number of corners
+                missing = int(count)
             zones[-1].places.append(place)
-            missing -= 1.0
+            missing -= 1
         elif item.command in {CIRCLE_IN, CIRCLE_OUT}:
             zones.append(Area([place], item.params[0], exclude))
         elif item.command == RALLY:
             rally.append(place._replace(above=FRAMES.get(item.frame, Above.GROUND)))
-    return FencePlaces(zones, rally, home)
+        elif item.command == RETURN:
+            back = place._replace(altitude=None)
+    if missing:
+        there = len(zones[-1].places)
+        raise ParameterError(f"{key}: found {there} of the {there + missing} corners of a polygon, expected all")
+    return FencePlaces(zones, rally, home, back)
 
 
-FENCE_IN, FENCE_OUT, CIRCLE_IN, CIRCLE_OUT, RALLY = 5001, 5002, 5003, 5004, 5100  # MAV_CMD
+MOST_CORNERS = 10_000
+RETURN, FENCE_IN, FENCE_OUT, CIRCLE_IN, CIRCLE_OUT, RALLY = 5000, 5001, 5002, 5003, 5004, 5100  # MAV_CMD
 
 
 def _entries(tree: Any, name: str, key: str) -> list[Any]:
@@ -558,7 +605,8 @@ def _read_wpl(content: bytes, key: str) -> Places:
 
 
 def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
-    lines = content.decode("utf-8-sig", errors="replace").splitlines()
+    encoding = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    lines = content.decode(encoding, errors="replace").splitlines()
     head = lines[0].strip() if lines else ""
     require(head.startswith(WPL), key, short_repr(head), "QGC WPL 110 in the first line")
     items, home = list[_Item](), None
@@ -568,7 +616,8 @@ def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
             continue
         numbers = [_number_of(word) for word in words]
         fits = len(words) == WPL_COLUMNS and all(isinstance(value, float) for value in numbers)
-        require(fits, f"{key}: line {number}", short_repr(line.strip()), f"{WPL_COLUMNS} numbers")
+        fits = fits and all(isinstance(value, float) and value.is_integer() for value in numbers[:4])
+        require(fits, f"{key}: line {number}", short_repr(line.strip()), f"{WPL_COLUMNS} numbers, the first four whole")
         index, _, frame, command, *params = (value for value in numbers[:-1] if isinstance(value, float))
         if index == 0 and frame == 0 and command == WAYPOINT and not items:  # ArduPilot's item 0 is the home
             home = Home(*params[4:7]) if params[4] or params[5] else None
