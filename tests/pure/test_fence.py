@@ -203,6 +203,12 @@ def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: st
         GuidanceConfig.validate_mapping(SECTION | {"fence": BOX} | section, "guidance")
 
 
+def test_start_outside_of_fence_refused() -> None:
+    scenario = calm(5.0, program=commanded(0.0), fence=BOX).vary(aircraft={"start": {"east": 510.0}})
+    with pytest.raises(ParameterError, match=r"guidance\.fence: found the start 10 m outside, at north 0 m, east 510 m"):
+        simulate(scenario)
+
+
 def test_lost_link_flies_home() -> None:
     """Without a message of an operator the route ends after the limit, which log, replay, notice and outcome know."""
     route = {"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}

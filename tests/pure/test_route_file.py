@@ -291,7 +291,10 @@ GEOJSON_FENCE = {
     "features": [
         {
             "type": "Feature",
-            "geometry": {"type": "Polygon", "coordinates": [[[8.49, 47.39], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]]},
+            "geometry": {
+                "type": "Polygon",
+                "coordinates": [[[8.49, 47.39], [8.49, 47.42], [8.49, 47.42], [8.53, 47.42], [8.49, 47.39]]],  # a double click
+            },
         },
         {
             "type": "Feature",

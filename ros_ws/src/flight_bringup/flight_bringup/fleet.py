@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from flight_analysis.closed_loop.scenario import Scenario, require_euler
+from flight_analysis.closed_loop.scenario import Scenario, require_guidable
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow, interrupt
 from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
@@ -124,7 +124,7 @@ def _scenario(config: FleetConfig, aircraft: AircraftOfFleet, folder: Path, dura
     if aircraft.route is not None:
         origin = None if config.origin is None else Origin(*config.origin)
         scenario = with_route(scenario, read_route(folder / aircraft.route, origin))
-    require_euler(scenario)
+    require_guidable(scenario)
     return scenario
 
 

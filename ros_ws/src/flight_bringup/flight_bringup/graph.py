@@ -10,7 +10,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from autopilot_bridge.params import ChannelMap, find_map, load_map
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_euler
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_guidable
 from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import require
 
@@ -122,7 +122,7 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
     Raises ParameterError where guidance cannot fly the simulated aircraft, and for a bridge beside a learner.
     """
     if not bridge:
-        require_euler(scenario)
+        require_guidable(scenario)
     learns = scenario.learns()
     require(not (bridge and learns), "controller.learn", "a bridge", "a simulated aircraft: no autopilot was flown with it")
     stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE

@@ -222,11 +222,8 @@ class GuidanceConfig(NodeConfig):
             read_target(target, params, route, f"program at {start:g} s")
 
     def _check_home(self) -> None:
-        if (fence := self.fence_zones()) is None:
-            return
-        north, east = np.array(fence.home[0]), np.array(fence.home[1])
         needed = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
-        inside = float(clearance(fence.zones, north, east))
+        inside = self.fence_clearance(self.home.north, self.home.east)
         found, expected = f"home {inside:.0f} m inside of the fence", f"at least {needed:.0f} m, for the orbit round home"
         require(inside >= needed, "home", found, expected)
 
@@ -234,6 +231,11 @@ class GuidanceConfig(NodeConfig):
         """The fence of the equations; None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
         return Fence(zones, (self.home.north, self.home.east)) if zones else None
+
+    def fence_clearance(self, north: float, east: float) -> float:
+        """Distance of a place from the fence, m, negative outside; infinite without a fence."""
+        fence = self.fence_zones()
+        return math.inf if fence is None else float(clearance(fence.zones, np.array(north), np.array(east)))
 
     def fence_margin(self, speed: float) -> float:
         """Least distance of a route from the fence at an airspeed, m: MARGIN of flight with the wind from behind."""

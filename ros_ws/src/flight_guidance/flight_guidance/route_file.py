@@ -198,10 +198,10 @@ def read_fence_file(
     zones: dict[str, Any] = {}
     for k, area in enumerate(read.zones):
         key = f"zone_{k}"
-        points = [
-            _placed(place._replace(key=f"fence.{key}", altitude=0.0, above=Above.AS_POSE), origin, _Heights()).point
-            for place in area.places
-        ]
+        flat = [place._replace(key=f"fence.{key}", altitude=0.0, above=Above.AS_POSE) for place in area.places]
+        points = [waypoint.point for waypoint in _merged([_placed(place, origin, _Heights()) for place in flat])]
+        if len(points) > 1 and points[0] == points[-1]:
+            del points[-1]  # of a ring
         zones[key] = {"north": [point[0] for point in points], "east": [point[1] for point in points], "exclude": area.exclude}
         if area.radius is not None:
             zones[key]["radius"] = _number(f"fence.{key}", area.radius, "radius")

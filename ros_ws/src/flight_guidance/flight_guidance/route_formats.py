@@ -527,8 +527,7 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
             continue
         for rings in [coordinates] if kind == "Polygon" else coordinates:
             for k, ring in enumerate(_listed(rings, key)):
-                corners = [_lon_lat(position) for position in _listed(ring, key)]
-                zones.append(Area(corners[:-1] if corners[0] == corners[-1] else corners, None, exclude or k > 0))
+                zones.append(Area([_lon_lat(position) for position in _listed(ring, key)], None, exclude or k > 0))
     return FencePlaces(zones)
 
 

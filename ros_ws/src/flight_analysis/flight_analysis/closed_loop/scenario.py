@@ -266,14 +266,20 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def require_euler(scenario: Scenario) -> None:
-    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn.
+def require_guidable(scenario: Scenario) -> None:
+    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn, or from outside of the fence.
 
     Behind a bridge the airframe of the scenario does not fly.
     """
-    aircraft = scenario.aircraft
-    turns = scenario.guidance is None or aircraft.is_jsbsim or aircraft.kinematics == "euler"
+    aircraft, guidance = scenario.aircraft, scenario.guidance
+    if guidance is None:
+        return
+    turns = aircraft.is_jsbsim or aircraft.kinematics == "euler"
     require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
+    start = aircraft.start
+    inside = guidance.fence_clearance(start.north, start.east)
+    found = f"the start {-inside:.0f} m outside, at north {start.north:g} m, east {start.east:g} m"
+    require(inside >= 0.0, "guidance.fence", found, "the aircraft inside")
 
 
 def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:

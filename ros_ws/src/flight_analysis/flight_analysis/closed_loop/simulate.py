@@ -10,7 +10,7 @@ import numpy as np
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.learning import Learn, LearningLoop
-from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_euler
+from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_guidable
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
 from flight_core.parameters import require
@@ -100,7 +100,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     controller. The aircraft holds u until the next u. A lost sample of y is not recorded; a delayed sample keeps the stamp. A
     flight that diverges or is interrupted (Ctrl-C) ends early.
     """
-    require_euler(scenario)
+    require_guidable(scenario)
     outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
     reference, controller = Reference(scenario.reference_model), control(scenario.controller)
     guidance = None if scenario.guidance is None else guide(scenario.guidance)
