@@ -255,6 +255,16 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
     assert route.notes == ("not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)",)
 
 
+def test_radius_of_loiter_is_named(tmp_path: Path) -> None:
+    """Of NAV_LOITER_TO_ALT the second parameter is the radius, of the other loiters the third; negative to the left."""
+    climb, turns = mission_item(47.4, 8.52, 50.0, command=31), mission_item(47.41, 8.52, 50.0, command=18)
+    climb["params"][1], turns["params"][2] = -150, 80
+    path = tmp_path / "r.plan"
+    path.write_text(json.dumps(plan([climb, turns])), encoding="utf-8")
+    replaced = "-150 m of NAV_LOITER_TO_ALT (item 1), 80 m of NAV_LOITER_TURNS (item 2)"
+    assert read_route_file(path).notes == (f"circles are clockwise, of the radius of the route, in place of {replaced}",)
+
+
 def test_camera_and_landing_of_plan_are_named_once(tmp_path: Path) -> None:
     shots = [mission_item(0, 0, 0, frame=2, command=206)] * 2
     landing = {"type": "ComplexItem", "complexItemType": "fwLandingPattern"}

@@ -405,6 +405,7 @@ def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequenc
     """The waypoints and loiters of a mission up to a loiter without end; the items that are not flown in notes."""
     places: list[Place] = []
     skipped: list[str] = []
+    circles: list[str] = []  # of a radius, negative to the left
     speed: Any = None
     ended = False
     for item in items:
@@ -418,11 +419,15 @@ def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequenc
             place = Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
             places.append(place._replace(**loiter.get(item.command, {})))
             ended = item.command == UNLIMITED
+            if item.command in LOITERS and (radius := item.params[1 if item.command == TO_ALTITUDE else 2]):
+                circles.append(f"{radius:g} m of {name} (item {item.number})")
         elif item.command == CHANGE_SPEED and item.params[0] == AIRSPEED and (item.params[1] or 0) > 0:
             speed = item.params[1]
         else:
             skipped.append(f"{name} (item {item.number})")
     told = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
+    own = "circles are clockwise, of the radius of the route"
+    told += [f"{own}, in place of {', '.join(circles)}"] * bool(circles)
     return Places(places, (*notes, *told), home)
 
 
