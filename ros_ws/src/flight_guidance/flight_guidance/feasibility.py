@@ -10,7 +10,7 @@ import numpy as np
 
 from flight_core.parameters import ParameterError, require
 from flight_guidance import path, protection
-from flight_guidance.fence import Fence, clearance
+from flight_guidance.fence import Fence, clearance, described
 from flight_guidance.lateral import least_period, least_radius
 from flight_guidance.modes import LARGEST
 from flight_guidance.path import Leg, Line, Loiter, Point, Route
@@ -186,8 +186,7 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
         if path.turns_back(leg, next(iter(route.legs[number + 1 :]), None)):
             inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
-        where = f"{abs(inside[worst]):.0f} m {'inside' if inside[worst] >= 0.0 else 'outside'} of the fence"
-        found = f"leg {number}, {where} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
+        found = f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
         require(bool(inside[worst] >= margin), "route", found, f"at least {margin:.0f} m inside")
 
 

@@ -87,6 +87,11 @@ def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
     return reduce(xp.minimum, [*([reduce(xp.maximum, stay)] if stay else []), *out])
 
 
+def described(distance: float) -> str:
+    """A distance of `clearance` in words: "9 m inside of the fence"."""
+    return f"{abs(distance):.0f} m {'inside' if distance >= 0.0 else 'outside'} of the fence"
+
+
 def _remaining(side: Array, home: tuple[float, float], place: tuple[Array, Array], course: Array) -> Array:
     """Angle of a turn to a side from the course to the bearing of home, rad, 0 to 2 pi."""
     xp = array_namespace(course)

@@ -27,7 +27,7 @@ from flight_core.units import GRAVITY
 from flight_guidance import protection
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
-from flight_guidance.fence import MARGIN, Fence, Zone, clearance
+from flight_guidance.fence import MARGIN, Fence, Zone, clearance, described
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, read_target
 from flight_guidance.notices import Notices
@@ -224,8 +224,8 @@ class GuidanceConfig(NodeConfig):
     def _check_home(self) -> None:
         needed = math.ceil(self.least_radius()) + self.fence_margin(self.speed)
         inside = self.fence_clearance(self.home.north, self.home.east)
-        found, expected = f"home {inside:.0f} m inside of the fence", f"at least {needed:.0f} m, for the orbit round home"
-        require(inside >= needed, "home", found, expected)
+        expected = f"at least {needed:.0f} m inside, for the orbit round home"
+        require(inside >= needed, "home", f"home {described(inside)}", expected)
 
     def fence_zones(self) -> Fence | None:
         """The fence of the equations; None without zones."""

@@ -17,6 +17,7 @@ from flight_core.files import dump_yaml, read_file
 from flight_core.parameters import REMOVED, Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
+from flight_guidance.fence import described
 from flight_guidance.params import GuidanceConfig
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
@@ -267,7 +268,7 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
 
 
 def require_guidable(scenario: Scenario) -> None:
-    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn, or from outside of the fence.
+    """Raise ParameterError where guidance would fly a simulated airframe that a bank does not turn, or from outside of a fence.
 
     Behind a bridge the airframe of the scenario does not fly.
     """
@@ -278,8 +279,8 @@ def require_guidable(scenario: Scenario) -> None:
     require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)
-    found = f"the start {-inside:.0f} m outside, at north {start.north:g} m, east {start.east:g} m"
-    require(inside >= 0.0, "guidance.fence", found, "the aircraft inside")
+    found = f"the start {described(inside)}, at north {start.north:g} m, east {start.east:g} m"
+    require(inside >= 0.0, "guidance.fence", found, "a start inside")
 
 
 def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
