@@ -22,6 +22,7 @@ from flight_guidance.lateral import (
     PathParams,
     bank_for,
     course_acceleration,
+    heading_estimate,
     least_period,
     least_radius,
     path_acceleration,
@@ -221,6 +222,25 @@ def test_gyro_bias_is_no_sideslip() -> None:
         slip = slip_estimate(slip, 0.0, 0.154, 0.0, 0.02, 2.0)
     assert slip == 0.0
     assert slip_estimate(1.0, -2.0, -1.0, 0.0, 0.02, 2.0) == pytest.approx(0.4)  # a fifth of the turn of a bank to the left
+
+
+def test_heading_is_smoothed_without_lag_across_180_deg() -> None:
+    """T = 2 s at 50 Hz. A low-pass leaves of white noise sigma sqrt(g / (2 - g)), g = 1 - exp(-dt/T): 0.07 deg of 1."""
+    dt, noise = 0.02, np.random.default_rng(1).normal(0.0, math.radians(1.0), 5000)
+    psi, off = math.radians(170.0), []
+    for k, error in enumerate(noise.tolist()):
+        true = math.radians(170.0) + 0.06 * dt * (k + 1)  # a turn of 0.06 rad/s
+        psi = heading_estimate(psi, math.remainder(true + error, 2.0 * math.pi), 0.06, dt)
+        off.append(math.degrees(math.remainder(psi - true, 2.0 * math.pi)))
+    g = 1.0 - math.exp(-dt / 2.0)
+    assert np.std(off) == pytest.approx(math.sqrt(g / (2.0 - g)), rel=0.3)  # 50 independent values
+    assert abs(np.mean(off)) < 0.05
+    # A gyro that is 1 mrad/s off turns the heading by 2 mrad; without a pose it alone counts.
+    held = 0.0
+    for _ in range(2000):
+        held = heading_estimate(held, 0.0, 1e-3, dt)
+    assert held == pytest.approx(2e-3, rel=0.02)
+    assert heading_estimate(0.1, None, 1.0, dt) == pytest.approx(0.12)
 
 
 def test_error_of_line_is_positive_to_right() -> None:

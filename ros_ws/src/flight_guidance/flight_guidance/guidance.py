@@ -33,7 +33,7 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
-STATE = ("phi", "theta", "alpha", "alpha_trim", "slip")
+STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
 ADDED = (LINK_AGE,)
@@ -107,7 +107,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
     given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
     begin, age_ns = Begin(int(logged["begin"])), nanoseconds(logged["age.pose"])
     inputs = Inputs(t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given)
-    phi, theta, alpha, alpha_trim, slip = group("state", STATE)
+    phi, theta, alpha, alpha_trim, slip, psi = group("state", STATE)
     state = GuidanceState(
         t_ns,
         Mode(int(logged["mode"])),
@@ -127,6 +127,7 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
         (logged["wind.north"], logged["wind.east"]),
         logged["fence.action"],
         logged["loitered"],
+        psi,
     )
     return inputs, state
 

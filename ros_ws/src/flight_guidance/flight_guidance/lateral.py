@@ -12,6 +12,9 @@ from flight_core.vectors import Scalar, array_namespace
 # Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the stop: 0.09.
 LARGEST_SLIP = 0.2
 
+HEADING_TIME = 2.0
+"""s. Ten poses of a receiver of 5 Hz; a bias of the gyro of 1 mrad/s then turns the heading by 0.1 deg."""
+
 
 class PathError(NamedTuple):
     """Where the aircraft is beside a path."""
@@ -37,6 +40,18 @@ def turn_towards(difference: Scalar) -> Scalar:
     xp = array_namespace(difference)
     sine = xp.sin(difference)
     return xp.where(xp.cos(difference) > 0.0, sine, xp.copysign(1.0, sine))
+
+
+def heading_estimate(psi: float, measured: float | None, psi_dot: float, dt: float) -> float:
+    """Heading a step later, rad, from the heading rate of y, rad/s, and the heading of pose; None where pose is stale.
+
+        psi+ = psi + dt psi_dot + (1 - exp(-dt/T)) (measured - psi - dt psi_dot),  T = HEADING_TIME
+
+    A complementary filter: noise of pose is smoothed, the gyro has no lag. A bias of the gyro turns the heading by T times it.
+    """
+    predicted = psi + dt * psi_dot
+    off = 0.0 if measured is None else math.remainder(measured - predicted, 2.0 * math.pi)
+    return math.remainder(predicted + (1.0 - math.exp(-dt / HEADING_TIME)) * off, 2.0 * math.pi)
 
 
 def course_acceleration(course_c: float, course: float, speed: float, k: float) -> float:

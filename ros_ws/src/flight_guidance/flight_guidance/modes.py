@@ -22,7 +22,15 @@ from flight_core.vectors import ChannelError, Scalar, array_namespace
 from flight_guidance import path, protection
 from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
 from flight_guidance.fence import HOME, RIGHT, Escape, Fence, Motion, last_safe_turn
-from flight_guidance.lateral import PathError, PathParams, bank_for, course_acceleration, path_acceleration, slip_estimate
+from flight_guidance.lateral import (
+    PathError,
+    PathParams,
+    bank_for,
+    course_acceleration,
+    heading_estimate,
+    path_acceleration,
+    slip_estimate,
+)
 from flight_guidance.path import Arc, Leg, Loiter, Point, Route
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
 from flight_guidance.wind import Wind, wind_estimate, wind_of
@@ -183,6 +191,7 @@ class GuidanceState(NamedTuple):
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
     fence: float = 0.0  # action of the fence: 1 and -1 turn to the right and left, 2 flies home after the turn, 0 none
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
+    psi: Scalar = 0.0  # estimated heading, rad
 
 
 class Commands(NamedTuple):
@@ -306,6 +315,7 @@ def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: Guidan
         speed,
         (0.0,) * len(params.outputs),
         wind=_measured_wind(pose, speed),
+        psi=pose["psi"],
     )
 
 
@@ -345,9 +355,9 @@ def step(
 ) -> tuple[GuidanceState, Commands]:
     """A step: attitude, commands, u_m.
 
-    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics with p, q, r of y. While pose
-       is stale: Euler's kinematics alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is unknown (`Mode.POSE_LOST`) until
-       pose returns; then wings level and the altitude of then.
+    1. Attitude: phi and theta of pose, brought to now over the age of pose by Euler's kinematics with p, q, r of y, and psi by
+       `heading_estimate`. While pose is stale: Euler's kinematics alone (`Mode.DEAD_RECKONING`). After `hold` the attitude is
+       unknown (`Mode.POSE_LOST`) until pose returns; then wings level and the altitude of then.
     2. Commands: the next leg at the end of a leg, then the commands given. A leg is joined by a circle that touches the leg at
        the start, unless the aircraft is near; a leg whose end the aircraft passes far away is missed.
     3. The fence: the last safe turn, then home, in place of the lateral mode.
@@ -448,7 +458,10 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
     p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
     phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
     phi, theta = state.phi + since * phi_dot, state.theta + since * theta_dot
-    return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta)
+    psi_dot = heading_rate(state.phi, state.theta, q, r)
+    measured = pose["psi"] + since * psi_dot if state.mode is Mode.ENGAGED else None
+    psi = heading_estimate(state.psi, measured, psi_dot, dt)
+    return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
 
 
 def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Motion:
@@ -601,7 +614,7 @@ def _bank(
     if state.lateral is Lateral.PHI:
         return target.phi, nowhere, 0.0
     if state.lateral is Lateral.HEADING:
-        return bank_for(course_acceleration(target.heading, pose["psi"], speed, params.k_chi), gamma, STEEPEST), nowhere, 0.0
+        return bank_for(course_acceleration(target.heading, state.psi, speed, params.k_chi), gamma, STEEPEST), nowhere, 0.0
     if state.lateral is Lateral.COURSE:
         return bank_for(course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST), nowhere, 0.0
     leg: Leg = Arc((target.north, target.east), target.radius)
