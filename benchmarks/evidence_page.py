@@ -24,6 +24,8 @@ class Topic(NamedTuple):
     text: str = ""
 
 
+ROUTE_AIRCRAFT = ("osprey_servo", "c172p", "737", "f16", "c182", "A320", "F4N")
+
 TOPICS = (
     Topic(
         "Faults",
@@ -93,7 +95,9 @@ TOPICS = (
         {f"guidance-{name}": f"holds and paths, {name}" for name in ("osprey_servo", "c172p", "737", "f16")}
         | {"guidance-route": "another route, other aircraft"}
         | {f"guidance-grid-{name}": f"off the design point, {name}" for name in ("c172p", "737", "f16")}
-        | {"guidance-rates": "errors of the rates with guidance over those without"},
+        | {"guidance-rates": "errors of the rates with guidance over those without"}
+        | {f"guidance-routes-{name}": f"routes hard to begin, in wind, steep, {name}" for name in ROUTE_AIRCRAFT}
+        | {f"guidance-fence-{name}": f"five fences in four winds, {name}" for name in ("osprey", "c172p", "f16", "737")},
         "[Experiments](experiments.md#guidance-by-rule) says what the figures mean and why some miss. "
         "In turbulence a figure is the worst of the seeds.",
     ),

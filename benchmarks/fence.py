@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave the fence, and how far.
 
-    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16] [--shapes square ell] [--aircraft 2000] > fence.csv
+    .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--shapes square ell] [--aircraft 2000]
 
-A row a shape and a wind. Of the osprey a fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
+The figures go to docs/evidence/guidance-fence-*.csv, where all fences and winds are flown. A row a shape and a wind. Of the
+osprey a fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
 An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The
 aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status
 1: an aircraft left the fence, or was lost.
@@ -16,9 +17,12 @@ import math
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
+from benchmarks import evidence_data
+from benchmarks.evidence_page import write_page
 from benchmarks.guidance import aircraft_of, turbulence
 
 from aircraft_sim.airframe import load_airframe
@@ -33,7 +37,7 @@ from flight_guidance.fence import Fence, Zone
 from flight_guidance.params import GuidanceConfig
 
 OSPREY = "osprey"
-AIRCRAFT = (OSPREY, "c172p", "f16")
+AIRCRAFT = (OSPREY, "c172p", "f16", "737")
 CHUNK, UNCERTAINTY = 250, 0.3
 """Aircraft in one flight; share of the entries of A and B."""
 
@@ -73,6 +77,14 @@ class Row(NamedTuple):
     farthest: float  # m beyond the fence
     turned: int  # flights with a bank of nine tenths of the largest
     lost: int  # flights
+
+    def figures(self) -> Iterator[evidence_data.Row]:
+        """The rows of evidence."""
+        about = f"{self.fence}, {self.wind}"
+        yield evidence_data.row(f"{about}: flights", self.flights)
+        yield evidence_data.row(f"{about}: flights outside", self.outside, at_most=0)
+        yield evidence_data.row(f"{about}: flights lost", self.lost, at_most=0)
+        yield evidence_data.row(f"{about}: farthest outside", self.farthest, "m")
 
 
 def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
@@ -149,29 +161,30 @@ def row_of(name: str, shape: str, wind: str, beyond: list[float], banks: list[fl
     return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost)
 
 
-def rows(names: list[str], shapes: list[str], winds: list[str], aircraft: int, seed: int) -> Iterator[Row]:
-    """The rows of aircraft, shapes and winds."""
-    for name in names:
-        for shape in shapes:
-            for wind in winds:
-                yield fly_fleet(shape, wind, aircraft, seed) if name == OSPREY else fly_alone(name, shape, wind)
-
-
 def main() -> int:
-    """Fly and print the rows."""
+    """Fly, print the rows and store them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="*", choices=[*AIRCRAFT, "737"], default=[*AIRCRAFT], help="aircraft")
-    parser.add_argument("--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences")
-    parser.add_argument("--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds")
+    parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=[*AIRCRAFT], help="aircraft")
+    parser.add_argument("--shapes", nargs="*", choices=[*SHAPES], default=[*SHAPES], help="fences; not stored")
+    parser.add_argument("--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds; not stored")
     parser.add_argument("--aircraft", type=int, default=2000, help="ospreys in each row")
     parser.add_argument("--seed", type=int, default=7, help="of the ospreys")
     chosen = parser.parse_args()
     writer, failed = csv.writer(sys.stdout), False
     writer.writerow(Row._fields)
-    for row in rows(chosen.only, chosen.shapes, chosen.winds, chosen.aircraft, chosen.seed):
-        writer.writerow(row)
-        sys.stdout.flush()
-        failed |= bool(row.outside or row.lost)
+    for name in chosen.only:
+        options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
+        begun, flown = evidence_data.origin(f"python -m benchmarks.fence --only {name}{options}"), list[Row]()
+        for shape, wind in product(chosen.shapes, chosen.winds):
+            of_fleet = name == OSPREY
+            row = fly_fleet(shape, wind, chosen.aircraft, chosen.seed) if of_fleet else fly_alone(name, shape, wind)
+            flown.append(row)
+            writer.writerow(row)
+            sys.stdout.flush()
+            failed |= bool(row.outside or row.lost)
+        if len(flown) == len(SHAPES) * len(WINDS):
+            evidence_data.write(f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun)
+            write_page()
     return int(failed)
 
 

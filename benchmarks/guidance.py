@@ -15,14 +15,13 @@ minutes.
 import argparse
 import math
 import sys
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import groupby
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,16 +33,17 @@ from benchmarks.guidance_grid import GRIDS, Point, places, point
 from benchmarks.sampling import new_table
 from rich.console import Console
 
+from aircraft_sim.pose import wrapped
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
 from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.outcome import COMPLETED
-from flight_core.rates import nanoseconds, seconds
+from flight_core.rates import seconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
-from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.guidance import Guidance
 from flight_guidance.lateral import least_radius
 from flight_guidance.modes import Lateral, Mode
@@ -89,47 +89,33 @@ class Figure(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """How guidance receives pose. The fault lasts for `fault` s from FAULT on."""
+    """How guidance receives pose: `aircraft.pose` of the scenario, and a fault for `fault` s from FAULT on."""
 
-    every: int = 1  # one of so many
-    delay: float = 0.0  # s
-    noise: bool = False  # NOISE
+    measured: Mapping[str, Any] = MappingProxyType({})
     fault: float = 0.0  # s
     off: Mapping[str, float] | None = None  # what the fault adds; None: the last pose is repeated
     stamped: bool = False  # whether the repeated pose has a new stamp
     max_age: float = 0.2  # s, of the section
 
 
-class PoseReceiver(Guidance):
-    """Guidance that receives pose so. As the node does, it refuses a sample that is not newer or stands still, and goes on."""
+class FaultyPose(Guidance):
+    """Guidance that receives pose with the fault. As the node does, it refuses a sample that is not newer or stands still."""
 
     def __init__(self, how: Pose, parameters: GuidanceConfig) -> None:
         super().__init__(parameters)
-        self._how, self._number, self._generator = how, 0, np.random.default_rng(1)
-        self._sent: deque[StampedVector] = deque()
+        self._how = how
 
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
-        """Take the poses that arrive now."""
-        how = self._how
-        if self._number % how.every == 0:
-            self._sent.append(self._measured(sample, now_ns))
-        self._number += 1
-        while self._sent and self._sent[0].stamp_ns <= now_ns - nanoseconds(how.delay):
-            with suppress(ChannelError):
-                super().take_pose(self._sent.popleft(), now_ns)
-
-    def _measured(self, sample: StampedVector, now_ns: int) -> StampedVector:
-        how, pose = self._how, sample.value.copy()
-        if how.noise:
-            pose += [NOISE[name] for name in POSE] * self._generator.standard_normal(len(POSE))
+        """Take a pose. Raises ChannelError as Guidance does."""
+        how, last = self._how, self._pose or sample
         if 0.0 <= seconds(now_ns) - FAULT < how.fault:
             if how.off is None:
-                last = self._pose or sample
-                return last._replace(stamp_ns=sample.stamp_ns) if how.stamped else last
-            pose += [how.off.get(name, 0.0) for name in POSE]
-        psi = POSE.index("psi")
-        pose[psi] = math.remainder(pose[psi], 2.0 * math.pi)
-        return StampedVector(sample.stamp_ns, pose)
+                sample = last._replace(stamp_ns=sample.stamp_ns) if how.stamped else last
+            else:
+                off = dict(zip(POSE, sample.value + [how.off.get(name, 0.0) for name in POSE], strict=True))
+                off["psi"] = wrapped(off["psi"])
+                sample = sample._replace(value=np.array([*off.values()]))
+        super().take_pose(sample, now_ns)
 
 
 class Manoeuvre(NamedTuple):
@@ -188,7 +174,7 @@ def of_pose(tape: Tape, section: GuidanceConfig, calm: bool) -> Iterator[Figure]
     if lateral[0] == Lateral.HEADING:  # not after a loss of pose
         yield Figure("heading (deg)", math.degrees(abs(float(np.mean(np.mod(psi, 2.0 * math.pi))) - math.pi)), 1.0)
     yield Figure("altitude (m)", abs(float(np.mean(altitude - wanted))), 1.0)
-    yield Figure("bank at the end (deg)", math.degrees(np.abs(tape["pose"]["phi"][tape.time("pose") > end]).max()), 5.0)
+    yield Figure("bank at the end (deg)", math.degrees(np.abs(tape["truth"]["x.phi"][tape.time("truth") > end]).max()), 5.0)
     stale = after(tape, 0.0, "mode")[0] != Mode.ENGAGED
     yield Figure("pose stale (s)", float(stale.sum()) * seconds(section.params().period_ns), math.inf)
 
@@ -247,7 +233,7 @@ RANGES: dict[str, float] = {}
 
 def of_limits(tape: Tape, section: GuidanceConfig, calm: bool, pose: Pose) -> Iterator[Figure]:
     """How far the bank is beyond its limit, and the airspeed below nine tenths of the floor, in any manoeuvre."""
-    phi, V = tape["pose"]["phi"], tape["guidance"]["y.V"]
+    phi, V = tape["truth"]["x.phi"], tape["guidance"]["y.V"]
     limit = 2.0 if calm else 3.0
     yield Figure("bank beyond (deg)", math.degrees(np.abs(phi).max() - section.bank), limit if pose == Pose() else LATE)
     floor = section.params().limits.stall_speed * FLOOR
@@ -285,10 +271,10 @@ def turn_round(section: GuidanceConfig) -> tuple[dict[str, Any], float]:
 
 
 POSES: Mapping[str, Pose] = {
-    "5 Hz": Pose(every=10),
-    "0.2 s late": Pose(delay=0.2),
-    "noisy": Pose(noise=True),
-    "5 Hz, 0.2 s late, noisy": Pose(every=10, delay=0.2, noise=True, max_age=0.5),
+    "5 Hz": Pose({"rate": 5.0}),
+    "0.2 s late": Pose({"delay": 0.2}),
+    "noisy": Pose({"noise": NOISE}),
+    "5 Hz, 0.2 s late, noisy": Pose({"rate": 5.0, "delay": 0.2, "noise": NOISE}, max_age=0.5),
     "frozen for 8 s": Pose(fault=8.0),
     "frozen for 8 s, new stamps": Pose(fault=8.0, stamped=True),
     "frozen for 20 s": Pose(fault=20.0),
@@ -398,7 +384,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
             section["program"][name]["value"] = [offset + value for value in section["program"][name]["value"]]
     if "route" in section:
         section["route"]["altitude"] = [altitude + above for above in section["route"]["altitude"]]
-    aircraft: dict[str, Any] = {"wind": [0.0, air.across * speed]}
+    aircraft: dict[str, Any] = {"wind": [0.0, air.across * speed], "pose": dict(manoeuvre.pose.measured)}
     if manoeuvre.figures is of_switch:
         aircraft["sensors"] = {}  # noise moves u by itself
     if air.seed is not None:
@@ -410,7 +396,7 @@ def flown(scenario: Scenario, manoeuvre: Manoeuvre, air: Air) -> Iterator[Figure
         RANGES.update(
             {name: high - low for name, low, high in zip(controller.inputs, controller.lower, controller.upper, strict=True)}
         )
-    tape = simulate(varied, guide=partial(PoseReceiver, manoeuvre.pose))
+    tape = simulate(varied, guide=partial(FaultyPose, manoeuvre.pose))
     if tape.outcome != COMPLETED:
         yield Figure(f"lost: {tape.outcome}", math.inf, 0.0)
         return

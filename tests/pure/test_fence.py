@@ -205,9 +205,7 @@ def test_fence_that_cannot_be_kept_refused(section: dict[str, Any], sentence: st
 
 def test_start_outside_of_fence_refused() -> None:
     scenario = calm(5.0, program=commanded(0.0), fence=BOX).vary(aircraft={"start": {"east": 510.0}})
-    with pytest.raises(
-        ParameterError, match=r"guidance\.fence: found the start 10 m outside of the fence, at north 0 m"
-    ):
+    with pytest.raises(ParameterError, match=r"guidance\.fence: found the start 10 m outside of the fence, at north 0 m"):
         simulate(scenario)
 
 

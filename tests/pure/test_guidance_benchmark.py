@@ -11,9 +11,7 @@ from benchmarks import routes
 from benchmarks.evidence_data import Row
 from benchmarks.guidance_grid import Point
 
-from flight_core.channels import POSE
 from flight_core.tape import Signal, Tape
-from flight_core.vectors import StampedVector
 
 pytestmark = pytest.mark.slow
 
@@ -48,18 +46,6 @@ def test_poor_pose_flown_across_180_deg_and_frozen_one_levels_wings(pose: str, s
         assert row.figure.value <= row.figure.limit, row
     assert {row.figure.name: row.figure.value for row in rows}["pose stale (s)"] == pytest.approx(stale)
     assert rows[0].figure.name == "heading (deg)"  # held again at the end
-
-
-def test_delayed_pose_keeps_stamp_and_one_that_comes_late_is_stale() -> None:
-    section = benchmark.aircraft_of("osprey_servo").guidance
-    assert section is not None
-    made = benchmark.PoseReceiver(benchmark.Pose(delay=0.3), section)
-    for k in range(20):
-        made.take_pose(StampedVector(20_000_000 * k, np.full(len(POSE), float(k))), 20_000_000 * k)
-    assert made.ages(380_000_000)["pose"] == pytest.approx(0.3)
-    assert made.pose()["north"] == 4.0
-    made.take_y(StampedVector(380_000_000, np.zeros(4)), 380_000_000)
-    assert made.step(380_000_000, 380_000_000) is None  # it does not begin with a pose older than 0.2 s
 
 
 def test_rows_of_evidence() -> None:
