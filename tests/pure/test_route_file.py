@@ -287,7 +287,7 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
 
 
 CENTRE = {"center": [47.41, 8.51], "radius": 200.0}
-PLAN_FENCE = {
+PLAN_FENCE: dict[str, Any] = {
     "fileType": "Plan",
     "geoFence": {
         "polygons": [{"polygon": [[47.39, 8.49], [47.42, 8.49], [47.42, 8.53]], "inclusion": True}],
