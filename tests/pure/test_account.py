@@ -40,7 +40,7 @@ from flight_cli.report import report
 from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Process, Tape
+from flight_core.tape import Process, Recording, Tape
 from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
 from flight_log.flight_processes import flight_processes
@@ -225,6 +225,27 @@ def test_flight_counts_from_its_first_u(begin: float, outcome: str, tape: Tape, 
     """As of a controller that takes a y after many that were too old."""
     late = {name: tape[name] for name in ("y", "y_m", "truth")} | {"u": tape["u"].where(tape.time("u") >= begin)}
     assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(outcome)
+
+
+@pytest.mark.parametrize(
+    ("of_y", "lost", "lacks"),
+    [("without", 0, False), ("with", 0, True), ("without", 1, True), ("after", 0, False)],
+    ids=["host withheld y and pose", "pose alone is missing", "messages were lost", "pose goes on after the end"],
+)
+def test_samples_that_busy_host_withheld_are_no_lack_of_log(
+    of_y: str, lost: int, lacks: bool, tape: Tape, osprey_gust: Scenario
+) -> None:
+    """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the pose was sent."""
+    begin_ns, until = NANOSECONDS * 1_795_000_000, 1.8 if of_y == "after" else 2.0
+    withheld = ("y", "truth", "pose") if of_y == "without" else ("pose",)
+    signals = {}
+    for name in ("y", "y_m", "u", "truth", "pose"):
+        t = tape.time(name)
+        of = tape[name].where((t < 1.7) | (t > until)) if name in withheld else tape[name]
+        signals[name] = replace(of, stamp_ns=of.stamp_ns - tape.start_ns + begin_ns)
+    recording = {name: Recording(0, lost=lost) for name in signals}
+    lacking = account(Tape(signals, begin_ns, duration=1.8, recording=recording), osprey_gust).lacks
+    assert any(lack.startswith("pose ") for lack in lacking) == lacks
 
 
 def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:

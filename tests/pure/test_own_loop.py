@@ -210,3 +210,56 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
     assert reward == pytest.approx(-10.0 * (3.0 - 0.01))  # the score of a loss of track for the seconds from the last tick on
     with pytest.raises(rise_di.ParameterError, match="expected reset"):
         env.step(u)
+
+
+def test_vector_environment_flies_as_environments_one_by_one() -> None:
+    """The fleet's linear steps against the simulator's integration: their difference is that of the campaign's figures."""
+    flights, alone = rise_di.FlightVectorEnv(SCENARIO, 3, uncertainty=0.0), rise_di.FlightEnv(SCENARIO)
+    observed, _ = flights.reset(seed=1)
+    expected, _ = alone.reset(seed=1)
+    assert flights.observation_space.contains(observed)
+    generator = np.random.default_rng(0)
+    for _ in range(100):
+        assert observed == pytest.approx(np.tile(expected, (3, 1)), abs=1e-6)  # rad/s and m/s; y is of the order of 1e-2
+        u = 0.01 * generator.standard_normal(M)
+        observed, rewards, terminated, truncated, _ = flights.step(np.tile(u, (3, 1)))
+        expected, reward, *_ = alone.step(u)
+        assert rewards == pytest.approx(np.full(3, reward), rel=1e-3, abs=1e-6)
+        assert not terminated.any()
+        assert not truncated.any()
+    assert flights.t == pytest.approx(alone.t)
+
+
+def test_vector_environment_starts_diverged_aircraft_and_ended_flight_anew() -> None:
+    flights = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_gust", 3.0), 2)  # without end stops
+    first, _ = flights.reset(seed=3)
+    u, terminations, still = np.zeros((2, M)), 0, None
+    u[1] = 1e9  # far beyond the limits of the law, so that the second aircraft leaves every bound within some steps
+    for k in range(1, round(3.0 * CONTROLLER.rate) + 1):
+        observed, rewards, terminated, truncated, _ = flights.step(u)
+        if still is not None:
+            assert np.all(np.abs(observed[1, :M]) < np.abs(still) / 2)  # trim, but for noise
+            assert rewards[1] == 0.0
+        still = observed[1, :M] if terminated[1] else None
+        if terminated[1]:
+            assert rewards[1] == pytest.approx(-10.0 * (3.0 - (k - 1) / CONTROLLER.rate))
+        terminations += terminated.sum()
+        assert not terminated[0]
+    assert terminations > 1
+    assert truncated[0]
+    again, rewards, terminated, truncated, _ = flights.step(u)
+    assert not np.any([terminated, truncated, rewards != 0.0])
+    assert flights.t == 0.0
+    assert again.shape == first.shape
+
+
+@pytest.mark.parametrize(
+    ("actions", "expected"), [(np.zeros((3, M)), r"of shape \(2, 4\)"), (np.full((2, M), np.nan), "finite")]
+)
+def test_vector_environment_refuses_actions(actions: FloatArray, expected: str) -> None:
+    flights = rise_di.FlightVectorEnv(SCENARIO, 2)
+    with pytest.raises(rise_di.ParameterError, match="reset"):
+        flights.step(np.zeros((2, M)))
+    flights.reset(seed=1)
+    with pytest.raises(rise_di.ParameterError, match=expected):
+        flights.step(actions)

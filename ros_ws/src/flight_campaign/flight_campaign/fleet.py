@@ -431,9 +431,9 @@ class Stepper:
     ) -> None:
         self.ticks, self._course, self._mission, self._k = len(course.segments.t), course, mission, 0
         self._timing = Timing(fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), windows)
-        self._fleet, self._vehicle = jax.device_put((fleet._replace(blocks=()), vehicle))
+        self._fleet, self._vehicle, self._segments = jax.device_put((fleet._replace(blocks=()), vehicle, course.segments))
         self._windows = window_of(np.arange(self.ticks), windows)
-        self._state = _in_trim(fleet, vehicle, mission, self._timing)
+        self._state = self._begin = _in_trim(fleet, vehicle, mission, self._timing)
 
     @property
     def t(self) -> float:
@@ -449,27 +449,37 @@ class Stepper:
         """The y and y_m of the present tick, each (m, N), in the law's order."""
         action = None if self._mission is None else np.asarray(self._mission.action)[self._k]
         self._state, sample = _sense_once(
-            self._state, self._segment, action, self._windows[self._k], self._vehicle, self._mission
+            self._state, self._segments, self._k, action, self._windows[self._k], self._vehicle, self._mission
         )
         y = np.asarray(sample.y)
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
 
     def advance(self, u: FloatArray) -> None:
         """To the next tick with the command u, (m, N), in the law's order."""
-        self._state = _advance_once(self._state, u, self._segment, self._fleet, self._vehicle, self._mission, self._timing)
+        self._state = _advance_once(
+            self._state, u, self._segments, self._k, self._fleet, self._vehicle, self._mission, self._timing
+        )
         self._k += 1
+
+    def restart(self, which: NDArray[np.bool_]) -> None:
+        """Set some aircraft, (N,), into trim at the present tick. Their figures begin anew."""
+        self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:
         """The figures after the last tick."""
         return _result(self._state, self.ticks, np.float64(self._course.period), self._mission, self._timing)
 
-    @property
-    def _segment(self) -> Segments:
-        return Segments(*(values[self._k] for values in self._course.segments))
+
+@jax.jit
+def _sense_once(now: LoopState, segments: Segments, k: int, *others: Any) -> tuple[LoopState, Sample]:
+    return _sense(now, jax.tree.map(lambda values: values[k], segments), *others)
 
 
-_sense_once = jax.jit(_sense)
-_advance_once = jax.jit(_advance, static_argnames=("timing",))
+@partial(jax.jit, static_argnames=("timing",))
+def _advance_once(
+    now: LoopState, u: Array, segments: Segments, k: int, fleet: Fleet, of: Vehicle, mission: Mission | None, timing: Timing
+) -> LoopState:
+    return _advance(now, u, jax.tree.map(lambda values: values[k], segments), fleet, of, mission, timing)
 
 
 def _at(t: Array, fleet: Fleet) -> Fleet:

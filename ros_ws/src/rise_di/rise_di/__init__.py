@@ -25,6 +25,7 @@ __all__ = [
     "Field",
     "FlightEnv",
     "FlightResult",
+    "FlightVectorEnv",
     "GainAssessment",
     "LawParams",
     "LawState",
@@ -110,7 +111,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_log.tape_reader import RecordedRun, read_run
     from rise_di.c_code import Exported, export
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
-    from rise_di.flight_env import FlightEnv
+    from rise_di.flight_env import FlightEnv, FlightVectorEnv
     from rise_di.gain_design import check_gains, select_gains
     from rise_di.learning import learner
     from rise_di.own_airframe import NewAirframe, new_airframe
@@ -149,7 +150,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "flight_log.tape_reader": ("RecordedRun", "read_run"),
         "rise_di.c_code": ("Exported", "export"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
-        "rise_di.flight_env": ("FlightEnv",),
+        "rise_di.flight_env": ("FlightEnv", "FlightVectorEnv"),
         "rise_di.gain_design": ("check_gains", "select_gains"),
         "rise_di.learning": ("learner",),
         "rise_di.own_airframe": ("NewAirframe", "new_airframe"),

@@ -1,15 +1,19 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of a scenario as an environment of gymnasium: the agent takes the place of the controller, a tick a step."""
+"""The aircraft of a scenario as environments of gymnasium: the agent takes the place of the controller, a tick a step."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
+from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_campaign.benchmark_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
-from flight_core.arguments import as_number
+from flight_core.arguments import as_count, as_number
 from flight_core.installation import require_package
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
@@ -21,6 +25,29 @@ require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
 
 UNLIMITED = 1.0  # SI, bound of an action that the controller does not limit: 57 deg, or the weight as thrust
+
+
+class _Channels(NamedTuple):
+    """Spaces of an aircraft, and the units of the score by output."""
+
+    action: gymnasium.spaces.Space[FloatArray]
+    observation: gymnasium.spaces.Space[FloatArray]
+    units: FloatArray  # (m,)
+
+
+def _channels(scenario: Scenario) -> _Channels:
+    """Spaces of u within the limits of the controller, and of y then y_m."""
+    controller = scenario.controller
+    limits = controller.effector_limits()
+    low, high = (
+        np.where(np.isfinite(limit), limit, sign * UNLIMITED) for limit, sign in ((limits.lower, -1), (limits.upper, 1))
+    )
+    shape = (2 * len(controller.outputs),)
+    return _Channels(
+        gymnasium.spaces.Box(low, high, dtype=np.float64),
+        gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float64),
+        score_units(controller.outputs, scenario.aircraft.channels().outputs),
+    )
 
 
 class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
@@ -45,18 +72,12 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     def __init__(self, scenario: Scenario, uncertainty: float | None = None) -> None:
         self.scenario = as_scenario(scenario)
         self._uncertainty = None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
-        controller, channels = scenario.controller, scenario.aircraft.channels()
+        controller = scenario.controller
         require(not (scenario.aircraft.is_jsbsim and uncertainty), "uncertainty", uncertainty, "0: JSBSim has no A and B")
         self.outputs, self.inputs = controller.outputs, controller.effectors
-        self._units = score_units(self.outputs, channels.outputs)
-        limits = controller.effector_limits()
-        low, high = (
-            np.where(np.isfinite(limit), limit, sign * UNLIMITED) for limit, sign in ((limits.lower, -1), (limits.upper, 1))
-        )
-        self.action_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2 * len(self.outputs),), np.float64)
+        self.action_space, self.observation_space, self._units = _channels(scenario)
         self._period = 1.0 / controller.rate
-        self._ticks = nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
+        self._k = self._ticks = nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
         self._samples = round(scenario.aircraft.rate / controller.rate)
         self._references = round(scenario.reference_model.rate / controller.rate)
 
@@ -110,3 +131,92 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     def _observed(self) -> FloatArray:
         y_m = self._reference.sample(self._references * self._k)
         return np.concatenate([self._y, select(self.outputs, self.scenario.reference_model.outputs, y_m)])
+
+
+class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
+    """N uncertain aircraft of a scenario on one course, compiled.
+
+    Observations have the shape (N, 2 m), actions (N, m) and rewards (N,), with the rows of FlightEnv. The aircraft share
+    commands, wind and the noise of the sensors, and end together. Every `reset` draws N aircraft. A diverged aircraft
+    terminates. The next step starts the same aircraft from trim at the present time of the course, and the step after the end
+    of the flight draws N aircraft again: `AutoresetMode.NEXT_STEP`.
+
+    Args:
+        scenario: As that of FlightEnv, of an airframe with matrices.
+        num_envs: N.
+        uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to 1.
+
+    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of JSBSim or an allocation.
+    """
+
+    metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
+
+    def __init__(self, scenario: Scenario, num_envs: int, uncertainty: float = 0.3) -> None:
+        from flight_campaign import fleet  # noqa: PLC0415 - JAX, a second to load
+
+        self.scenario = as_scenario(scenario)
+        self.num_envs = as_count(num_envs, "num_envs", 1)
+        self._uncertainty = as_number(uncertainty, "uncertainty", 0.0, 1.0)
+        self._course, self._vehicle, self._fleet = build_course(self.scenario), fleet.vehicle(self.scenario), fleet
+        self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self._units, self._k, self._last = units[:, None], 0, 0
+        self._y, self._ended = np.zeros((len(units), self.num_envs)), np.zeros(self.num_envs, dtype=bool)
+
+    @property
+    def t(self) -> float:
+        """Time of the present observations, s."""
+        return self._flights.t
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
+        """N new aircraft in trim at t = 0. A seed repeats them. Raises ParameterError for a list of seeds."""
+        seed = None if seed is None else as_count(seed, "seed", 0)
+        super().reset(seed=seed, options=options)
+        return self._begin(), {}
+
+    def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Hold u for a period, (N, m). Raises ParameterError for another shape, and for an action that is not finite."""
+        u = np.asarray(actions, dtype=np.float64)
+        shape = (self.num_envs, len(self._units))
+        require(u.shape == shape and bool(np.isfinite(u).all()), "actions", f"shape {u.shape}", f"finite, of shape {shape}")
+        require(self._last > 0, "step", "a step before an episode", "reset() first")
+        none = np.zeros(self.num_envs, dtype=bool)
+        if self._last == self._k:
+            return self._begin(), np.zeros(self.num_envs), none, none, {}
+        self._flights.advance(u.T)
+        self._k += 1
+        started = self._ended
+        if started.any():
+            self._flights.restart(started)
+            self._y = np.where(started, 0.0, self._y)
+        y, y_m = self._sense()
+        self._ended = ~self._flights.bounded
+        left = (self._last - self._k + 1) * self._course.period
+        reward = -self._course.period * np.sum(np.abs(y - y_m) / self._units, axis=0)
+        reward = np.where(self._ended, -LOSS_OF_TRACK_SCORE * left, np.where(started, 0.0, reward))
+        truncated = ~self._ended if self._k == self._last else none
+        return self._observed(y, y_m), reward, self._ended, truncated, {}
+
+    def _begin(self) -> FloatArray:
+        """All aircraft anew."""
+        aircraft, part = self.scenario.aircraft, self._uncertainty
+        airframe, seed = load_airframe(aircraft.airframe), int(self.np_random.integers(0, 2**31))
+        A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs)
+        directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
+        drawn = self._fleet.assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
+        self._flights = self._fleet.Stepper(drawn, self._vehicle, self._course)
+        self._k, self._last = 0, self._flights.ticks - 1
+        self._y, self._ended = np.zeros_like(self._y), np.zeros_like(self._ended)
+        return self._observed(*self._sense())
+
+    def _sense(self) -> tuple[FloatArray, FloatArray]:
+        """The newest y that has arrived, and y_m."""
+        y, _ = self._flights.sense()
+        if self._course.segments.phase[self._k] != HOLD:
+            self._y = y
+        return self._y, np.broadcast_to(self._course.segments.y_m[self._k][:, None], y.shape)
+
+    @staticmethod
+    def _observed(y: FloatArray, y_m: FloatArray) -> FloatArray:
+        return np.concatenate([y, y_m]).T

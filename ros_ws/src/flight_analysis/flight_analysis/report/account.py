@@ -25,6 +25,7 @@ LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much 
 GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
 RESTART = 10  # a number of a tick that is less by more
+OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(rf", (?:{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{INCOMPLETE}).*", re.DOTALL)  # of an outcome
 
@@ -191,9 +192,13 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     expected = {} if scenario is None else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
     topics = {name: _topic(tape, name, expected.get(name), end_ns) for name in names}
+    late = {} if scenario is None else _latest(scenario)
     if scenario is not None and tape.start_ns > SINCE_EPOCH_NS:  # in real time
         for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
             topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)))
+            if rest := _unsent_rest(tape, name, step_ns, end_ns):
+                topics[name] = topics[name]._replace(unsent=topics[name].unsent + rest)
+                late[name] = seconds(end_ns)
     end = seconds(end_ns - tape.start_ns)
     failsafe = 0
     if "internals" in tape and "mode" in tape["internals"].names:
@@ -204,7 +209,6 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         topics[name] = topic._replace(found=max(topic.found - repeated, 0), repeated=repeated)
     guided = [topics[name] for name in GUIDED if name in topics]
     unguided = bool(guided) and all(topic.expected and not topic.found and not topic.unset for topic in guided)
-    late = {} if scenario is None else _latest(scenario)
     first = _late_first_u(topics, scenario) if from_start else None
     lacks = [lack for name, topic in topics.items() if (lack := _lack(name, topic, end, late.get(name, 0.0), first))]
     busy = [
@@ -289,6 +293,22 @@ def _with_unsent(topic: TopicAccount, step_ns: int, of: Recording) -> TopicAccou
         return topic
     instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
     return topic._replace(unsent=max(instants - topic.found - of.lost, 0))
+
+
+def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
+    """The number of instants from the last sample of a topic to the end, where the publisher left them out.
+
+    The numbers of the messages tell: the next sample comes after the end, or the aircraft sent no y at these instants. 0: a
+    sample may be missing in the log.
+    """
+    signal = tape.signals.get(name)
+    if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
+        return 0
+    held_ns = signal.until(end_ns).stamp_ns
+    rest_ns = np.arange(int(held_ns[-1]) + step_ns, end_ns + 1, step_ns) if len(held_ns) else held_ns
+    goes_on = len(signal.stamp_ns) > len(held_ns)
+    as_y = name in OF_AIRCRAFT and "y" in tape and tape.recording.get("y", Recording(0)).lost == 0
+    return len(rest_ns) if goes_on or (as_y and not np.isin(rest_ns, tape["y"].stamp_ns).any()) else 0
 
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
