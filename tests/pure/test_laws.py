@@ -273,7 +273,7 @@ def test_every_law_flies_and_replays(name: str) -> None:
 @pytest.mark.parametrize(("name", "groups"), [("rise_di", {"integral_e", "Pi"}), ("pi", {"integral_e"}), ("l1", set())])
 def test_layout_shows_integrals_that_law_has(name: str, groups: set[str]) -> None:
     channels = layouts.channels_of(flight(name))
-    text = layouts.foxglove(channels) + layouts.plotjuggler(channels)
+    text = layouts.foxglove({"": channels}) + layouts.plotjuggler({"": channels})
     assert {group for group in ("integral_e", "Pi") if f"{group}.q" in text} == groups
 
 

@@ -14,10 +14,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
+from flight_analysis.report.layouts import MAP_TOPICS, channels_of, foxglove, plotjuggler
 from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.tape import Tape
@@ -25,7 +26,7 @@ from flight_core.tape import Tape
 pytestmark = pytest.mark.package("flight_analysis")
 
 CHANNELS = channels_of(find_scenario("osprey_gust"))
-JSON, XML = foxglove(CHANNELS), plotjuggler(CHANNELS)
+JSON, XML = foxglove({"": CHANNELS}), plotjuggler({"": CHANNELS})
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
 CURVES = {
     *(f"{topic} {name}" for topic in ("y", "y_m") for name in OUTPUTS),
@@ -126,7 +127,7 @@ def test_guided_flight_has_map_and_what_guidance_holds() -> None:
     scenario = find_scenario("osprey_route").vary(flight={"duration": 0.1})
     log, channels = simulate(scenario)["guidance"], channels_of(scenario)
     assert channels["guidance"] == log.names
-    layout = json.loads(foxglove(channels))
+    layout = json.loads(foxglove({"": channels}))
     first, second, *others = layout["configById"]["Tab!rise_di"]["tabs"]
     assert (first["title"], first["layout"], second["title"]) == ("map", "3D!map", "guidance")
     assert [tab["title"] for tab in others] == list(TABS)
@@ -139,9 +140,36 @@ def test_guided_flight_has_map_and_what_guidance_holds() -> None:
     for path in paths:
         index = int(path["value"].removeprefix("/guidance.position[").removesuffix("]"))
         assert path["label"] == f"guidance: {log.names[index]}"
-    curves = ElementTree.fromstring(plotjuggler(channels)).iter("curve")
+    curves = ElementTree.fromstring(plotjuggler({"": channels})).iter("curve")
     guided = [name for curve in curves if (name := curve.attrib["name"]).startswith("/guidance/")]
     assert len(guided) == len(paths) == 12
+
+
+def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
+    """RViz shows each aircraft at the frame that guidance publishes, after REP 105."""
+    fleet = tmp_path / "fleet.yaml"
+    fleet.write_text("aircraft: {uav1: {}, uav2: {scenario: osprey_gust}, uav3: {}}", encoding="utf-8")
+    result = CliRunner().invoke(application(["layouts"]), ["layouts", "--fleet", str(fleet), "--folder", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    panels = json.loads((tmp_path / "fleet.foxglove.json").read_text(encoding="utf-8"))["configById"]
+    assert [tab["title"] for tab in panels["Tab!rise_di"]["tabs"]] == ["map", "uav1", "uav2", "uav3"]
+    assert set(panels["3D!map"]["topics"]) == {f"/{name}/{topic}" for name in ("uav1", "uav3") for topic in MAP_TOPICS}
+    (tracking,) = (tab for tab in panels["Tab!uav2"]["tabs"] if tab["title"] == "tracking")
+    first = panels[next(leaves(tracking["layout"]))]["paths"][0]
+    assert (first["value"], first["label"]) == (f"/uav2/y.position[{CHANNELS['y'].index('q')}]", "y: q")
+    tabs = [tab.attrib["tab_name"] for tab in ElementTree.parse(tmp_path / "fleet.plotjuggler.xml").iter("Tab")]
+    assert tabs[len(TABS) + 1 :][: len(TABS)] == [f"uav2 {title}" for title in TABS]
+    shown = yaml.safe_load((tmp_path / "fleet.rviz").read_text(encoding="utf-8"))["Visualization Manager"]
+    models = [display for display in shown["Displays"] if display["Class"].endswith("/RobotModel")]
+    assert [(model["TF Prefix"], Path(model["Description File"])) for model in models] == [
+        (name, tmp_path / "aircraft.urdf") for name in ("uav1", "uav3")
+    ]
+    assert (shown["Global Options"]["Fixed Frame"], shown["Views"]["Current"]["Target Frame"]) == ("map", "uav1/base_link")
+    (link,) = ElementTree.parse(tmp_path / "aircraft.urdf").iter("link")
+    widths = [float(box.attrib["size"].split()[1]) for box in link.iter("box")]
+    assert (link.attrib["name"], max(widths)) == ("base_link", 3.0)  # m, the span
+    both = CliRunner().invoke(application(["layouts"]), ["layouts", "osprey_gust", "--fleet", str(fleet)])
+    assert str(both.exception) == "--fleet: found a scenario beside it, expected one of the two"
 
 
 def test_every_splitter_of_plotjuggler_has_its_count() -> None:

@@ -1,27 +1,42 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di layouts`: layouts of Foxglove and PlotJuggler for the runs of a scenario."""
+"""`rise-di layouts`: layouts of Foxglove, PlotJuggler and RViz for the runs of a scenario or of a fleet."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler
+from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler, rviz, urdf
+from flight_bringup.fleet import read_fleet
 from flight_bringup.scenarios import find_scenario
 from flight_core.files import write_file, writing
+from flight_core.parameters import require
 
 
 def layouts(
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
-    folder: Annotated[Path, typer.Option(help="Folder to write the two files to.")] = Path(),
+    scenario: Annotated[
+        str | None,
+        typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).", show_default="osprey_servo"),
+    ] = None,
+    fleet: Annotated[
+        Path | None, typer.Option("--fleet", metavar="FILE", help="File of a fleet: layouts with all its aircraft.")
+    ] = None,
+    folder: Annotated[Path, typer.Option(help="Folder to write the files to.")] = Path(),
 ) -> None:
-    """Write layouts for Foxglove and PlotJuggler that plot the runs of a scenario."""
-    chosen = find_scenario(scenario)
-    channels = channels_of(chosen)
-    for suffix, text in (("foxglove.json", foxglove(channels)), ("plotjuggler.xml", plotjuggler(channels))):
-        path = folder / f"{chosen.name}.{suffix}"
+    """Write layouts for Foxglove and PlotJuggler that plot the runs of a scenario, and for RViz where it has guidance."""
+    require(fleet is None or scenario is None, "--fleet", "a scenario beside it", "one of the two")
+    if fleet is None:
+        chosen = find_scenario(scenario or "osprey_servo")
+        name, scenarios = chosen.name, {"": chosen}
+    else:
+        name, scenarios = fleet.stem, {member.name: member.scenario for member in read_fleet(fleet).members}
+    aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
+    files = {f"{name}.foxglove.json": foxglove(aircraft), f"{name}.plotjuggler.xml": plotjuggler(aircraft)}
+    if guided := [namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None]:
+        files |= {f"{name}.rviz": rviz(guided, (folder / "aircraft.urdf").absolute()), "aircraft.urdf": urdf()}
+    for file, text in files.items():
         with writing("folder", folder, "a folder that can"):
             folder.mkdir(parents=True, exist_ok=True)
-            write_file(path, text)
-        print(path)
+            write_file(folder / file, text)
+        print(folder / file)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of Foxglove and PlotJuggler for the runs of a scenario.
+"""Layouts of Foxglove, PlotJuggler and RViz for the runs of a scenario or of a fleet.
 
 Foxglove addresses a channel by the index in `position`, PlotJuggler by the name. A layout therefore fits every scenario with
 the same channels in the same order.
@@ -8,8 +8,11 @@ the same channels in the same order.
 
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
+
+import yaml
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
@@ -20,8 +23,20 @@ COLOURS = ("#1f77b4", "#d62728", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b")
 COLUMNS = 2
 MAP = "3D!map"
 """The 3-D panel of a guided flight: route and aircraft in the frame `map`, ENU."""
-MAP_TOPICS = ("/odometry", "/path", "/markers")
+MAP_TOPICS = ("odometry", "path", "markers")
 CAMERA_DISTANCE, GRID_SIZE = 3000.0, 10_000.0  # m
+CHASE_DISTANCE = 15.0  # m, of the camera of RViz behind the aircraft
+
+SPAN = 3.0  # m, of the drawn aircraft
+BOXES = {  # (size, centre) of its parts in spans: forward, left, up. Those of report/scene/scene.js
+    "body": ((0.8, 0.08, 0.09), (-0.1, 0.0, 0.0)),
+    "wing": ((0.2, 1.0, 0.02), (-0.03, 0.0, 0.01)),
+    "tail": ((0.11, 0.36, 0.01), (-0.465, 0.0, 0.01)),
+    "fin": ((0.11, 0.01, 0.17), (-0.465, 0.0, 0.09)),
+}
+
+Channels = Mapping[str, Sequence[str]]
+"""The channels of the topics of an aircraft, in their order."""
 
 
 class Plot(NamedTuple):
@@ -39,7 +54,7 @@ class Tab(NamedTuple):
 
 
 def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
-    """The channels of the topics of a run, in their order."""
+    """The channels of the topics of a run."""
     controller = scenario.controller
     guided = {} if scenario.guidance is None else {"guidance": guidance.names(scenario.guidance.outputs)}
     return guided | {
@@ -51,7 +66,7 @@ def channels_of(scenario: Scenario) -> dict[str, tuple[str, ...]]:
     }
 
 
-def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
+def tabs_of(channels: Channels) -> tuple[Tab, ...]:
     """The tabs: y over y_m and e by output, u with u_free, integral_e and Pi, state and timing of the controller, the wind.
 
     A guided flight has a further tab, of the commands and measurements of guidance.
@@ -94,32 +109,51 @@ def tabs_of(channels: Mapping[str, Sequence[str]]) -> tuple[Tab, ...]:
     )
 
 
-def foxglove(channels: Mapping[str, Sequence[str]]) -> str:
-    """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels.
+def foxglove(aircraft: Mapping[str, Channels]) -> str:
+    """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels. `aircraft`: channels by namespace, "" the root.
 
-    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep.
+    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep. Of
+    several aircraft each has a tab with the tabs of one, beside a common map.
     """
     panels: dict[str, Any] = {}
     tabs: list[dict[str, Any]] = []
-    if "guidance" in channels:
-        panels[MAP] = _foxglove_map()
+    if guided := [namespace for namespace, channels in aircraft.items() if "guidance" in channels]:
+        panels[MAP] = _foxglove_map(guided)
         tabs.append({"title": "map", "layout": MAP})
-    for tab in tabs_of(channels):
-        names = []
-        for number, plot in enumerate(tab.plots):
-            names.append(f"Plot!{tab.title}{number}")
-            panels[names[-1]] = _foxglove_plot(plot, channels)
-        if names:
-            tabs.append({"title": tab.title, "layout": _mosaic(names)})
+    for namespace, channels in aircraft.items():
+        own = _foxglove_tabs(panels, namespace, channels)
+        if len(aircraft) == 1:
+            tabs += own
+        else:
+            panels[f"Tab!{namespace}"] = {"activeTabIdx": 0, "tabs": own}
+            tabs.append({"title": namespace, "layout": f"Tab!{namespace}"})
     panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": tabs}
     defaults = {"globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
     return json.dumps({"configById": panels, **defaults, "layout": "Tab!rise_di"}, indent=2) + "\n"
 
 
-def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+def _foxglove_tabs(panels: dict[str, Any], namespace: str, channels: Channels) -> list[dict[str, Any]]:
+    """The tabs of an aircraft; their plots are added to the panels."""
+    tabs = []
+    for tab in tabs_of(channels):
+        names = []
+        for number, plot in enumerate(tab.plots):
+            names.append(f"Plot!{namespace}{tab.title}{number}")
+            panels[names[-1]] = _foxglove_plot(plot, namespace, channels)
+        if names:
+            tabs.append({"title": tab.title, "layout": _mosaic(names)})
+    return tabs
+
+
+def _topic(namespace: str, name: str) -> str:
+    """The full name of a topic."""
+    return f"/{namespace}/{name}" if namespace else f"/{name}"
+
+
+def _foxglove_plot(plot: Plot, namespace: str, channels: Channels) -> dict[str, Any]:
     paths = [
         {
-            "value": f"/{topic}.position[{list(channels[topic]).index(channel)}]",
+            "value": f"{_topic(namespace, topic)}.position[{list(channels[topic]).index(channel)}]",
             "label": f"{topic}: {channel}",
             "color": colour,
             "enabled": True,
@@ -142,7 +176,7 @@ def _foxglove_plot(plot: Plot, channels: Mapping[str, Sequence[str]]) -> dict[st
     }
 
 
-def _foxglove_map() -> dict[str, Any]:
+def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
     return {
         "cameraState": {
             "distance": CAMERA_DISTANCE, "perspective": True, "phi": 45.0, "thetaOffset": 0.0, "fovy": 45.0,
@@ -153,7 +187,7 @@ def _foxglove_map() -> dict[str, Any]:
         "followTf": "map",
         "scene": {},
         "transforms": {},
-        "topics": {topic: {"visible": True} for topic in MAP_TOPICS},
+        "topics": {_topic(namespace, name): {"visible": True} for namespace in namespaces for name in MAP_TOPICS},
         "layers": {
             "grid": {
                 "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid", "frameId": "map",
@@ -177,20 +211,21 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
     return {"direction": direction, "first": first, "second": _split(others, direction), "splitPercentage": share}
 
 
-def plotjuggler(channels: Mapping[str, Sequence[str]]) -> str:
-    """A layout of PlotJuggler: XML, tabs of docked plots, curves named "/topic/channel/position"."""
+def plotjuggler(aircraft: Mapping[str, Channels]) -> str:
+    """A layout of PlotJuggler: XML, tabs of docked plots, curves "/topic/channel/position". `aircraft` as in `foxglove`."""
     root = ElementTree.Element("root")
     window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
-    for tab in tabs_of(channels):
+    for namespace, tab in [(namespace, tab) for namespace, channels in aircraft.items() for tab in tabs_of(channels)]:
         if not tab.plots:
             continue
-        element = ElementTree.SubElement(window, "Tab", {"tab_name": tab.title, "containers": "1"})
+        title = f"{namespace} {tab.title}".strip()
+        element = ElementTree.SubElement(window, "Tab", {"tab_name": title, "containers": "1"})
         rows = [tab.plots[start : start + COLUMNS] for start in range(0, len(tab.plots), COLUMNS)]
         outer = _splitter(ElementTree.SubElement(element, "Container"), "-", len(rows))
         for row in rows:
             inner = _splitter(outer, "|", len(row))
             for plot in row:
-                _plotjuggler_plot(inner, plot)
+                _plotjuggler_plot(inner, plot, namespace)
     ElementTree.SubElement(window, "currentTabIndex", {"index": "0"})
     ElementTree.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
     ElementTree.indent(root)
@@ -202,10 +237,60 @@ def _splitter(parent: ElementTree.Element, orientation: str, count: int) -> Elem
     return ElementTree.SubElement(parent, "DockSplitter", {"orientation": orientation, "count": str(count), "sizes": sizes})
 
 
-def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot) -> None:
+def _plotjuggler_plot(parent: ElementTree.Element, plot: Plot, namespace: str) -> None:
     area = ElementTree.SubElement(parent, "DockArea", {"name": plot.title})
     element = ElementTree.SubElement(
         area, "plot", {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
     )
     for (topic, channel), colour in zip(plot.curves, COLOURS, strict=False):
-        ElementTree.SubElement(element, "curve", {"name": f"/{topic}/{channel}/position", "color": colour})
+        ElementTree.SubElement(element, "curve", {"name": f"{_topic(namespace, topic)}/{channel}/position", "color": colour})
+
+
+def rviz(namespaces: Sequence[str], description: Path) -> str:
+    """A configuration of RViz: aircraft, path and route of each namespace in the frame `map`, a camera that follows the first.
+
+    `description`: the file of `urdf`.
+    """
+    displays: list[dict[str, Any]] = [
+        {"Class": "rviz_default_plugins/Grid", "Name": "Grid", "Cell Size": 100.0, "Plane Cell Count": int(GRID_SIZE / 100.0)}
+    ]
+    for name in namespaces:
+        model = {"Description Source": "File", "Description File": str(description), "TF Prefix": name}
+        displays += [
+            {"Class": "rviz_default_plugins/RobotModel", "Name": name or "aircraft"} | model,
+            {"Class": "rviz_default_plugins/Path", "Name": f"{name} path".strip(), "Topic": {"Value": _topic(name, "path")}},
+            {
+                "Class": "rviz_default_plugins/MarkerArray",
+                "Name": f"{name} route".strip(),
+                "Topic": {"Value": _topic(name, "markers")},
+            },
+        ]
+    body = f"{namespaces[0]}/base_link".lstrip("/")
+    behind = {"Target Frame": body, "Distance": CHASE_DISTANCE, "Pitch": 0.3, "Yaw": 3.1416}
+    manager = {
+        "Class": "",
+        "Displays": [display | {"Enabled": True, "Value": True} for display in displays],
+        "Global Options": {"Fixed Frame": "map", "Frame Rate": 30},
+        "Tools": [{"Class": "rviz_default_plugins/MoveCamera"}],
+        "Views": {"Current": {"Class": "rviz_default_plugins/Orbit", "Name": "Current View"} | behind},
+    }
+    panels = [{"Class": f"rviz_common/{name}", "Name": name} for name in ("Displays", "Views")]
+    return yaml.safe_dump({"Panels": panels, "Visualization Manager": manager}, sort_keys=False)
+
+
+def urdf() -> str:
+    """The aircraft of `BOXES` as the link `base_link`, forward-left-up, as URDF."""
+    robot = ElementTree.Element("robot", {"name": "aircraft"})
+    link = ElementTree.SubElement(robot, "link", {"name": "base_link"})
+    for name, (size, centre) in BOXES.items():
+        visual = ElementTree.SubElement(link, "visual", {"name": name})
+        ElementTree.SubElement(visual, "origin", {"xyz": _spans(centre)})
+        geometry = ElementTree.SubElement(visual, "geometry")
+        ElementTree.SubElement(geometry, "box", {"size": _spans(size)})
+    ElementTree.indent(robot)
+    return ElementTree.tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _spans(values: Sequence[float]) -> str:
+    """Lengths in spans as m, as an attribute."""
+    return " ".join(f"{SPAN * value:.4g}" for value in values)
