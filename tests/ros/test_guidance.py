@@ -9,11 +9,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pymap3d
 import pytest
 from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Path as PathMessage
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
 from std_srvs.srv import SetBool, Trigger
 from tests.ros.conftest import Start
 from tests.ros.peer import OUTPUTS, Peer, stamp_ns
@@ -27,6 +31,7 @@ from flight_core.modes import Mode as ControllerMode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
 from flight_guidance.modes import Lateral, Vertical
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
@@ -36,19 +41,53 @@ from flight_view.control_client import ControlClient
 pytestmark = pytest.mark.package("flight_guidance")
 
 PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
+ORIGIN = [47.38, 8.54, 400.0]  # deg, m above WGS84
+ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
 LEVEL = {"altitude": 50.0, "v_north": 25.0}
 
 
 def test_lockstep_flight_repeats_bytes_of_one_process(start: Start, tmp_path: Path) -> None:
-    lost_link = {"home": {"link_timeout": 1.0}}
+    lost_link = {"home": {"link_timeout": 1.0}, "origin": ORIGIN}
     scenario = scenario_file(tmp_path, 2.0, "osprey_route", aircraft=ROUGH, guidance=lost_link)
-    recorded = read_run(fly(start, scenario, "runs", status=STATUS_INCOMPLETE)).tape  # the route takes longer
+    run = fly(start, scenario, "runs", status=STATUS_INCOMPLETE)  # the route takes longer
+    recorded = read_run(run).tape
     for name, signal in simulate(load_scenario(scenario)).signals.items():
         assert signal.names == recorded[name].names
         assert signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
     assert recorded["guidance"]["mode.lateral"][-1] == Lateral.ORBIT  # home
     assert len(recorded["u_m"].stamp_ns) == 100  # one at each instant but the first: y takes 10 ms
+    tools_read(run, recorded["guidance"])
+
+
+def tools_read(run: Path, logged: Signal) -> None:
+    """Rosbags reads what tools get as guidance had it: frames of REP 103 by SciPy, the place on WGS84 by pymap3d."""
+    with AnyReader([run]) as reader:
+        messages: dict[str, list[Any]] = {
+            topic: [] for topic in ("/odometry", "/guidance/imu", "/guidance/fix", "/guidance/wind")
+        }
+        for connection, _, data in reader.messages([each for each in reader.connections if each.topic in messages]):
+            messages[connection.topic].append(reader.deserialize(data, connection.msgtype))
+    assert {topic: len(received) for topic, received in messages.items()} == dict.fromkeys(messages, 20)  # 2 s at 10 Hz
+    for odometry, imu, fix, wind in zip(*messages.values(), strict=True):
+        stamp = odometry.header.stamp
+        k = logged.stamp_ns.tolist().index(stamp.sec * NANOSECONDS + stamp.nanosec)
+        assert all(each.header.stamp == stamp for each in (imu, fix, wind))
+        assert (odometry.child_frame_id, imu.header.frame_id, wind.header.frame_id) == ("base_link", "base_link", "map")
+        angles = [logged[f"pose.{name}"][k] for name in ("psi", "theta", "phi")]
+        flu_in_enu = ENU_OF_NED @ Rotation.from_euler("ZYX", angles).as_matrix() @ FLU_OF_FRD
+        orientation = [getattr(imu.orientation, key) for key in "xyzw"]
+        assert Rotation.from_quat(orientation).as_matrix() == pytest.approx(flu_in_enu, abs=1e-12)
+        body = imu.angular_velocity
+        assert (body.x, -body.y, -body.z) == tuple(logged[f"y.{name}"][k] for name in "pqr")
+        assert imu.linear_acceleration_covariance[0] == -1.0  # none: sensor_msgs/Imu
+        assert (wind.vector.y, wind.vector.x) == tuple(logged[f"wind.{name}"][k] for name in ("north", "east"))
+        place = [logged[f"pose.{name}"][k] for name in ("east", "north", "altitude")]
+        velocity = [logged[f"pose.{name}"][k] for name in ("v_east", "v_north", "climb")]
+        linear = odometry.twist.twist.linear
+        assert flu_in_enu @ [linear.x, linear.y, linear.z] == pytest.approx(velocity, abs=1e-9)
+        east, north, _ = pymap3d.geodetic2enu(fix.latitude, fix.longitude, 0.0, *ORIGIN[:2], 0.0)  # on the ellipsoid
+        assert (east, north, fix.altitude - ORIGIN[2]) == pytest.approx(place, abs=1e-6)
 
 
 def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(start: Start, tmp_path: Path) -> None:

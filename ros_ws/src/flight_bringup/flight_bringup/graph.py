@@ -46,7 +46,7 @@ SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
 POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
-GUIDANCE_VIEWS = ("odometry", "path", "markers")
+GUIDANCE_VIEWS = ("odometry", "path", "markers", "guidance/imu", "guidance/fix", "guidance/wind")
 OF_LEARNING = ("proposal", "learned", "learning")  # what a learner proposes and has found, and what became of it
 
 # The bridge also publishes the messages of its channel map.

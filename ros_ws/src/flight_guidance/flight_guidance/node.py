@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Point, PoseStamped, TransformStamped
+from geometry_msgs.msg import Point, PoseStamped, TransformStamped, Vector3Stamped
 from nav_msgs.msg import Odometry, Path
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -29,7 +30,7 @@ from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.modes import Mode
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
-from flight_guidance.route_file import Waypoint
+from flight_guidance.route_file import Origin, Waypoint, geographic
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
 from flight_ros.messages import NO_CHANNELS, Decoder, NamedDecoder, NamedSample, require_size
@@ -38,7 +39,9 @@ from flight_ros.receiver import Receiver
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
+    FIX,
     GUIDANCE,
+    IMU,
     INTERNALS,
     MARKERS,
     NEWEST_SAMPLES,
@@ -49,6 +52,7 @@ from flight_ros.topics import (
     STATE,
     TARGET,
     U_M,
+    WIND,
     Topic,
     Y,
     publisher_qos,
@@ -103,10 +107,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             self._controller_mode = ControllerMode.WAITING
             self._guidance.pause(paused=True, forget=False)
             self._internals = self._receive(INTERNALS, Decoder(["mode"]).decode, self._take_mode)
-        self._odometry, self._path, self._markers = (
-            self.create_publisher(topic.type, topic.name, publisher_qos(period))
-            for topic, period in ((ODOMETRY, ODOMETRY_PERIOD_NS), (PATH, PATH_PERIOD_NS), (MARKERS, PATH_PERIOD_NS))
-        )
+        self._odometry, self._imu, self._fix, self._wind = map(self._view, (ODOMETRY, IMU, FIX, WIND))
+        self._path, self._markers = (self._view(topic, PATH_PERIOD_NS) for topic in (PATH, MARKERS))
         # REP 105: with several aircraft, each body frame has a prefix, and they share the map
         self._body = f"{self.get_namespace()}/{BODY}".lstrip("/")
         self._broadcast = None if TFMessage is None else self.create_publisher(TFMessage, "/tf", TRANSFORMS).publish
@@ -178,6 +180,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if now_ns % ODOMETRY_PERIOD_NS < step:
             odometry = self._odometry_of(now_ns)
             self._odometry.publish(odometry)
+            self._publish_sensors(odometry)
             if self._broadcast is not None:
                 self._broadcast(TFMessage(transforms=[_transform(odometry)]))
             if now_ns % PATH_PERIOD_NS < step:
@@ -260,6 +263,30 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         for key, value in zip("xyz", (y["p"], -y["q"], -y["r"]), strict=True):
             setattr(message.twist.twist.angular, key, value)
         return message
+
+    def _view(self, topic: Topic, period_ns: int = ODOMETRY_PERIOD_NS) -> Any:
+        """The publisher of a topic for tools."""
+        return self.create_publisher(topic.type, topic.name, publisher_qos(period_ns))
+
+    def _publish_sensors(self, odometry: Odometry) -> None:
+        """Attitude and rates, the place on the Earth where an origin is given, the estimated wind by where the air moves to."""
+        place, twist = odometry.pose.pose, odometry.twist.twist
+        imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
+        imu.header.stamp, imu.header.frame_id = odometry.header.stamp, self._body
+        imu.linear_acceleration_covariance[0] = -1.0  # no estimate, as the definition of the message says
+        self._imu.publish(imu)
+        wind = Vector3Stamped(header=odometry.header)
+        if (state := self._guidance.state) is not None:
+            wind.vector.y, wind.vector.x = state.wind
+            self._wind.publish(wind)
+        if self.parameters.origin is None:
+            return
+        latitude, longitude, height = self.parameters.origin
+        there = geographic(place.position.y, place.position.x, Origin(latitude, longitude))
+        fix = NavSatFix(latitude=there.latitude, longitude=there.longitude, altitude=height + place.position.z)
+        fix.header.stamp, fix.header.frame_id = odometry.header.stamp, self._body
+        fix.status.status = NavSatStatus.STATUS_FIX
+        self._fix.publish(fix)
 
     def _publish_path(self, odometry: Odometry) -> None:
         self._flown.append(PoseStamped(header=odometry.header, pose=odometry.pose.pose))

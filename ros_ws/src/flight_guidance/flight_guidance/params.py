@@ -190,6 +190,10 @@ class GuidanceConfig(NodeConfig):
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=10.0, description="how long the attitude is known by dead reckoning when pose is stale, s"
     )
+    origin: Annotated[Numbers, Field(min_length=3, max_length=3)] | None = Field(
+        default=None,
+        description="latitude, longitude, deg, and height above WGS84, m, of north = east = altitude = 0: for `guidance/fix`",
+    )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")
     fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in, or to keep out of, by a name of yours")

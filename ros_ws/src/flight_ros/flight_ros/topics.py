@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from geometry_msgs.msg import Vector3Stamped
 from nav_msgs.msg import Odometry, Path
 from rcl_interfaces.msg import Log
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState, NavSatFix
 from visualization_msgs.msg import MarkerArray
 
 from flight_core.rates import NANOSECONDS
@@ -92,6 +93,7 @@ TARGET = Topic("target", JointState, foreign=True)  # what to hold: channels of 
 ROUTE = Topic("route", Path, foreign=True)  # waypoints in the frame map: east, north, altitude
 GUIDANCE = Topic("guidance", JointState)
 ODOMETRY, PATH, MARKERS = Topic("odometry", Odometry), Topic("path", Path), Topic("markers", MarkerArray)
+IMU, FIX, WIND = Topic("guidance/imu", Imu), Topic("guidance/fix", NavSatFix), Topic("guidance/wind", Vector3Stamped)
 INTERNALS = Topic("internals", JointState)
 TRUTH = Topic("truth", JointState)
 DIAGNOSTICS = Topic("/diagnostics", DiagnosticArray, foreign=True)
