@@ -43,7 +43,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Process, Recording, Tape
 from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
-from flight_log.flight_processes import flight_processes
+from flight_log.flight_processes import Span, flight_processes
 from flight_log.rosbag2_metadata import METADATA, bag_files
 from flight_log.tape_writer import write_run
 from flight_view.flight import Flight
@@ -287,7 +287,7 @@ def test_flight_without_step_of_guidance_is_outcome(tmp_path: Path) -> None:
 
 def test_account_survives_summary(figures: dict[str, Any]) -> None:
     busy = "this host is too busy: 147 of 2001 y were never sent; see docs/faults.md"
-    processes = {"/controller#1": ProcessAccount(-1.5, 0.0, 2.0), "/recorder": ProcessAccount(-2.0, None, None)}
+    processes = {"/controller#1": ProcessAccount(-1.5, 0.0, 2.0, 7), "/recorder": ProcessAccount(-2.0, None, None)}
     commands = Commands(3, 2, 1, 1)
     of = Account(2.0, {}, ("y 1 of 2 samples",), busy, unguided=True, processes=processes, commands=commands)
     assert account_of_json(figures | {"account": json.loads(json.dumps(of.as_json()))}) == of
@@ -340,10 +340,14 @@ def test_process_has_ready_time_of_its_own_start() -> None:
     """A controller that was killed and started again, of two aircraft, beside a recorder without samples."""
     second = NANOSECONDS
     ready = [("/recorder", 1), ("/one/controller", 2), ("/controller", 3 * second), ("/controller", 40 * second)]
-    spans = {"/controller#9": (10 * second, 30 * second), "/controller#4": (41 * second, 60 * second), "base_link": (0, 1)}
+    spans = {
+        "/controller#9": Span(10 * second, 30 * second, 2000),
+        "/controller#4": Span(41 * second, 60 * second, 1900),
+        "base_link": Span(0, 1, 2),
+    }
     assert flight_processes(spans, ready, "") == {
-        "/controller#9": Process(3 * second, 10 * second, 30 * second),
-        "/controller#4": Process(40 * second, 41 * second, 60 * second),
+        "/controller#9": Process(3 * second, 10 * second, 30 * second, 2000),
+        "/controller#4": Process(40 * second, 41 * second, 60 * second, 1900),
         "/recorder": Process(1, None, None),
     }
 

@@ -94,6 +94,13 @@ class TickMetrics(NamedTuple):
     age_p99: float
 
 
+class AgeMetrics(NamedTuple):
+    """Age of u at the aircraft, the delay of the whole loop from the instant of a y to its u, in s."""
+
+    mean: float
+    max: float
+
+
 class LatencyMetrics(NamedTuple):
     """Time from sending y to sending the resulting u, in s."""
 
@@ -480,3 +487,10 @@ def latency_metrics(tape: Tape) -> LatencyMetrics | None:
         return None
     latency = tape["latency"].values[:, 0]
     return LatencyMetrics(float(np.median(latency)), float(np.percentile(latency, 99)), float(latency.max()))
+
+
+def age_metrics(tape: Tape) -> AgeMetrics | None:
+    """Metrics of the signal `age_of_u`; None where the tape has none."""
+    if "age_of_u" not in tape or len(tape["age_of_u"].stamp_ns) == 0:
+        return None
+    return AgeMetrics(float(tape["age_of_u"]["mean"].mean()), float(tape["age_of_u"]["max"].max()))

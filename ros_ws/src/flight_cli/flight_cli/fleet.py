@@ -102,4 +102,15 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
         if sentence := (summary["account"] or {}).get("busy"):
             lines.append(f"  {sentence}")
     Console().print(table)
-    print(*lines, sep="\n")
+    print(*lines, *_foreign({name: result.summary for name, result in results.items()}), sep="\n")
+
+
+def _foreign(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """How many samples on the topics of each aircraft are of nodes of another one; empty without an account of processes."""
+    sentences, total = [], 0
+    for name, summary in summaries.items():
+        processes = (summary["account"] or {}).get("processes", {})
+        total += sum(process["samples"] for process in processes.values())
+        foreign = sum(process["samples"] for node, process in processes.items() if node.split("/")[1] in {*summaries} - {name})
+        sentences += [f"{name}: {foreign} samples of another aircraft"] if foreign else []
+    return sentences or ([f"samples of another aircraft: 0 of {total}"] if total else [])

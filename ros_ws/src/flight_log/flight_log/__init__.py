@@ -18,5 +18,6 @@
 | `named_vectors` | decodes messages as named vectors |
 | `tape_reader`, `tape_writer` | convert between a bag and a `Tape` |
 | `playback` | schedules the messages of a bag for sending |
+| `age_of_u` | reads the age of u at the aircraft |
 | `latency` | computes the time from y to u |
 """

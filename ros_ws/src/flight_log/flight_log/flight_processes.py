@@ -4,7 +4,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosbags.serde.errors import SerdeError
 
@@ -15,6 +15,18 @@ from flight_log.named_vectors import typestore
 ROSOUT, LOG = "/rosout", "rcl_interfaces/msg/Log"
 READY = b"\x06\x00\x00\x00ready\x00"  # the text of the line in CDR: its length with the final zero, and its bytes
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
+
+
+class Span(NamedTuple):
+    """First and last stamp of the samples of a publisher, ns, and their number."""
+
+    first_ns: int
+    last_ns: int
+    samples: int
+
+    def joined(self, other: "Span") -> "Span":
+        """The span of both."""
+        return Span(min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns), self.samples + other.samples)
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
@@ -30,10 +42,8 @@ def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
     return sorted(times, key=lambda time: time[1])
 
 
-def flight_processes(
-    spans: Mapping[str, tuple[int, int]], ready: Iterable[tuple[str, int]], namespace: str
-) -> dict[str, Process]:
-    """The processes by name, "/controller#4711". `spans`: first and last stamp of the samples by publisher, ns.
+def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]], namespace: str) -> dict[str, Process]:
+    """The processes by name, "/controller#4711", by the `spans` of the publishers.
 
     A node that was restarted is several processes. A process was ready at the last such time of its node before its first
     sample. A node without samples, as the recorder, has no process id.
@@ -43,9 +53,9 @@ def flight_processes(
         if node.rpartition("/")[0] == namespace:
             waiting.setdefault(node, []).append(time_ns)
     processes = {}
-    for name, (first_ns, last_ns) in sorted(spans.items(), key=lambda span: span[1]):
+    for name, (first_ns, last_ns, samples) in sorted(spans.items(), key=lambda span: span[1]):
         if (instance := INSTANCE.fullmatch(name)) is not None:
             before = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns <= first_ns + NANOSECONDS]
-            processes[name] = Process(before[-1] if before else None, first_ns, last_ns)
+            processes[name] = Process(before[-1] if before else None, first_ns, last_ns, samples)
             waiting[instance[1]] = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before]
     return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}

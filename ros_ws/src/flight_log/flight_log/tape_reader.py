@@ -23,13 +23,15 @@ from flight_core.rates import NANOSECONDS, seconds
 from flight_core.scenario import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
+from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
 from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
-from flight_log.flight_processes import LOG, READY, ROSOUT, flight_processes, ready_times
+from flight_log.flight_processes import LOG, READY, ROSOUT, Span, flight_processes, ready_times
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
+from flight_log.learning import DIAGNOSTIC_ARRAY
 from flight_log.named_vectors import (
     JOINT_STATE,
     PATH,
@@ -69,9 +71,10 @@ class StoredFile(NamedTuple):
 class RecordedRun(NamedTuple):
     """The content of a log. `metadata` holds the named sets of strings, `attachments` the files except the scenario.
 
-    `latency` is the latency of the loop from y to u, `engagements` are the engagements of a bridge; None for a log without
-    samples of the kind, or without times of sending. The content is of the aircraft in `namespace`, "" for the root. `path` is
-    where the log was read, `topics` are the types of all topics of the log by full name.
+    `latency` is that of the loop from y to u, `age_of_u` the age of u at the aircraft, `engagements` are the engagements of a
+    bridge; None for a log without samples of the kind, or without times of sending. The content is of the aircraft in
+    `namespace`, "" for the root. `path` is where the log was read, `topics` are the types of all topics of the log by full
+    name.
     """
 
     tape: Tape
@@ -83,6 +86,7 @@ class RecordedRun(NamedTuple):
     namespace: str = ""
     path: Path | None = None
     topics: Mapping[str, str] = {}
+    age_of_u: Signal | None = None
 
     def require(self, *names: str) -> None:
         """Raise ParameterError with the topics of the log where a topic of a flight has no sample, or every topic."""
@@ -149,17 +153,16 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    stored = given or log.scenario
-    return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds)
+    stored, ages = given or log.scenario, age_of_u(log.diagnostics, aircraft)
+    return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
 
 
-def _spans(topics: Iterable["_TopicSamples"]) -> dict[str, tuple[int, int]]:
-    """First and last stamp of each publisher over its topics."""
-    spans: dict[str, tuple[int, int]] = {}
+def _spans(topics: Iterable["_TopicSamples"]) -> dict[str, Span]:
+    """The span of each publisher over its topics."""
+    spans: dict[str, Span] = {}
     for topic in topics:
-        for sender, (first, last) in topic.spans.items():
-            before, after = spans.get(sender, (first, last))
-            spans[sender] = min(first, before), max(last, after)
+        for sender, span in topic.spans.items():
+            spans[sender] = span.joined(spans[sender]) if sender in spans else span
     return spans
 
 
@@ -209,7 +212,7 @@ class _TopicSamples:
         self._numbered, self._lost = False, 0
         self._unset = 0  # samples with a zero stamp, left out at the end
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
-        self.spans: dict[str, tuple[int, int]] = {}  # by publisher: its first and its last stamp
+        self.spans: dict[str, Span] = {}  # by publisher
         self._refused = 0
 
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
@@ -239,9 +242,8 @@ class _TopicSamples:
         for received, stamp_ns, unordered, sender in decoded.samples:
             if unordered.shape[1] == len(received):
                 names, values = self._ordered(received, unordered)
-                first, last = int(stamp_ns.min()), int(stamp_ns.max())
-                before, after = self.spans.get(sender, (first, last))
-                self.spans[sender] = min(first, before), max(last, after)
+                span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
+                self.spans[sender] = span.joined(self.spans[sender]) if sender in self.spans else span
                 if names not in self._samples:
                     expected = 0 if self._samples else self._expected  # other names are few, or those of a hostile log
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
@@ -318,6 +320,7 @@ class _Log:
         self.known_end_ns = 0  # the latest log time in any index or metadata
         self.sent: dict[str, list[Times]] = {}  # of y and u by full topic name
         self.lines: list[bytes] = []  # of /rosout: that a node is ready
+        self.diagnostics: list[bytes] = []  # of /diagnostics: those with an age of u
         self.reports: dict[str, list[tuple[int, bytes]]] = {}  # of bridges by full topic name: time of sending, ns, and message
         self.times: Times | None = None  # of the last y or u of a chunk
         self.kinds: dict[str, str] = {}  # types of all topics, by full name
@@ -340,6 +343,8 @@ class _Log:
             return lambda batch: samples.add(batch.data, batch.log_ns, batch.sequence)
         if topic == ROSOUT and type_name == LOG:
             return lambda batch: self.lines.extend(line for line in map(bytes, batch.data) if READY in line)
+        if topic == DIAGNOSTICS and type_name == DIAGNOSTIC_ARRAY:
+            return lambda batch: self.diagnostics.extend(data for data in map(bytes, batch.data) if IN_MESSAGE in data)
         if topic.endswith(ENGAGEMENT) and type_name == KEY_VALUE:
             reports = self.reports.setdefault(topic, [])
             return lambda batch: reports.extend(

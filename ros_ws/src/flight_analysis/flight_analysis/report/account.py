@@ -65,6 +65,7 @@ class ProcessAccount(NamedTuple):
     ready: float | None  # its event loop began
     first: float | None  # stamps of its first and last output
     last: float | None
+    samples: int = 0  # on the topics of the aircraft
 
 
 class Commands(NamedTuple):
@@ -237,8 +238,8 @@ def _processes(tape: Tape) -> dict[str, ProcessAccount]:
 
     since_epoch = tape.start_ns > SINCE_EPOCH_NS
     return {
-        name: ProcessAccount(flight_time(ready_ns) if since_epoch else None, flight_time(first_ns), flight_time(last_ns))
-        for name, (ready_ns, first_ns, last_ns) in tape.processes.items()
+        name: ProcessAccount(flight_time(ready_ns) if since_epoch else None, flight_time(first), flight_time(last), samples)
+        for name, (ready_ns, first, last, samples) in tape.processes.items()
     }
 
 

@@ -98,8 +98,9 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
         summary = summarise_imported(recorded.tape, source)
         return RecordedFlight(name, None, recorded.tape, summary, recorded.metadata.get(CHANNEL_UNITS, {}))
     scenario = _scenario_in(recorded, run)
-    signals = recorded.tape.signals if recorded.latency is None else {**recorded.tape.signals, "latency": recorded.latency}
-    log = replace(recorded.tape, signals=signals)
+    timed = {"latency": recorded.latency, "age_of_u": recorded.age_of_u}
+    signals = {name: signal for name, signal in timed.items() if signal is not None}
+    log = replace(recorded.tape, signals={**recorded.tape.signals, **signals})
     engagements = recorded.engagements
     outcome = outcome or _previous_outcome(folder, recorded.tape, scenario, simulated=engagements is None)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:

@@ -14,8 +14,10 @@ from flight_analysis.metrics import (
     GUIDED_LEGEND,
     PARTS_LEGEND,
     TRUE_ERROR,
+    AgeMetrics,
     TickMetrics,
     Transient,
+    age_metrics,
     best_error,
     engagements,
     errors_by_part,
@@ -33,11 +35,12 @@ from flight_analysis.metrics import (
 from flight_analysis.report.account import Account, Commands, account, account_of_json, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.outcome import IMPORT
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
 from flight_core.units import si_per_unit
 from flight_log.clock import SINCE_EPOCH_NS
+from rise_di_controller.linear_loop import delay_margin
 
 NO_VALUE = "-"
 OLD_ORDER = "summarise(scenario, tape, outcome): the order is summarise(tape, scenario, outcome), and summarise(tape) is enough"
@@ -152,9 +155,10 @@ def summarise(
     of, events = account(tape, scenario, outcome) if of is None else of, transients(scenario, tape)
     of = of._replace(commands=_commands(tape, events, of.end))
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
-    latency = latency_metrics(tape)
+    latency, age = latency_metrics(tape), age_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS:  # in real time
         of = _with_late_ticks(of, ticks, scenario)
+    notes = [of.busy] if of.busy else []
     summary = empty_summary(scenario, final_outcome(outcome, of)) | {
         "duration": _duration(tape, of),
         "error": best_error(tape)[0],
@@ -166,9 +170,10 @@ def summarise(
         ],
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
+        "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
         "guidance": guidance_summary(tape),
         "account": of.as_json(),
-        "notes": [*([of.busy] if of.busy else []), *tape.notes, *guidance_notices(tape, scenario.guidance)],
+        "notes": [*notes, *late_u(scenario, age), *tape.notes, *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
 
@@ -186,6 +191,27 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
     summary = empty_summary(None, IMPORT) | deviations | {"duration": of.end, "account": of.as_json()}
     summary |= {"source": dict(source), "notes": [*of.notes(), *tape.notes]}
     return {key: finite_or_null(value) for key, value in summary.items()}
+
+
+def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
+    """The sentence on a u that is older at the aircraft than the gains allow for; empty for one that is not.
+
+    The linear loop has the delay of the controller's parameters; each period beyond takes from the delay margin, which is
+    computed where u is more than a period older.
+    """
+    controller = scenario.controller
+    if age is None or age.mean - controller.delay < 1.0 / controller.rate:
+        return []
+    from flight_analysis.closed_loop.margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
+
+    try:
+        of = scenario_loop(scenario, controller)
+    except ParameterError:  # no linear model
+        return []
+    margin = delay_margin(of.nominal, of.law, of.loop)
+    late, beyond = f"u is {1e3 * age.mean:.1f} ms old at the aircraft", age.mean - controller.delay - margin
+    made = f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of {1e3 * margin:.1f} ms"
+    return [f"{late}, {made}: {'more than' if beyond > 0.0 else 'within'} the margin; see rise-di gains --delay"]
 
 
 def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
@@ -267,6 +293,7 @@ def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
         "transients": [],
         "ticks": None,
         "latency": None,
+        "age_of_u": None,
         "guidance": None,
         "account": None,
         "notes": [],

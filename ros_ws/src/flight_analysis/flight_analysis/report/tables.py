@@ -176,12 +176,17 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
         ]
         if latency is not None:
             rows.append(("y sent to u sent median / p99 / max (ms)", ms(*latency.values())))
+        if (age := summary.get("age_of_u")) is not None:  # none in a summary of an earlier version
+            rows.append(("age of u at the aircraft mean / max (ms)", ms(*age.values())))
     return Table(f"Ticks of the controller{taken_over(summary, 'ticks')}", [Column("", "")], rows)
 
 
 def _process_table(summary: Mapping[str, Any]) -> Table:
     of = account_of_json(summary)
     processes = {} if of is None else of.processes
-    columns = [Column("", "ready (s)"), Column("output", "first (s)"), Column("output", "last (s)")]
-    rows = [[name, *("" if time is None else f"{time:.3f}" for time in process)] for name, process in processes.items()]
+    columns = [Column("", "ready (s)"), *(Column("output", head) for head in ("first (s)", "last (s)", "samples"))]
+    rows = [
+        [name, *("" if time is None else f"{time:.3f}" for time in times), f"{samples}"]
+        for name, (*times, samples) in processes.items()
+    ]
     return Table("Processes", columns, rows)

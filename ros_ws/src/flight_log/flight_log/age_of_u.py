@@ -1,0 +1,36 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The age of u at the aircraft, from its diagnostics: the delay of the whole loop, from the instant of a y to its u."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from rosbags.serde.errors import SerdeError
+
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal
+from flight_log.learning import DIAGNOSTIC_ARRAY
+from flight_log.named_vectors import typestore
+
+DIAGNOSTICS = "/diagnostics"
+MEAN, MAX = "age of u mean (s)", "age of u max (s)"
+IN_MESSAGE = MEAN.encode()  # of a message with an age of u
+CHANNELS = ("mean", "max")
+
+
+def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
+    """Mean and largest age of the u that arrived between two reports of the aircraft of a namespace, s; None without any."""
+    rows: dict[int, tuple[float, float]] = {}
+    for data in messages:
+        try:
+            report: Any = typestore().deserialize_cdr(data, DIAGNOSTIC_ARRAY)
+            for status in report.status:
+                values = {value.key: value.value for value in status.values}
+                if status.name == f"{namespace}/aircraft" and MEAN in values:
+                    stamp = report.header.stamp
+                    rows[stamp.sec * NANOSECONDS + stamp.nanosec] = float(values[MEAN]), float(values[MAX])
+        except (SerdeError, LookupError, ValueError):
+            continue
+    stamps = sorted(rows)
+    return Signal(np.array(stamps), CHANNELS, np.array([rows[stamp] for stamp in stamps])) if rows else None
