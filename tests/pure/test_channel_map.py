@@ -55,6 +55,7 @@ RATES = {
     "ardupilot_2024": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
     "ardupilot_mavlink": Message(rollspeed=0.3, pitchspeed=0.2, yawspeed=0.1),
     "mavros": Message(angular_velocity=FLU),
+    "odometry": Message(angular_velocity=FLU),
     "px4": Message(angular_velocity=FRD),
     "rosflight": Message(p=0.3, q=0.2, r=0.1, va=27.0),
 }
@@ -63,6 +64,7 @@ AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
     "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
     "ardupilot_mavlink": Message(airspeed=27.0),
     "mavros": Message(airspeed=27.0),
+    "odometry": Message(twist=Message(twist=Message(linear=Message(x=-18.0, y=18.0, z=-9.0)))),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
     "rosflight": RATES["rosflight"],
 }
@@ -71,10 +73,11 @@ SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to
     "px4": {"torque.xyz[1]": 0.1 / 0.523599, "thrust.xyz[0]": 0.6, "torque.xyz[0]": 0.1 / 0.523599, "torque.xyz[2]": 0.190986},
     "ardupilot_mavlink": {"chan2_raw": 1595.493, "chan3_raw": 1600.0, "chan1_raw": 1595.493, "chan4_raw": 1595.493},
     "mavros": {"channels[1]": 1595.493, "channels[2]": 1600.0, "channels[0]": 1595.493, "channels[3]": 1595.493},
+    "odometry": {"elevator.data": 0.1, "thrust.data": 12.0, "aileron.data": 0.1, "rudder.data": 0.1},  # 12 of 20 N
     "rosflight": {"u[4]": -0.1 / 0.523599, "u[0]": 0.6, "u[3]": 0.1 / 0.523599, "u[5]": -0.1 / 0.523599},
 }
 SENT["ardupilot_2024"] = SENT["ardupilot"]
-RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "px4": None} | dict.fromkeys(
+RELEASED = {"ardupilot": math.nan, "ardupilot_2024": math.nan, "odometry": None, "px4": None} | dict.fromkeys(
     ("ardupilot_mavlink", "mavros", "rosflight"), 0.0
 )
 
@@ -240,10 +243,10 @@ TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
-@pytest.mark.parametrize("name", ["ardupilot", "mavros", "px4"])
+@pytest.mark.parametrize("name", ["ardupilot", "mavros", "odometry", "px4"])
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
 def test_attitude_of_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
-    """Checked by SciPy's rotations. ArduPilot and MAVROS publish body FLU in ENU (REP 103), PX4 body FRD in NED."""
+    """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP 103)."""
     frd_in_ned, channel_map = Rotation.from_euler("ZYX", [psi, theta, phi]), shipped(name)
     x, y, z, w = (frd_in_ned if name == "px4" else TURN_NED_ENU * frd_in_ned * TURN_FLU_FRD).as_quat().tolist()
     quaternion = [w, x, y, z] if name == "px4" else Message(w=w, x=x, y=y, z=z)
@@ -280,6 +283,22 @@ def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
         assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == expected[channel]
 
 
+@given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
+def test_velocity_in_body_axes_of_odometry_is_turned_to_the_world(phi: float, theta: float, psi: float) -> None:
+    """Odometry has its twist in the body frame, FLU (nav_msgs, REP 103). SciPy turns 4 m/s north, 3 east, 2 up into it."""
+    flu_in_enu = TURN_NED_ENU * Rotation.from_euler("ZYX", [psi, theta, phi]) * TURN_FLU_FRD
+    x, y, z, w = (2.0 * flu_in_enu.as_quat()).tolist()  # a quaternion of any length
+    forward, left, up = flu_in_enu.inv().apply([3.0, 4.0, 2.0]).tolist()
+    odometry = Message(
+        pose=Message(pose=Message(orientation=Message(w=w, x=x, y=y, z=z))),
+        twist=Message(twist=Message(linear=Message(x=forward, y=left, z=up))),
+    )
+    for channel, expected in (("v_north", 4.0), ("v_east", 3.0), ("climb", 2.0)):
+        row = shipped("odometry").pose[channel]
+        raw = read_raw(odometry, row.field, row.function, row.turned_by)
+        assert to_channel(raw, row.line) == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("name", ["mavros", "rosflight"])
 def test_reliably_offered_override_is_not_lost(name: str) -> None:
     """Publishers of rc_io.cpp:47 and rosflight_io.cpp:534, with ROS 2's default reliability."""
@@ -292,6 +311,8 @@ def test_a_quaternion_without_an_attitude_is_refused(quaternion: list[float]) ->
     for function in ("roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"):
         with pytest.raises(ChannelError, match="cannot convert q"):
             read_raw(Message(q=quaternion), "q", function)
+    with pytest.raises(ChannelError, match=r"q cannot convert v\.x"):
+        read_raw(Message(q=quaternion, v=Message(x=1.0, y=0.0, z=0.0)), "v.x", "value", "q")
 
 
 @given(LINES, st.floats(-1e4, 1e4))
@@ -378,6 +399,7 @@ REFUSALS: tuple[tuple[tuple[str, ...], object, str], ...] = (
     (("envelope",), {"beta": [-0.1, 0.1]}, r"map test\.envelope\.beta: found a channel, expected one of .* phi, .*, r"),
     (("envelope",), {"phi": [0.1, -0.1]}, r"map test\.envelope\.phi: found \[0\.1, -0\.1\]"),
     (("outputs", "phi"), ROW | {"positive": "roll right"}, r"map test\.outputs\.phi: found a channel of the pose too"),
+    (("pose", "phi", "turned_by"), "q", r"map test\.pose\.phi\.turned_by: found pose.orientation \(roll_of_quaternion\)"),
     (("instant",), "x", r"map test\.instant: found 'x', expected one of the outputs q, V, p, r"),
 )
 

@@ -6,19 +6,26 @@ It simulates the aircraft section of the scenario at its rate and publishes y as
 five). It subscribes to Joy as AP_DDS does: axes are scaled to full deflection, NaN releases a channel at once, and all channels
 are released after RELEASE_AFTER seconds without Joy. A released channel is at trim. It imports nothing from the bridge. It
 prints "y STAMP q V p r" without noise, and "timeout" when the channels are released without Joy.
+
+With a third word `odometry` it is a simulator for the map of that name: Imu and Odometry in the frames of REP 103, and the last
+Float64 of each effector.
 """
 
 import math
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Joy
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Imu, Joy
+from std_msgs.msg import Float64
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -27,6 +34,8 @@ from flight_ros import transport
 QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 SPEED = 25.0  # m/s, trim
 FULL = math.radians(30.0)  # of the surfaces
+FULL_THRUST = 20.0  # N
+ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
 
 
 class Autopilot:
@@ -84,7 +93,42 @@ class Autopilot:
         self._airspeed.publish(airspeed)
 
 
+class Odometer(Autopilot):
+    """A simulator that publishes Imu and Odometry and takes commands of joints and of the thrust."""
+
+    def __init__(self, scenario: Path, release_after: float) -> None:
+        super().__init__(scenario, release_after)
+        self._imu = self.node.create_publisher(Imu, "sim/imu", 10)
+        self._odometry = self.node.create_publisher(Odometry, "sim/odom", 10)
+        self._held = {"elevator": 0.0, "thrust": FULL_THRUST / 2.0, "aileron": 0.0, "rudder": 0.0}
+        for name in self._held:
+            self.node.create_subscription(Float64, f"sim/{name}", partial(self._hold, name), 10)
+
+    def _hold(self, name: str, message: Float64) -> None:
+        self._held[name] = message.data
+
+    def _u(self) -> list[float]:
+        elevator, thrust, aileron, rudder = self._held.values()
+        return [elevator, thrust / FULL_THRUST - 0.5, aileron, rudder]
+
+    def _publish(self, q: float, V: float, p: float, r: float) -> None:
+        imu, odometry = Imu(), Odometry()
+        for message in (imu, odometry):
+            message.header.stamp.sec = 12  # simulated time
+        imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = p, -q, -r
+        phi, theta, psi, north, east, altitude, v_north, v_east, climb, _ = self._simulator.pose().tolist()
+        attitude = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
+        turn = Rotation.from_matrix(ENU_OF_NED @ attitude @ FLU_OF_FRD)
+        place, velocity = odometry.pose.pose, odometry.twist.twist.linear
+        place.position.x, place.position.y, place.position.z = east, north, altitude
+        place.orientation.x, place.orientation.y, place.orientation.z, place.orientation.w = turn.as_quat().tolist()
+        velocity.x, velocity.y, velocity.z = turn.inv().apply([v_east, v_north, climb]).tolist()
+        self._imu.publish(imu)
+        self._odometry.publish(odometry)
+
+
 if __name__ == "__main__":
     transport.prepare()
     rclpy.init()
-    Autopilot(Path(sys.argv[1]), float(sys.argv[2])).fly()
+    kind = Odometer if "odometry" in sys.argv[3:] else Autopilot
+    kind(Path(sys.argv[1]), float(sys.argv[2])).fly()

@@ -22,8 +22,10 @@ import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Twist, TwistStamped, Vector3, Vector3Stamped
+from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import FluidPressure, Imu, Joy
 from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool
@@ -646,6 +648,35 @@ def test_dry_run_publishes_what_it_would_send_and_sends_nothing(setup: BridgeSet
     assert setup.engage().startswith("dry_run is true: nothing is sent; u.elevator is 0.1 from trim")
     setup.peer.spin(0.3)
     assert not setup.joys
+
+
+def test_imu_and_odometry_of_simulator_become_y_and_pose_in_namespace(start: Start) -> None:
+    """The messages are of a publisher in the frames of REP 103; SciPy gives orientation and velocity in the body axes."""
+    start("autopilot_bridge.main", "--ros-args", "-r", "__ns:=/uav1", "-p", f"map:={MAP_FILES['odometry']}")
+    phi, theta, psi = 0.3, -0.2, 2.0
+    enu_of_ned, flu_of_frd = [[0, 1, 0], [1, 0, 0], [0, 0, -1]], np.diag([1, -1, -1])
+    turn = Rotation.from_matrix(enu_of_ned @ Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix() @ flu_of_frd)
+    imu, odometry = Imu(angular_velocity=RATES), Odometry(child_frame_id="plane/base_link")
+    for message, values in (
+        (odometry.pose.pose.position, (30.0, 40.0, 20.0)),
+        (odometry.pose.pose.orientation, turn.as_quat().tolist()),
+        (odometry.twist.twist.linear, turn.inv().apply([3.0, 4.0, 2.0]).tolist()),
+    ):
+        for key, value in zip("xyzw", values, strict=False):
+            setattr(message, key, value)
+    with peer(topics=("uav1/y", "uav1/pose")) as simulator:
+        to_imu = simulator.node.create_publisher(Imu, "uav1/sim/imu", 10)
+        to_odometry = simulator.node.create_publisher(Odometry, "uav1/sim/odom", 10)
+
+        def publish() -> None:
+            to_imu.publish(imu)
+            to_odometry.publish(odometry)
+
+        simulator.until(lambda: all(simulator.received.values()), each=publish)
+        y, pose = (dict(zip(m[-1].name, m[-1].position, strict=True)) for m in simulator.received.values())
+    assert y == pytest.approx({"q": 0.2, "V": 0.0, "p": 0.3, "r": 0.1})  # V is captured at an engagement
+    expected = {"phi": phi, "theta": theta, "psi": psi, "north": 40.0, "east": 30.0, "altitude": 20.0}
+    assert pose == pytest.approx(expected | {"v_north": 4.0, "v_east": 3.0, "climb": 2.0}, abs=1e-6)
 
 
 def test_topic_of_another_version_is_error_that_names_both_types(start: Start) -> None:

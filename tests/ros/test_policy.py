@@ -147,9 +147,9 @@ def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer
     used = [row for channel_map in maps for row in channel_map.used_topics()]
     sent, received = ([row for row in used if row[0].startswith("messages.") is is_sent] for is_sent in (True, False))
     # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
-    published = {topic for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")}
+    published = {in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")}
     published |= {in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")}
-    subscribed = {topic for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
+    subscribed = {in_full(topic, "bridge") for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
     policy = allowed()["bridge"]
     start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}").wait_for("dry run")
     own = discovered(peer_node, ("bridge",))["bridge"]

@@ -136,13 +136,27 @@ angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in NED: th
 """
 
 
-def read_raw(message: Any, path: str, function: str) -> float:
+def _turned(message: Any, path: str, by: str) -> float:
+    """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the world.
+
+    `by`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q = (w, r).
+    """
+    vector, _, axis = path.rpartition(".")
+    v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
+    w, *r = _quaternion(get_field(message, by))
+    across = np.cross(r, v)
+    turned = v + 2.0 * (w * across + np.cross(r, across)) / (w * w + np.dot(r, r))
+    return float(turned["xyz".index(axis)])
+
+
+def read_raw(message: Any, path: str, function: str, turned_by: str | None = None) -> float:
     """Raw value of a row. Raises ChannelError: reason "field" where the field is missing, "finite" where it is not finite."""
     value = get_field(message, path)
     try:
-        raw = DERIVED[function](value)
+        raw = DERIVED[function](value) if turned_by is None else _turned(message, path, turned_by)
     except (AttributeError, TypeError, ValueError):
-        raise ChannelError("field", f"function {function} cannot convert {path} of {type(message).__name__}") from None
+        what = f"function {function}" if turned_by is None else turned_by
+        raise ChannelError("field", f"{what} cannot convert {path} of {type(message).__name__}") from None
     if not math.isfinite(raw):
         raise ChannelError("finite", f"{path} = {raw} is not finite")
     return raw

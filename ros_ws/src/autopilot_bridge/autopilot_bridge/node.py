@@ -219,7 +219,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 if row.stamp == "header":
                     stamp = get_field(message, "header.stamp")
                     stamp_ns = stamp.sec * NANOSECONDS + stamp.nanosec
-                self._bridge.take_output(name, read_raw(message, row.field, row.function), stamp_ns - step_ns, now_ns)
+                raw_value = read_raw(message, row.field, row.function, row.turned_by)
+                self._bridge.take_output(name, raw_value, stamp_ns - step_ns, now_ns)
             except ChannelError as error:
                 self.refusals.add(subscription, error.reason, str(error))
 
@@ -450,6 +451,8 @@ def _require_field(empty: Any, name: str, row: MeasuredRow | WatchedRow) -> None
         return
     try:
         get_field(empty, row.field)
+        if isinstance(row, MeasuredRow) and row.turned_by is not None:
+            get_field(empty, row.turned_by)
         if isinstance(row, MeasuredRow) and row.stamp == "header":
             get_field(empty, "header.stamp")
     except ChannelError as error:

@@ -93,8 +93,19 @@ class MeasuredRow(Row):
         default="value",
         description="conversion of the field to the raw value: none, vector length, airspeed of a pressure, an Euler angle",
     )
+    turned_by: str | None = Field(
+        default=None,
+        description="the path of the quaternion that turns a vector in body axes to the world; `field` is a component of it",
+    )
     stamp: Literal["header", "arrival"] = Field(description="stamp of the sample: that of the message header, or its arrival")
     max_age: Positive = Field(description="the age above which the channel is stale, s")
+
+    def _check(self) -> None:
+        if self.turned_by is not None:
+            component = self.field.endswith((".x", ".y", ".z")) and self.function == "value"
+            require(component, "turned_by", f"{self.field} ({self.function})", "a component x, y or z of a vector (value)")
+            is_path = PATH.fullmatch(self.turned_by) is not None
+            require(is_path, "turned_by", repr(self.turned_by), "the path of a quaternion, such as pose.pose.orientation")
 
 
 class PoseRow(MeasuredRow):
