@@ -95,7 +95,7 @@ class TickMetrics(NamedTuple):
 
 
 class AgeMetrics(NamedTuple):
-    """Age of u at the aircraft, the delay of the whole loop from the instant of a y to its u, in s."""
+    """Age of u at the aircraft, the delay of the whole loop from the instant of y to u, in s."""
 
     mean: float
     max: float

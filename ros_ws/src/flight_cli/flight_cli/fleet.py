@@ -106,7 +106,7 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
 
 
 def _foreign(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """How many samples on the topics of each aircraft are of nodes of another one; empty without an account of processes."""
+    """The samples on the topics of an aircraft from nodes of further aircraft; empty without an account of processes."""
     sentences, total = [], 0
     for name, summary in summaries.items():
         processes = (summary["account"] or {}).get("processes", {})

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The age of u at the aircraft, from its diagnostics: the delay of the whole loop, from the instant of a y to its u."""
+"""The age of u at the aircraft, from the diagnostics: the delay of the whole loop, from the instant of y to u."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -20,7 +20,7 @@ CHANNELS = ("mean", "max")
 
 
 def age_of_u(messages: Iterable[bytes], namespace: str) -> Signal | None:
-    """Mean and largest age of the u that arrived between two reports of the aircraft of a namespace, s; None without any."""
+    """Mean and largest age of u between two reports of the aircraft of a namespace, s; None without any."""
     rows: dict[int, tuple[float, float]] = {}
     for data in messages:
         try:

@@ -25,7 +25,7 @@ class Span(NamedTuple):
     samples: int
 
     def joined(self, other: "Span") -> "Span":
-        """The span of both."""
+        """The joint span."""
         return Span(min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns), self.samples + other.samples)
 
 

@@ -194,10 +194,10 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
 
 def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
-    """The sentence on a u that is older at the aircraft than the gains allow for; empty for one that is not.
+    """The sentence on u older at the aircraft than planned, beside the delay margin of the gains; empty for u as planned.
 
-    The linear loop has the delay of the controller's parameters; each period beyond takes from the delay margin, which is
-    computed where u is more than a period older.
+    The linear loop has the delay of the controller's parameters; further delay takes from the delay margin, computed
+    where u is more than a period older.
     """
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
