@@ -112,8 +112,8 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
 def foxglove(aircraft: Mapping[str, Channels]) -> str:
     """A layout of Foxglove and Lichtblick: JSON, a Tab panel with Plot panels. `aircraft`: channels by namespace, "" the root.
 
-    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep. Several
-    aircraft have a tab by namespace, beside a common map.
+    Paths are "/topic.position[index]". The time axis is log time: stamps are flight time, far from log time in lockstep. With
+    several aircraft each namespace has a tab, beside a common map.
     """
     panels: dict[str, Any] = {}
     tabs: list[dict[str, Any]] = []
