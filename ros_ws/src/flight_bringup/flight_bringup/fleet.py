@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A fleet: several aircraft at once over topics, each in its namespace with its own nodes, log and report."""
+"""A fleet: several aircraft at once over topics, with a namespace, nodes, a log and a report for every aircraft."""
 
 import signal
 import threading
@@ -46,7 +46,7 @@ class AircraftOfFleet(Config):
 
 
 class FleetConfig(Config):
-    """A fleet as its file has it. Paths are relative to the folder of the file."""
+    """A fleet as in the file. Paths are relative to the folder of the file."""
 
     scenario: str = Field(default="osprey_route", description="scenario of the aircraft that name none")
     duration: Positive | None = Field(default=None, description="flight time of each aircraft, s; by default its scenario's")
@@ -61,7 +61,7 @@ class FleetConfig(Config):
 
 @dataclass(frozen=True)
 class Member:
-    """An aircraft of a fleet: its name and namespace, its scenario, and its t = 0 after that of the fleet, s."""
+    """An aircraft of a fleet: name and namespace, scenario, and t = 0 after t = 0 of the fleet, s."""
 
     name: str
     scenario: Scenario
@@ -78,7 +78,7 @@ class Fleet:
     composed: bool = False
 
     def participants(self) -> int:
-        """The DDS participants of its flight: one of the command, and one a process."""
+        """The DDS participants of a flight: the command, and the processes."""
         scenarios = [member.scenario for member in self.members]
         if self.composed:
             return 1 + sum(1 + scenario.learns() for scenario in scenarios)  # a learner has a process of its own
@@ -86,7 +86,7 @@ class Fleet:
 
 
 def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
-    """Read the file of a fleet; `duration` in s replaces that of the file. Raises ParameterError."""
+    """Read the file of a fleet; `duration` in s replaces the duration of the file. Raises ParameterError."""
     path = as_path(file, "fleet", A_FLEET)
     content = read_yaml(path, str(path), A_FLEET)
     require(isinstance(content, Mapping), str(path), "no mapping", A_FLEET)
@@ -186,7 +186,7 @@ class _Flight:
             self.steps = follow(self.member.scenario, self.processes, self.monitor, self.progress, lockstep=fleet.lockstep)
 
     def step(self) -> bool:
-        """Look at the flight once. Returns whether it goes on."""
+        """Look at the flight once. Returns whether the flight goes on."""
         if self.steps is not None:
             try:
                 next(self.steps)
@@ -195,7 +195,7 @@ class _Flight:
         return self.steps is not None
 
     def end(self, outcome: str) -> None:
-        """Stop the processes, in another thread: a recorder takes a while to close its log, and the others fly on."""
+        """Stop the processes, in another thread: a recorder takes a while to close a log, and the fleet flies on."""
         self.outcome, self.steps = outcome, None
         self.progress(self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome)
         if self.processes is not None and self.stopping is None:
@@ -226,9 +226,9 @@ def new_runs(fleet: Fleet, runs: Path) -> list[Path]:
 def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float, str], None]) -> list[Flown]:
     """Fly a fleet over topics, with a run for each aircraft.
 
-    `progress` is called with the name of an aircraft, its flight time, s, and a text.
+    `progress` is called with the name of an aircraft, flight time, s, and a text.
 
-    In real time the aircraft share t = 0, which is set once every node is ready; each may begin later by its delay. An aircraft
+    In real time the aircraft share t = 0, set once every node is ready; an aircraft may begin later by a delay. An aircraft
     that ends early, or never begins, leaves the others untouched. Ctrl-C ends all. Raises ParameterError where none can begin.
     """
     require_ros_environment()
@@ -261,7 +261,7 @@ def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float
 
 
 def _begin(flights: Sequence[_Flight], fleet: Fleet) -> None:
-    """Begin all flights in real time with one t = 0."""
+    """Begin the flights in real time with a common t = 0."""
     if not fleet.lockstep:
         start = start_instants(LEAD + BEGIN_TIME * len(flights))
         for flight in flights:

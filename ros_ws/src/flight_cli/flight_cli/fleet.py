@@ -34,7 +34,7 @@ def fleet(
     runs: Annotated[Path, typer.Option(help="Folder that the run's folder of each aircraft is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summaries as JSON, by name, nothing else.")] = False,
 ) -> None:
-    """Fly a fleet: each aircraft in its namespace, with its own nodes, log and report.
+    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report.
 
     Exit status, the severest of the aircraft: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an
     incomplete log or a leg missed or not flown, 130 interrupted.

@@ -24,7 +24,7 @@ def layouts(
     ] = None,
     folder: Annotated[Path, typer.Option(help="Folder to write the files to.")] = Path(),
 ) -> None:
-    """Write layouts for Foxglove and PlotJuggler that plot the runs of a scenario, and for RViz where it has guidance."""
+    """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz with guidance."""
     require(fleet is None or scenario is None, "--fleet", "a scenario beside it", "one of the two")
     if fleet is None:
         chosen = find_scenario(scenario or "osprey_servo")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The processes of a flight in a log: when each was ready, by its line on /rosout, and the span of its samples."""
+"""The processes of a flight in a log: when ready, by the line on /rosout, and the span of the samples."""
 
 import re
 from collections.abc import Iterable, Mapping

@@ -69,7 +69,7 @@ class Peers:
             known.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """The least difference of each other node, to be reported."""
+        """The least difference of every peer, to be reported."""
         return {name: min(seen) for name, seen in self._seen.items()}
 
     def clocks(self) -> dict[str, ClockOfPeer]:
@@ -104,11 +104,11 @@ class PeerClocks:
         self._publish(encoder.encode(time.time_ns() - ahead_ns, np.array([*differences.values()])))
 
     def received(self) -> list[str]:
-        """The other nodes that are received."""
+        """The received peers."""
         return [*self._peers.differences()]
 
     def clocks(self) -> dict[str, ClockOfPeer]:
-        """The clocks of the other nodes."""
+        """The clocks of the peers."""
         return self._peers.clocks()
 
     def told_of(self, sender: str) -> str:
