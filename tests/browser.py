@@ -90,12 +90,21 @@ class Browser:
         Time counts while the browser answers: of each look at most LOOK, since other work may keep the processor from both.
         """
         waited, before = 0.0, time.monotonic()
-        while not self.run(expression):
+        while not self._holds(expression):
             if waited > limit:
                 raise TimeoutError(f"not true after {limit:g} s: {expression}; {self.console}")
             time.sleep(0.02)
             now = time.monotonic()
             waited, before = waited + min(now - before, LOOK), now
+
+    def _holds(self, expression: str) -> bool:
+        """Whether an expression is true; not on a page that the browser is leaving."""
+        try:
+            return bool(self.run(expression))
+        except RuntimeError as error:
+            if "navigated" in str(error):
+                return False
+            raise
 
     @property
     def pid(self) -> int:

@@ -362,13 +362,13 @@ def test_fleet_on_one_map_with_choice_of_aircraft(browser: Browser, tmp_path: Pa
                 bag.write(pose, stamp_ns, stamp_ns, k, vector(stamp_ns, names, [0.0, 0.0, 0.0, 2.0 * k, east + 0.3 * k, 50.0]))
     place = "document.getElementById('aircraft')"
     with shown(browser, tmp_path / "uav1", tmp_path / "uav2", fleet=True) as address:
-        browser.wait_for(f"{place}.options.length === 2")
+        browser.wait_for(f"{place}?.options.length === 2")
         assert browser.run(f"[...{place}.options].map(({{text}}) => text)") == ["uav1", "uav2"]
         browser.wait_for(f"{PIXELS}('#scene', '--ghost') > 20")
         browser.run(f"location.href = '{address.partition('#')[0]}#t=5'; location.reload()")
-        browser.wait_for(f"{TIME} === 5 && {place}.value === '0' && {place}.options.length === 2")
+        browser.wait_for(f"{TIME} === 5 && {place}?.value === '0' && {place}.options.length === 2")
         browser.run(f"{place}.value = '1'; {place}.dispatchEvent(new Event('change'))")
-        browser.wait_for(f"{TIME} === 3 && document.getElementById('name').textContent === 'uav2' && {place}.value === '1'")
+        browser.wait_for(f"{TIME} === 3 && document.getElementById('name').textContent === 'uav2' && {place}?.value === '1'")
         browser.wait_for(f"{PIXELS}('#scene', '--ghost') > 20")
         assert browser.console == []
 
