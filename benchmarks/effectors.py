@@ -27,7 +27,7 @@ from rise_di_controller.params import ControllerConfig
 
 SCENARIOS = ("osprey_twin", "osprey_vtail", "x8_elevons")
 FAULTS = {"lost": "lost_at", "stuck": "stuck_at", "half": "weak_at", "slow": "slow_at", "loose": "loose_at"}
-DURATION, RATE, FROM, TO = 22.0, 200.0, 3.0, 10.0  # s, Hz, s: a flight, of y, first and last begin of a fault
+DURATION, RATE, FROM, TO = 22.0, 100.0, 3.0, 10.0  # s, Hz, s: a flight, of y, first and last begin of a fault
 SCORE_LOST = 10.0  # a higher score is a loss of track
 
 
@@ -129,9 +129,9 @@ def main() -> None:
                 lost = f", {found['lost']} lost in {found['output']}" if found["lost"] else ""
                 cells.append(f"{found['mean']:.2f} ({found['worst']:.2f}){lost}")
             table.add_row(effector, kind, *cells)
+            if given.json is not None:  # after each fault: a run that is stopped leaves what it has flown
+                given.json.write_text(json.dumps({"seeds": given.seeds, "rows": rows}, indent=1) + "\n", encoding="utf-8")
         console.print(table)
-        if given.json is not None:
-            given.json.write_text(json.dumps({"seeds": given.seeds, "rows": rows}, indent=1) + "\n", encoding="utf-8")
     console.print(f"largest u beyond its end stop: {max(row['beyond'] for row in rows):.3g}")
 
 

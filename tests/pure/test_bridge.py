@@ -248,6 +248,21 @@ def test_y_returned_once_per_rate_sample_and_only_while_all_channels_are_fresh()
     assert bridge.y(at(0.25)) is None
 
 
+def test_held_channel_of_vane_is_repeated_and_ends_no_y() -> None:
+    content = CHANNEL_MAP.model_dump()
+    vane = content["outputs"]["q"] | {"held": True, "field": "twist.linear.y"}
+    channel_map = ChannelMap.validate_mapping(content | {"outputs": content["outputs"] | {"alpha": vane}}, "map")
+    bridge = new_bridge(channel_map)
+    receive_outputs(bridge, 0.0)
+    assert bridge.y(at(0.0)) is None  # never received
+    bridge.take_output("alpha", 0.1, at(0.0), at(0.0))
+    for t in (0.0, 10.0):
+        receive_outputs(bridge, t + 0.1)
+        y = bridge.y(at(t + 0.1))
+        assert y is not None
+        assert abs(y.value[-1]) == pytest.approx(0.1)
+
+
 def test_low_pass_answers_step_as_first_order_does_at_any_spacing_of_samples() -> None:
     content = CHANNEL_MAP.model_dump()
     content["outputs"]["q"]["low_pass"] = 0.05

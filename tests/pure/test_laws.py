@@ -468,8 +468,9 @@ def test_observer_is_same_for_many_aircraft() -> None:
     many = ObserverParams(None, Phi, Gamma, H, L, F, limits, np.float64(2.0))
     z, e, u = (generator.standard_normal((size, N)) for size in (s, m, m))
     state = ObserverState(None, z, np.zeros((m, N)), np.full((1, N), 0.3))
-    corrected, predicted = correct(state, e, DT, many), predict(z, u, many)
-    by_jax = jax.jit(lambda z, e: correct(state._replace(z=z, u_o=jax.numpy.zeros((m, N))), e, DT, many).u_o)(z, e)
+    looks = Measurements(e, 0.0 * e, 0.0 * e, 0.0 * e, 0.0 * e)
+    corrected, predicted = correct(state, looks, DT, many), predict(z, u, many)
+    by_jax = jax.jit(lambda z, e: correct(state._replace(z=z, u_o=jax.numpy.zeros((m, N))), looks, DT, many).u_o)(z, e)
     for k in range(N):
         x = z[:, k] + L[..., k] @ (e[:, k] - H[..., k] @ z[:, k])
         np.testing.assert_allclose(corrected.z[:, k], x, rtol=1e-12)

@@ -13,6 +13,7 @@ from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
+from aircraft_sim.vanes import ANGLES
 from flight_core.outcome import LANDED, FlightEnded
 from flight_core.rates import divide, seconds
 from flight_core.units import FOOT
@@ -131,6 +132,10 @@ class JsbsimModel:
     def y(self) -> FloatArray:
         """[q, V, p, r], deviations from trim, shape (4,)."""
         return self._x[: len(OUTPUTS)]
+
+    def air_angles(self, t_ns: int) -> FloatArray:
+        """See `simulator.FlightDynamicsModel`; alpha and beta of JSBSim are those relative to the air."""
+        return self._x[[list(STATES).index(name) for name in ANGLES]]
 
     def truth(self, t_ns: int) -> FloatArray:
         """Values in the order of `truth_names`."""

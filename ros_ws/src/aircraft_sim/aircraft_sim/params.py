@@ -18,6 +18,7 @@ from aircraft_sim.pose import every
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
+from aircraft_sim.vanes import ANGLES, Vanes
 from flight_core import parameters
 from flight_core.channels import POSE
 from flight_core.fields import Field
@@ -168,6 +169,21 @@ class SensorConfig(Config):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
+class VanesConfig(Config):
+    """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors` too."""
+
+    channels: tuple[Literal["alpha", "beta"], ...] = Field(default=(), description="the angles that have a vane; none if empty")
+    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, as in ice, s; .inf is never")
+    dropout: float = Field(
+        default=0.0, ge=0, lt=1, description="the probability that a reading is lost; it repeats the one before"
+    )
+
+    def _check(self) -> None:
+        require(len(set(self.channels)) == len(self.channels), "channels", ", ".join(self.channels), "different ones")
+        if self.frozen_at:
+            parameters.require_length("frozen_at", self.frozen_at, self.channels)
+
+
 PerPose = dict[str, Number]
 
 
@@ -233,6 +249,7 @@ class AircraftConfig(NodeConfig):
     drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
+    vanes: VanesConfig = Field(default=VanesConfig(), description="vanes beside the outputs, none where left out")
     pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
 
     control_rate: float = Field(
@@ -250,7 +267,8 @@ class AircraftConfig(NodeConfig):
         """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a drift."""
         gusts = {f"gusts.{axis}.{key}" for axis in AXES for key in Gust.model_fields}
         effectors = {f"actuators.{key}" for key in (*EFFECTOR_FAULTS, *SEVERITIES)}
-        return frozenset(gusts | effectors | {"sensors.bias", "sensors.noise", "sensors.dropout", "drift.start"})
+        sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {"vanes.frozen_at", "vanes.dropout"}
+        return frozenset(gusts | effectors | sensors | {"drift.start"})
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")
@@ -297,6 +315,10 @@ class AircraftConfig(NodeConfig):
         known = self.kinematics == "linear" or not missing
         require(known, "kinematics", f"{self.kinematics!r}", f"linear: {has_none} state {', '.join(missing)}")
         require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
+        for name in self.vanes.channels:
+            require(name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}")
+            require(name not in airframe.outputs, "vanes.channels", name, f"none: {name} is an output of {airframe.name}")
+            require(airframe.speed > 0.0, "vanes.channels", name, f"none: {has_none} speed")
 
     def _check_jsbsim(self) -> None:
         require_aircraft(self.airframe)
@@ -327,13 +349,14 @@ class AircraftConfig(NodeConfig):
 
     def channels(self) -> AircraftChannels:
         """Outputs and inputs with their units, the effects of the inputs, and the trim speed."""
+        vanes: dict[str, Unit] = dict.fromkeys(self.vanes.channels, "rad")
         if self.is_jsbsim:
             positive = {name: command.positive for name, command in INPUTS.items()}
-            return AircraftChannels(dict(OUTPUTS), dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
+            return AircraftChannels({**OUTPUTS, **vanes}, dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
         airframe = load_airframe(self.airframe)
         inputs = {name: given.unit for name, given in airframe.inputs.items()}
         positive = {name: given.positive for name, given in airframe.inputs.items()}
-        return AircraftChannels(airframe.units_of_outputs(), inputs, positive, airframe.speed)
+        return AircraftChannels(airframe.units_of_outputs() | vanes, inputs, positive, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
         """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named airframe."""
@@ -432,6 +455,14 @@ class AircraftConfig(NodeConfig):
             drift=None if drift is None else drift * np.sqrt(1.0 / self.rate),
             quantum=_array(sensors.quantisation, zero_is_none=True),
         )
+
+    def vane_arrays(self) -> Vanes | None:
+        """The vanes as arrays; None without any."""
+        section = self.vanes
+        if not section.channels:
+            return None
+        frozen_at = np.array(section.frozen_at or (np.inf,) * len(section.channels))
+        return Vanes([ANGLES.index(name) for name in section.channels], frozen_at, section.dropout, self.sensors.seed)
 
     def pose_every(self) -> int:
         """Number of the aircraft's instants from pose to pose."""

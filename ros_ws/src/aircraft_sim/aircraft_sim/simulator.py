@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from aircraft_sim import plant, pose, sensors, truth
+from aircraft_sim import plant, pose, sensors, truth, turbulence, vanes
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
@@ -41,6 +41,9 @@ class FlightDynamicsModel(Protocol):
 
     def y(self) -> FloatArray:
         """The outputs before the sensors, deviations from trim, shape (m,), SI."""
+
+    def air_angles(self, t_ns: int) -> FloatArray:
+        """Alpha and beta relative to the air, deviations from trim, rad, shape (2,)."""
 
     def truth(self, t_ns: int) -> FloatArray:
         """Values in the order of `truth_names`."""
@@ -73,6 +76,10 @@ class StateSpaceModel:
         states = list(airframe.states)
         self._places = [states.index(name) if name in states else None for name in POSE_STATES]
         self._axes = list(airframe.gusts)
+        self._angles = [
+            (POSE_STATES.index(name), self._axes.index(axis) if axis in self._axes else None)
+            for name, axis in zip(vanes.ANGLES, ("vertical", "lateral"), strict=True)
+        ]
         self._speed, self._euler = airframe.speed, parameters.kinematics == "euler"
         self._psi, self._position = 0.0, [0.0, 0.0, 0.0]  # north, east, altitude
         self._psi_dot, self._velocity = self._heading_rate(self._states()), self._air_velocity(self._states())
@@ -127,6 +134,13 @@ class StateSpaceModel:
         y: FloatArray = plant.output(self._state, self._plant)
         return y
 
+    def air_angles(self, t_ns: int) -> FloatArray:
+        """See FlightDynamicsModel: x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`."""
+        x, wind = self._states(), self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]
+        if self._plant.turbulence is not None:
+            wind = wind + turbulence.wind(self._state.turbulence, self._plant.turbulence)
+        return np.array([x[place] - (0.0 if axis is None else wind[axis] / self._speed) for place, axis in self._angles])
+
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
@@ -165,7 +179,8 @@ class Simulator:
         self._start = pose.Start(**parameters.start.model_dump())
         self._pose_every, self._pose_sensors = parameters.pose_every(), parameters.pose_sensors()
         self._poses: DelayLine = ()
-        self._sensors = parameters.sensor_arrays()
+        self._sensors, self._vanes = parameters.sensor_arrays(), parameters.vane_arrays()
+        self._vane_state = None if self._vanes is None else vanes.initial_state(self._vanes)
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
         if self._pose_sensors is not None:
             self.truth_names += tuple(f"noise.pose.{name}" for name in POSE)
@@ -191,7 +206,8 @@ class Simulator:
             require(drift is None or drift.start >= t, "drift.start", f"{drift and drift.start:g} s", f"at least t = {t:g} s")
             acts = before is not None and before.start < t
             require(not acts, "drift", "a change of a drift that acts", "one before its start")
-        self._drift_section, self._gusts, self._sensors = drift, parameters.gusts, parameters.sensor_arrays()
+        self._drift_section, self._gusts = drift, parameters.gusts
+        self._sensors, self._vanes = parameters.sensor_arrays(), parameters.vane_arrays()
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
@@ -206,7 +222,16 @@ class Simulator:
         self._number = number
         if self._model.diverged():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
-        measured, self._error, self._drift = sensors.measure(number, self._model.y(), self._drift, self._sensors)
+        true = self._model.y()
+        if self._vanes is not None and self._vane_state is not None:
+            angles = self._model.air_angles(t_ns)
+            self._vane_state = vanes.turned(seconds(t_ns), angles, self._vane_state, self._vanes)
+            true = np.concatenate([true, self._vane_state.angle])
+        measured, self._error, self._drift = sensors.measure(number, true, self._drift, self._sensors)
+        if self._vanes is not None and self._vane_state is not None:
+            of_y = len(measured) - len(self._vanes.places)
+            self._vane_state = vanes.read(number, measured[of_y:], self._vane_state, self._vanes)
+            measured = np.concatenate([measured[:of_y], self._vane_state.reading])
         y = measured if sensors.arrives(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived

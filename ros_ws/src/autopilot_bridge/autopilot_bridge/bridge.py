@@ -136,8 +136,10 @@ class Bridge:
         return {name: reason for name in watched if (reason := self._staleness(name, now_ns))}
 
     def _staleness(self, name: str, now_ns: int) -> str:
-        """What is wrong with a channel; empty where it is fresh."""
+        """What is wrong with a channel; empty where it is fresh, and where its last value is held."""
         row = self._rows[name]
+        if isinstance(row, OutputRow) and row.held and name in self._readings:
+            return ""
         return _staleness(row.topic, self._readings.get(name), row.max_age, now_ns)
 
     def _outside(self, section: str = "envelope") -> str:

@@ -118,6 +118,10 @@ class OutputRow(MeasuredRow, MovingRow):
     captured: bool = Field(
         default=False, description="whether the channel begins at 0 at each engagement, in place of the trim in `offset`"
     )
+    held: bool = Field(
+        default=False,
+        description="whether y repeats the last value of a stale channel: for a vane, which the observer then leaves out",
+    )
     low_pass: NonNegative = Field(
         default=0.0, description="time constant of a low-pass filter of first order, s: y is later by it; 0 without"
     )
@@ -288,6 +292,8 @@ class ChannelMap(Config):
     def _check(self) -> None:
         outputs, messages = ", ".join(self.outputs), ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
+        own = self.outputs[self.instant]
+        require(not own.held, f"outputs.{self.instant}.held", "true", "false: its stamp is that of y")
         self._check_fields()
         self._check_topics()
         owners: dict[tuple[str, str], str] = {}

@@ -137,6 +137,20 @@ def aircraft_correction(sampled: ObserverModel, model: NominalModel, weights: We
     return _correction(sampled, model, intensities)
 
 
+def vane_correction(
+    sampled: ObserverModel, model: NominalModel, weights: tuple[Weights, Weights], row: FloatArray, noise: float
+) -> FloatArray:
+    """Gains of a vane beside L of `aircraft_correction`, (s, m + 1): the filter of y and the vane less the filter of y.
+
+    The last column acts on the vane: a reading beyond the reference motion is `row` z, (s,), with white `noise`, rms.
+    `weights` without and with the vane.
+    """
+    alone = aircraft_correction(sampled, model, weights[0])
+    with_vane = sampled._replace(H=np.vstack([sampled.H, row]))
+    both = aircraft_correction(with_vane, model._replace(noise=np.append(model.noise, noise)), weights[1])
+    return np.asarray(both - np.column_stack([alone, np.zeros(len(alone))]))
+
+
 def extended_state_observer(model: NominalModel, names: Names, weights: ExtendedStateWeights) -> ObserverDesign:
     """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
     sampled, size = extended_state_model(model, names, weights.decay), model.C @ model.size

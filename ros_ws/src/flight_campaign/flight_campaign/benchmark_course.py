@@ -42,6 +42,8 @@ class Segments(NamedTuple):
     forcing: FloatArray  # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @ the rest
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
+    vane_m: FloatArray  # (T, k) readings of the vanes in the reference motion, rad
+    vane_error: FloatArray  # (T, k) sensor error of the vanes, rad
 
 
 class Course(NamedTuple):
@@ -60,7 +62,7 @@ def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
     Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, an allocation, a delay of y by a part of a
-    tick, dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit.
+    tick, dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
@@ -78,12 +80,14 @@ def build_course(scenario: Scenario) -> Course:
     late = divide(errors.delay_ns, tick_ns, "sensors.delay", "a tick") if errors.delay_ns else 0
     lossless = errors.dropout == 0.0 or tick_ns == sample_ns
     require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) with dropouts")
+    vanes = [outputs.index(name) for name in controller.vanes]
+    _require_plain_vanes(scenario, late)
     error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
     for k in range(ticks):
         error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
 
     reference = Reference(scenario.reference_model)
-    y_m, y_m_dot = np.zeros_like(error), np.zeros_like(error)
+    y_m, y_m_dot = np.zeros((ticks, len(order))), np.zeros((ticks, len(order)))
     places = [scenario.reference_model.outputs.index(name) for name in controller.outputs]
     for k in range(ticks):
         y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
@@ -99,6 +103,8 @@ def build_course(scenario: Scenario) -> Course:
     over_step, now = (
         np.concatenate([blowing[:, axes], rest @ basis], axis=1) for blowing, rest in zip(wind, other, strict=True)
     )
+    guard = controller.guard()
+    u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used])
     segments = Segments(
         np.arange(ticks) * np.float64(seconds(tick_ns)),
         phase,
@@ -106,11 +112,13 @@ def build_course(scenario: Scenario) -> Course:
         y_m,
         y_m[used],
         y_m_dot[used],
-        _feedforward(controller.guard().nominal, phase, dt, y_m[used]),
+        u_ff,
         error[:, order],
         over_step.reshape(ticks, -1),
         now,
         _air_angles(wind.at_tick, airframe),
+        x_m[:, guard.vanes],
+        error[:, vanes],
     )
     return Course(segments, axes, basis, order, late, seconds(tick_ns), steps)
 
@@ -131,10 +139,23 @@ def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[
     return phase, dt
 
 
-def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArray, y_m: FloatArray) -> FloatArray:
+def _require_plain_vanes(scenario: Scenario, late: int) -> None:
+    """Raise ParameterError for vanes beyond a campaign: late, frozen, with losses or steps."""
+    vanes, sensors_of, key = scenario.aircraft.vanes, scenario.aircraft.sensors, "aircraft.vanes"
+    if scenario.controller.vanes:
+        require(not late, "sensors.delay", f"{sensors_of.delay:g} s beside vanes", "0: a campaign has no late vanes")
+        plain = vanes.dropout == 0.0 and not np.isfinite(vanes.frozen_at).any() and not any(sensors_of.quantisation)
+        require(plain, key, "a vane that freezes, loses readings or has steps", "none: rise-di fly --in-process has these")
+
+
+def _feedforward(
+    nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArray, y_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """u_ff at the ticks, (T, m), and the state of the nominal model, (T, n); n = 0 without a model."""
     u_ff = np.zeros_like(y_m)
     if nominal is None:
-        return u_ff
+        return u_ff, np.zeros((len(y_m), 0))
+    x_m = np.zeros((len(y_m), len(nominal.A)))
     state = feedforward.initial_state(y_m[0], nominal)
     for k, action in enumerate(phase):
         if action == ENGAGE:
@@ -143,7 +164,8 @@ def _feedforward(nominal: Nominal | None, phase: NDArray[np.int32], dt: FloatArr
             state, u_ff[k] = feedforward.step(state, y_m[k], dt[k], nominal)
         elif k:
             u_ff[k] = u_ff[k - 1]
-    return u_ff
+        x_m[k] = state.x
+    return u_ff, x_m
 
 
 class _Forcing(NamedTuple):

@@ -81,6 +81,7 @@ class Vehicle(NamedTuple):
     limits: Limits  # (m, 1), law's order: of u, as the controller has them
     quantum: Array | None  # (m, 1), law's order
     dt: float  # s, of a step of the integration
+    vanes: tuple[int, ...] = ()  # indices in the state of what the vanes read
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
@@ -97,6 +98,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
         Limits(*(values[:, None] for values in scenario.controller.guard().limits)),
         None if quantum is None else quantum[:, None],
         seconds(plant.step_ns),
+        tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
     )
 
 
@@ -303,7 +305,11 @@ def _fly(
         acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
         moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
         u_trim, x_air = segment.u_ff[:, None] + 0.0 * y, x - fleet.wind * segment.air[:, None]
-        return Measurements(y, y_m, y_m_dot, u_trim, now.u, now.position[vehicle.inputs], x, x_air, moving)
+        vane = vane_m = None
+        if vehicle.vanes:
+            vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
+            vane_m = segment.vane_m[:, None] + 0.0 * vane
+        return Measurements(y, y_m, y_m_dot, u_trim, now.u, now.position[vehicle.inputs], x, x_air, moving, vane, vane_m)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array]:

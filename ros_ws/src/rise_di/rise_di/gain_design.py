@@ -31,6 +31,7 @@ DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
 MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
+PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
 
 
 def select_gains(
@@ -260,8 +261,10 @@ def observed(
     where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
     margins change least, then the one of the least cost.
     """
-    noises = scenario.aircraft.sensors.noise or (0.0,) * len(controller.outputs)
-    by_name = dict(zip(scenario.aircraft.channels().outputs, noises, strict=True))
+    channels = scenario.aircraft.channels().outputs
+    by_name = dict(zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True))
+    measured = [name for name in scenario.aircraft.vanes.channels if name in model.states]
+    vanes: dict[str, float] = {name: by_name[name] or PERFECT_VANE for name in measured}
     perfect = (
         sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
     )  # noise in place of none, of a perfect sensor
@@ -280,7 +283,7 @@ def observed(
     selected, refusal = [], None
     for gains, origin in candidates:
         try:
-            selected.append((with_aircraft_observer(controller, model, gains, noise, margin, needed), origin))
+            selected.append((with_aircraft_observer(controller, model, gains, noise, margin, needed, vanes), origin))
         except ParameterError as error:  # another gain set may have the margin
             refusal = error
     if refusal is not None and not selected:
@@ -291,7 +294,8 @@ def observed(
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
     lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
     margins = f"delay margin {1e3 * found.delay_margin:.0f} ms, phase margin {np.degrees(found.phase_margin):.0f} deg"
-    return found.controller, f"observer of {model.name}: {origin}{lowered}; {margins}"
+    beside = f" with vanes for {' and '.join(vanes)}" if vanes else ""
+    return found.controller, f"observer of {model.name}{beside}: {origin}{lowered}; {margins}"
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller in a loop of the user's own: tick by tick, around a plant that is a function, and in python-control."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,6 +49,7 @@ class Loop:
         self.config = controller
         self._controller = Controller(self.config)
         self.outputs, self.inputs = self.config.outputs, self.config.effectors
+        self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
         self.output: ControlOutput | None = None  # of the last tick; None where nothing is to be sent
@@ -67,8 +68,8 @@ class Loop:
         """A tick at t in s: u, shape (m,), SI, deviation from trim, in the order of `inputs`; 0 before the engagement.
 
         With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations from trim, belong to t and
-        have the order of `outputs`; None is a lost sample. t may jitter; it never goes back. The failsafe of the guard starts
-        where samples are older than `max_age`.
+        have the order of `outputs`; y of an observer with vanes has the order of `measured`. None is a lost
+        sample. t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
         Raises ParameterError for a t that goes back, for a wrong length and for a value that is not finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
@@ -77,7 +78,8 @@ class Loop:
         self._now_ns = now_ns
         for key, value, take in (("y", y, self._controller.take_y), ("y_m", y_m, self._controller.take_y_m)):
             if value is not None:
-                take(StampedVector(now_ns, self.vector(value, key)), now_ns)
+                names = self.measured if key == "y" else self.outputs
+                take(StampedVector(now_ns, self.vector(value, key, names)), now_ns)
         self.output = self._controller.tick(now_ns)
         return self._controller.state.command.copy()
 
@@ -86,11 +88,11 @@ class Loop:
         self._controller.retune(controller)
         self.config = controller
 
-    def vector(self, value: ArrayLike, key: str) -> FloatArray:
-        """A sample of y or y_m as an array of its own, shape (m,). Raises ParameterError with the key."""
-        expected = f"{len(self.outputs)} finite numbers: {', '.join(self.outputs)}"
+    def vector(self, value: ArrayLike, key: str, names: Sequence[str]) -> FloatArray:
+        """A sample of y or y_m as an array of its own, a value a name. Raises ParameterError with the key."""
+        expected = f"{len(names)} finite numbers: {', '.join(names)}"
         vector = as_array(value, key, expected)
-        require(vector.shape == (len(self.outputs),) and bool(np.isfinite(vector).all()), key, value, expected)
+        require(vector.shape == (len(names),) and bool(np.isfinite(vector).all()), key, value, expected)
         return vector.copy()
 
 
@@ -115,13 +117,13 @@ def fly_plant(
     require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", whole)
     each = period_ns // reference.period_ns
     ticks = int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
-    channels = {"y": loop.outputs, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
+    channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
     rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
     u, outcome = np.zeros(len(loop.inputs)), COMPLETED
     for k in range(ticks):
         t_ns, dt = k * period_ns, loop.period if k else 0.0
         try:
-            y = loop.vector(plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant")
+            y = loop.vector(plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured)
         except FlightEnded as error:
             outcome = str(error)
             break

@@ -18,7 +18,7 @@ class Measurements(NamedTuple):
     """Inputs of a law at a tick: SI units, deviations from trim, channels in the law's order.
 
     A single aircraft has arrays of (m,). A campaign has N aircraft in the last axis, (m, N), or (m, 1) for shared values. The
-    last four fields are not on the topics. Campaigns alone have these fields, for laws with more sensors.
+    fields from `position` to `y_dot` are not on the topics. Campaigns alone have these fields, for laws with more sensors.
     """
 
     y: Array  # measured outputs
@@ -30,6 +30,8 @@ class Measurements(NamedTuple):
     x: Array | None = None  # (n, N) state: measured values of the outputs, true values of the remaining states
     x_air: Array | None = None  # (n, N) x with alpha and beta relative to the air
     y_dot: Array | None = None  # true derivative of C x, free of noise and delay
+    vane: Array | None = None  # (k,) readings of the vanes of an observer, rad
+    vane_m: Array | None = None  # (k,) those of the reference motion, from the model of the feedforward
 
 
 def _no_prediction(state: Any, measured: Measurements, params: Any) -> Any:

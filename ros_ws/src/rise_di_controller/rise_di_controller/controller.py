@@ -113,6 +113,11 @@ class Controller:
         self._law, self._guard, self._digest, self._parameters = new.law, new.guard, new.digest, new.parameters
         self._first_law, self._learned = self._has_first_model(new.parameters), _with_feedforward(new.parameters)
 
+    def still_vanes(self) -> tuple[str, ...]:
+        """The vanes left out by the observer: still vanes."""
+        measures = getattr(self._state.law, "vane_measures", ())
+        return tuple(name for name, value in zip(self._parameters.vanes, measures, strict=False) if not value)
+
     def fallback(self) -> ControllerConfig | None:
         """The parameters of the start where a law with a model that was learned in flight diverges; else None."""
         diverges = not self._first_law and divergence.diverges(self._errors, self._least, self._learned)

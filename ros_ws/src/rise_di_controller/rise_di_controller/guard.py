@@ -23,7 +23,7 @@ from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, TunedLaw
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
-from rise_di_controller.observer import ObserverParams, ObserverState, PastTick
+from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
 from rise_di_controller.saturation import Limits, saturate
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
@@ -46,12 +46,20 @@ class GuardParams(NamedTuple):
     nominal: Nominal | None = None  # None: no feedforward
     history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
+    vanes: tuple[int, ...] = ()  # states of the nominal model read by vanes; the readings follow the outputs in y
 
 
 # The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full: with half of the ticks
 # lost, an upper end of 3 increases the error by 15 % in q and 22 % in r. The lower end keeps a burst of samples from
 # exciting the sign term. A gap beyond the age limit leads to re-engagement.
 DT_RANGE = (0.2, 10.0)
+
+
+class Vanes(NamedTuple):
+    """Readings of the k vanes at the last step."""
+
+    reading: FloatArray  # (k,)
+    reference: FloatArray  # (k,) of the motion of the nominal model
 
 
 class ControllerState(NamedTuple):
@@ -73,6 +81,7 @@ class ControllerState(NamedTuple):
     history: tuple[PastTick, ...] = ()
     effectors: FloatArray | None = None  # (p,) commanded, with an allocation; u is the input of the law that they give
     effectors_failsafe: FloatArray | None = None  # at the start of the failsafe
+    vanes: Vanes | None = None  # None without vanes
 
     @property
     def command(self) -> FloatArray:
@@ -134,6 +143,7 @@ def tick(
     law: TunedLaw,
     active: bool = True,
     u_ff_recorded: FloatArray | None = None,
+    vane_m_recorded: FloatArray | None = None,
 ) -> tuple[ControllerState, TickInputs | None]:
     """A tick of the controller: (state, now, y, y_m) -> (state, inputs of the tick), u in state.u.
 
@@ -144,10 +154,12 @@ def tick(
     mode is INACTIVE, and u is held or ramps to trim; with fresh inputs u is published at trim before the first engagement too.
     Returns None for the inputs where nothing is to be published.
 
-    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's order. `u_ff_recorded`
-    replaces a feedforward of unknown state, in replay.
+    Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's order; readings of vanes
+    follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace a feedforward of unknown state, in replay.
     """
-    reference = None
+    reference, vane = None, None
+    if guard.vanes and y is not None:
+        y, vane = y._replace(value=y.value[: len(state.u)]), y.value[len(state.u) :]
     if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
         reference = align(y_m, y.stamp_ns, guard.period_ns)
     if not active and state.law is None and y is not None and reference is not None and not state.u.any():
@@ -158,16 +170,20 @@ def tick(
     control_law, params = law
     if state.law is None or state.y is None or state.y_m is None or state.mode is not Mode.ENGAGED:
         zero = np.zeros_like(state.u)
+        ff_state = None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
+        vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
+        measured = Measurements(y.value, reference, np.zeros_like(reference), state.u, state.u, vane=vane)
         engaged = state._replace(
             mode=Mode.ENGAGED,
-            law=control_law.engage(Measurements(y.value, reference, np.zeros_like(reference), state.u, state.u), params),
+            law=control_law.engage(measured, params),
             y=y,
             y_m=reference,
             u_trim=state.u,
             u_free=state.u,
             u_ff=zero,
-            feedforward=None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal),
+            feedforward=ff_state,
             history=(),
+            vanes=vanes,
         )
         return engaged, TickInputs(y.stamp_ns, y.value, reference, offset, 0.0)
     if y.stamp_ns <= state.y.stamp_ns:
@@ -186,7 +202,9 @@ def tick(
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
-    measured = Measurements(y.value, reference, (reference - state.y_m) / dt, u_trim, state.u)
+    vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
+    slope, vane_m = (reference - state.y_m) / dt, None if vanes is None else vanes.reference
+    measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
     after, u_free = control_law.step(law_state, measured, dt, params)
     u, effectors = _within_effectors(saturate(u_free, state.u, dt, guard.limits), state, dt, guard)
     if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
@@ -198,9 +216,18 @@ def tick(
         last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt))
         state = state._replace(history=(*state.history, *lost, last)[-guard.history :])
     state = state._replace(
-        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors
+        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
     )
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def _vanes(
+    reading: FloatArray | None, state: FeedforwardState | None, guard: GuardParams, recorded: FloatArray | None
+) -> Vanes | None:
+    """The readings, and the states of the nominal model along y_m as readings of the reference motion; None without vanes."""
+    if reading is None:
+        return None
+    return Vanes(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
 
 
 def _within_effectors(
@@ -231,8 +258,8 @@ def retune(
         return state
     law = new.control_law.retune(state.law, old.params, new.params)
     before, after = nominal
-    other_nominal = not _same_nominal(before, after)
-    other_model = isinstance(law, ObserverState) and _is_replaced(old.params, new.params)
+    other_nominal = not _same_arrays(before, after)
+    other_model = isinstance(law, (ObserverState, VaneObserverState)) and _is_replaced(old.params, new.params)
     if len(state.history) > 1 and isinstance(law, ObserverState) and isinstance(law.law, LawState):
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
@@ -274,10 +301,11 @@ def _is_replaced(old: ObserverParams, new: ObserverParams) -> bool:
 
 
 def _same_model(old: ObserverParams, new: ObserverParams) -> bool:
-    return all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("Phi", "Gamma", "H", "L", "F"))
+    same = all(np.array_equal(getattr(old, name), getattr(new, name)) for name in ("Phi", "Gamma", "H", "L", "F"))
+    return same and _same_arrays(old.vanes, new.vanes)
 
 
-def _same_nominal(old: Nominal | None, new: Nominal | None) -> bool:
+def _same_arrays(old: tuple[Any, ...] | None, new: tuple[Any, ...] | None) -> bool:
     if old is None or new is None:
         return old is new
     return all(np.array_equal(before, after) for before, after in zip(old, new, strict=True))

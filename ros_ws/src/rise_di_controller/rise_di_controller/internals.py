@@ -16,7 +16,11 @@ OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
 EFFECTOR = "effector"  # group of an allocation
-RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, EFFECTOR}) - {"e"}
+VANE_STATE, VANE_READING = (
+    ("vane_mean", "vane_square", "vane_measures"),
+    ("vane", "vane_m"),
+)  # groups of the vanes of an observer
+RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, *VANE_STATE, *VANE_READING, EFFECTOR}) - {"e"}
 """Names reserved by the log, not for the state of a law. e is y - y_m."""
 
 
@@ -34,18 +38,22 @@ def groups(
     inputs: Sequence[str],
     estimates: Sequence[str],
     effectors: Sequence[str] = (),
+    vanes: Sequence[str] = (),
 ) -> dict[str, tuple[str, ...]]:
     """Groups of channels of `internals` and the names per group, in the order of the log.
 
     By output: y, y_m, e = y - y_m, then the state of the law, for RISE-DI e_0 (e at engagement), integral_e (units of y times
     s) and Pi (scaled input). By input: u before (u_free) and after saturation (u), u_trim, limited (Saturation), u_ff
-    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in. Of an allocation: effector, as commanded.
+    (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in. Of vanes: mean, mean square around it,
+    1 for a vane in use, the reading, and the reading in the reference motion. Of an allocation: effector, as commanded.
     """
-    of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS)]
+    of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)]
     grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
     grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
     if "z" in field_names(law):
         grouped |= {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
+    if vanes:
+        grouped |= {group: tuple(vanes) for group in (*VANE_STATE, *VANE_READING)}
     return grouped | ({EFFECTOR: tuple(effectors)} if effectors else {})
 
 
@@ -77,8 +85,9 @@ def values(
     limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
     of_law = fields(state.law)
     of_law.pop("e", None)
-    of_observer = [of_law.pop(group) for group in OBSERVER_GROUPS if group in of_law]
+    of_observer = [of_law.pop(group) for group in (*OBSERVER_GROUPS, *VANE_STATE) if group in of_law]
+    readings = () if state.vanes is None else state.vanes
     by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *of_law.values())
     by_input = (state.u_free, state.u, state.u_trim, limited, state.u_ff)
     effectors = () if state.effectors is None else (state.effectors,)
-    return np.concatenate([scalars, *by_output, *by_input, *of_observer, *effectors])
+    return np.concatenate([scalars, *by_output, *by_input, *of_observer, *readings, *effectors])

@@ -28,7 +28,7 @@ class LinearPlant(NamedTuple):
 
     A: FloatArray  # (n, n)
     B: FloatArray  # (n, m)
-    C: FloatArray  # (m, n)
+    C: FloatArray  # (m, n), with k vanes (m + k, n)
 
 
 class Loop(NamedTuple):
@@ -48,7 +48,7 @@ class LinearLaw(NamedTuple):
     """A law near e = 0 with k values in the state: z+ = A z + B y, u = C z + D y, at y_m = 0; leading axes are batches."""
 
     A: FloatArray  # (..., k, k)
-    B: FloatArray  # (..., k, m)
+    B: FloatArray  # (..., k, m), with vanes these in further columns, as in D
     C: FloatArray  # (..., m, k)
     D: FloatArray  # (..., m, m)
 
@@ -56,16 +56,22 @@ class LinearLaw(NamedTuple):
 def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = None) -> LinearLaw:
     """A law's step near e = 0 over m channels: a column is the response to SMALL in a value of the state or of y.
 
-    An observer has faded in. With `candidates` N the parameters have N sets of gains as the last axis, and the matrices have
-    them as the first. Raises ParameterError for the literal sign: not linear anywhere.
+    An observer has faded in, and its vanes measure: a column each, after those of y. With `candidates` N the parameters have N
+    sets of gains as the last axis, and the matrices have them as the first. Raises ParameterError for the literal sign: not
+    linear anywhere.
     """
     control_law, params = law
     of_law = getattr(params, "law", params)  # the law under an observer or a schedule
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     sets = () if candidates is None else (candidates,)
-    zero = np.zeros((m, *sets))
-    at_engagement = fields(control_law.engage(Measurements(zero, zero, zero, zero, zero), params))
+    zero, vanes = np.zeros((m, *sets)), getattr(params, "vanes", None)
+    none = None if vanes is None else np.zeros((len(vanes.H), *sets))
+    wide = m if none is None else m + len(none)
+    if vanes is not None:
+        params = params._replace(vanes=vanes._replace(least=np.where(np.isinf(vanes.least), np.inf, -1.0)))
+    still = Measurements(zero, zero, zero, zero, zero, vane=none, vane_m=none)
+    at_engagement = fields(control_law.engage(still, params))
     at_rest = {name: np.broadcast_to(value, (len(value), *sets)) for name, value in at_engagement.items()}
     if "sigma" in at_rest:
         at_rest["sigma"] = np.ones((1, *sets))
@@ -74,14 +80,13 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
 
     def step(z: FloatArray, y: FloatArray) -> FloatArray:
         parts = dict(zip(at_rest, np.split(z, ends[:-1]), strict=True)) if size else {}
-        state, u = control_law.step(
-            restored(control_law, parts), Measurements(y, zero, zero, zero, zero), np.float64(period), params
-        )
+        now = still._replace(y=y[:m], vane=None if none is None else y[m:])
+        state, u = control_law.step(restored(control_law, parts), now, np.float64(period), params)
         return np.concatenate([*fields(state).values(), u])
 
-    begin = np.concatenate([*at_rest.values(), zero])
-    rest = step(begin[:size], zero)
-    units = SMALL * np.eye(size + m).reshape(size + m, size + m, *(1 for _ in sets))
+    begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
+    rest = step(begin[:size], begin[size:])
+    units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
     columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in units]
     matrix = np.array(columns).T
     above, below = matrix[..., :size, :], matrix[..., size:, :]
@@ -136,7 +141,7 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     held = int(whole.max()) + 1  # earlier ticks whose u still acts, the newest first
 
     size = n + m + held * m
-    A, B, C = np.zeros((*batch, size, size)), np.zeros((*batch, size, m)), np.zeros((*batch, m, size))
+    A, B, C = np.zeros((*batch, size, size)), np.zeros((*batch, size, m)), np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
     inputs = np.zeros((*batch, n + m, m + held * m))  # effect of u of this tick, then of earlier ticks

@@ -50,10 +50,10 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._active = False
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
-        outputs = self.parameters.outputs
+        of_y, of_y_m = (self.parameters.measured, self._controller.take_y), (self.parameters.outputs, self._controller.take_y_m)
         self._y, self._y_m = (
-            self.receive(topic, Decoder(outputs).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
-            for topic, take in ((Y, self._controller.take_y), (Y_M, self._controller.take_y_m))
+            self.receive(topic, Decoder(names).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
+            for topic, (names, take) in ((Y, of_y), (Y_M, of_y_m))
         )
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.effectors)
@@ -69,6 +69,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 self._has_proposal,
             )
         self._last_ns = 0  # of the last tick
+        self._still_vanes: tuple[str, ...] = ()
         if self.parameters.autostart:
             self.trigger_configure()
             if self.parameters.start_active:
@@ -122,6 +123,16 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
+    def _tell_vanes(self) -> None:
+        """Log a vane at the begin and the end of a standstill."""
+        before, self._still_vanes = self._still_vanes, self._controller.still_vanes()
+        if before == self._still_vanes:
+            return
+        if still := set(self._still_vanes) - set(before):
+            self.get_logger().warning(f"vane {', '.join(sorted(still))} stands still: left out")
+        if moves := set(before) - set(self._still_vanes):
+            self.get_logger().info(f"vane {', '.join(sorted(moves))} moves again: measured")
+
     def _max_age_ns(self) -> int:
         return nanoseconds(self.parameters.max_age)
 
@@ -144,6 +155,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             self._learning.ticked(now_ns)
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
+        self._tell_vanes()
         if output is None or not self._publishes:
             return False
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
@@ -251,4 +263,5 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         ages = {}
         if not self.parameters.lockstep:
             ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in self._controller.ages(self.now_ns()).items()}
-        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **ages}
+        still = {"vanes left out": ", ".join(self._still_vanes) or "none"} if self.parameters.vanes else {}
+        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **still, **ages}

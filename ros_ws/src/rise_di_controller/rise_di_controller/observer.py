@@ -6,15 +6,25 @@ The observer extends any control law: the law's own equations do not change. The
 here. See docs/theory.md.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from flight_core.arithmetic import inverse, product
-from flight_core.vectors import Array, array_namespace
+from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits, saturate
+
+
+class VaneParams(NamedTuple):
+    """Parameters of k vanes, sensors beside y for the observer alone: a reading is H z beyond the reference motion."""
+
+    H: Array  # (k, s)
+    L: Array  # (k, s, m + 1) gains of a vane, added to L; the last column acts on the innovation of the vane
+    least: Array  # (k,) mean square of the motion of a reading below which the vane counts as frozen
+    time: Array  # () s, over which the motion is averaged
 
 
 class ObserverParams(NamedTuple):
@@ -31,6 +41,7 @@ class ObserverParams(NamedTuple):
     F: Array  # (m, s) u per estimate
     limits: Limits  # of u_o
     fade_rate: Array  # () 1/s, inverse of the fade-in time of u_o after engagement
+    vanes: VaneParams | None = None  # None: the observer of y alone
 
 
 class PastTick(NamedTuple):
@@ -49,6 +60,18 @@ class ObserverState(NamedTuple):
     z: Array  # (s,) estimates, predicted for the next tick
     u_o: Array  # (m,) the observer's contribution to the trim
     sigma: Array  # (1,) fade-in after engagement, 0 to 1
+
+
+class VaneObserverState(NamedTuple):
+    """State of an observer with vanes."""
+
+    law: Any
+    z: Array
+    u_o: Array
+    sigma: Array
+    vane_mean: Array  # (k,) mean of the readings
+    vane_square: Array  # (k,) mean square of the readings around it
+    vane_measures: Array  # (k,) 1 for a vane in use, 0 for a still vane
 
 
 def predict(z: Array, u: Array, params: ObserverParams) -> Array:
@@ -84,24 +107,76 @@ def estimates_after(history: tuple[PastTick, ...], change: Array, params: Observ
     return z
 
 
-def correct(state: ObserverState, e: Array, dt: Array, params: ObserverParams) -> ObserverState:
+def moving(state: VaneObserverState, reading: Array, dt: Array, params: VaneParams) -> VaneObserverState:
+    """The state with the motion of the readings, and the vanes in use.
+
+        part    = min(dt / time, 1)
+        mean   += part (reading - mean)
+        square += part ((reading - mean)^2 - square)
+        measures 1 where square > least, else 0
+
+    A frozen vane has electrical noise alone, of less than `least`. So has a vane in calm air, without wind to tell.
+    """
+    xp = array_namespace(reading)
+    part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
+    mean = state.vane_mean + part * (reading - state.vane_mean)
+    square = state.vane_square + part * ((reading - mean) ** 2 - state.vane_square)
+    measures = xp.where(square > params.least, 1.0, 0.0)
+    return state._replace(vane_mean=mean, vane_square=square, vane_measures=measures)
+
+
+def by_vanes(z: Array, innovation: Array, deviation: Array, measures: Array, params: VaneParams) -> Array:
+    """Correction by the vanes in use, (s,): sum of L_v [e - H z, deviation_v - H_v z].
+
+    Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion, (k,).
+    """
+    xp = array_namespace(z)
+    own = deviation - product(params.H, z)
+    total = 0.0 * z
+    for v in range(len(params.H)):
+        total = total + measures[v] * product(params.L[v], xp.concat([innovation, own[v : v + 1]]))
+    return total
+
+
+def without_frozen(params: ObserverParams, frozen: Sequence[bool]) -> ObserverParams:
+    """Parameters for frozen vanes: never in use, and the rest in use from the first motion on."""
+    if params.vanes is None:
+        return params
+    return params._replace(vanes=params.vanes._replace(least=np.where(frozen, np.inf, 0.0)))
+
+
+def filter_matrix(params: ObserverParams) -> FloatArray:
+    """Phi (I - L H - sum of L_v [H, H_v]), (s, s): the estimates from tick to tick, with the vanes of a finite `least`."""
+    corrected = params.L @ params.H
+    if params.vanes is not None:
+        for row, gain, least in zip(params.vanes.H, params.vanes.L, params.vanes.least, strict=True):
+            corrected = corrected + np.isfinite(least) * (gain @ np.vstack([params.H, row]))
+    return np.asarray(params.Phi @ (np.eye(len(params.Phi)) - corrected))
+
+
+def correct(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> Any:
     """Correction by the measured error, and the contribution to the trim.
 
-        z     = z + L (e - H z)
+        z     = z + L (e - H z) + by_vanes
         sigma = min(1, sigma + dt fade_rate)
         u_o   = -sigma F z, inside limits of magnitude and rate
 
     The limits bound u_o and u_o_dot for any measurement. The fade-in makes the engagement bumpless.
     """
-    z = state.z + product(params.L, e - product(params.H, state.z))
+    e = measured.y - measured.y_m
+    innovation = e - product(params.H, state.z)
+    z = state.z + product(params.L, innovation)
+    if params.vanes is not None and measured.vane is not None:
+        state = moving(state, measured.vane, dt, params.vanes)
+        z = z + by_vanes(state.z, innovation, measured.vane - measured.vane_m, state.vane_measures, params.vanes)
     sigma = array_namespace(e).minimum(state.sigma + dt * params.fade_rate, 1.0 + 0.0 * state.sigma)
     u_o = saturate(-sigma * product(params.F, z), state.u_o, dt, params.limits)
-    return ObserverState(state.law, z, u_o, sigma)
+    return state._replace(z=z, u_o=u_o, sigma=sigma)
 
 
 @lru_cache(maxsize=64)
-def with_observer(law: ControlLaw) -> ControlLaw:
-    """A control law from the trim u_trim + u_o; the observer takes u after saturation (anti-windup).
+def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
+    """A control law from the trim u_trim + u_o; the observer takes u after saturation (anti-windup), and its vanes.
 
         u_o by `correct`
         u   = law(y, y_m) from the trim u_trim + u_o
@@ -110,38 +185,40 @@ def with_observer(law: ControlLaw) -> ControlLaw:
     The law takes the measured e, not the estimate.
     """
 
-    def corrected(
-        state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams
-    ) -> tuple[ObserverState, Measurements]:
-        state = correct(state, measured.y - measured.y_m, dt, params)
+    def corrected(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[Any, Measurements]:
+        state = correct(state, measured, dt, params)
         return state, measured._replace(u_trim=measured.u_trim + state.u_o)
 
-    def predicted(state: ObserverState, of_law: Any, u: Array, measured: Measurements, params: ObserverParams) -> ObserverState:
-        return ObserverState(of_law, predict(state.z, u - measured.u_trim, params), state.u_o, state.sigma)
+    def predicted(state: Any, of_law: Any, u: Array, measured: Measurements, params: ObserverParams) -> Any:
+        return state._replace(law=of_law, z=predict(state.z, u - measured.u_trim, params))
 
-    def engage(measured: Measurements, params: ObserverParams) -> ObserverState:
+    def engage(measured: Measurements, params: ObserverParams) -> Any:
         xp = array_namespace(measured.y)
         e = measured.y - measured.y_m
         zero = xp.zeros_like(e)
-        return ObserverState(law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1])
+        state = ObserverState(law.engage(measured, params.law), initial_estimates(e, params), zero, zero[:1])
+        if not vanes or measured.vane is None:
+            return state
+        none = 0.0 * measured.vane
+        return VaneObserverState(*state, measured.vane, none, none)
 
-    def step(state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[ObserverState, Array]:
+    def step(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[Any, Array]:
         state, inner = corrected(state, measured, dt, params)
         of_law, u = law.step(state.law, inner, dt, params.law)
         return predicted(state, of_law, u, measured, params), u
 
     def limited(
-        state: ObserverState, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
-    ) -> tuple[ObserverState, Array, Array]:
+        state: Any, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
+    ) -> tuple[Any, Array, Array]:
         state, inner = corrected(state, measured, dt, params)
         of_law, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
         return predicted(state, of_law, u, measured, params), u_free, u
 
-    def retune(state: ObserverState, old: ObserverParams, new: ObserverParams) -> ObserverState:
+    def retune(state: Any, old: ObserverParams, new: ObserverParams) -> Any:
         return state._replace(law=law.retune(state.law, old.law, new.law))
 
-    def missed(state: ObserverState, measured: Measurements, params: ObserverParams) -> ObserverState:
+    def missed(state: Any, measured: Measurements, params: ObserverParams) -> Any:
         of_law = law.missed(state.law, measured, params.law)
         return predicted(state, of_law, measured.u_before, measured, params)
 
-    return ControlLaw(ObserverState, engage, step, limited, retune, missed, inner=law)
+    return ControlLaw(VaneObserverState if vanes else ObserverState, engage, step, limited, retune, missed, inner=law)

@@ -9,7 +9,8 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import blake2b
-from typing import Annotated, Any, ClassVar, Literal
+from itertools import combinations
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -41,7 +42,7 @@ from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART, Nominal, nominal_model, zero_dynamics
 from rise_di_controller.guard import DT_RANGE, GuardParams
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law, spectral_radius
-from rise_di_controller.observer import ObserverParams, with_observer
+from rise_di_controller.observer import ObserverParams, VaneParams, filter_matrix, with_observer, without_frozen
 from rise_di_controller.saturation import Limits
 
 MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop with an observer has to be stable
@@ -89,6 +90,30 @@ class FeedforwardConfig(Config):
         return nominal_model(A, B, C, gravity, np.array(self.lead), acts)
 
 
+class VanesConfig(Config):
+    """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by row."""
+
+    channels: Names = Field(description="the channels of y, which are states of the feedforward too, as alpha and beta")
+    H: Numbers = Field(description="a reading less that of the reference motion is H z: a row a vane, a column an estimate")
+    L: Numbers = Field(
+        description="what a vane adds to L: vane by vane a row an estimate, a column an output and one of the vane itself"
+    )
+    least: NonNegatives = Field(description="rms motion of a reading below which the vane counts as frozen and is left out")
+    time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
+
+    def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
+        """The arrays. Raises ParameterError for channels without a state, and for wrong sizes."""
+        k, s, m = len(self.channels), estimates, len(outputs)
+        expected = f"states of the feedforward that are no outputs: {', '.join(set(states) - set(outputs))}"
+        known = set(self.channels) <= set(states) - set(outputs) and len(set(self.channels)) == k
+        require(known, "observer.vanes.channels", ", ".join(self.channels), expected)
+        for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
+            found = len(getattr(self, key))
+            require(found == size, f"observer.vanes.{key}", f"{found} values", f"{size} for {k} vanes, {s} estimates")
+        least, L = np.array(self.least) ** 2, np.reshape(self.L, (k, s, m + 1))
+        return VaneParams(np.reshape(self.H, (k, s)), L, least, np.float64(self.time))
+
+
 class ObserverConfig(Config):
     """An observer of the nominal model, an extension of the paper, with its matrices as designed; SI, row by row."""
 
@@ -108,6 +133,7 @@ class ObserverConfig(Config):
     margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
         default=0.03, description="least delay margin, `delay` included, of a nominal linear loop that the controller loads, s"
     )
+    vanes: VanesConfig | None = Field(default=None, description="vanes beside y; none where absent")
 
     def matrices(self, nominal: Nominal) -> tuple[FloatArray, ...]:
         """Phi, Gamma, H, L and F. Raises ParameterError for sizes that do not match."""
@@ -283,17 +309,46 @@ class ControllerConfig(NodeConfig):
         for key, matrix in (("L", Phi @ (np.eye(len(Phi)) - L @ H)), ("F", Phi - Gamma @ F)):
             radius = spectral_radius(matrix)
             require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
+        flies = not self.vanes or observer.part > 0.0
+        require(flies, "observer.vanes", "part 0 beside it", "a part above 0: the observer flies")
         yield
-        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, nominal.C)
-        period, m = 1.0 / self.rate, len(self.inputs)
-        loop, law = Loop(np.array(self.lag), 0.0, period), linear_law(self.tuned_law(), m, period)
-        for part in MARGIN_PARTS:
-            late = part * max(observer.margin, self.delay)
-            stable = is_stable(plant, law, loop, np.full(m, late))
-            found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late"
-            expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
-            require(stable, "observer.margin", found, expected_margin)
-            yield
+        (law, params), period, m = self.tuned_law(), 1.0 / self.rate, len(self.inputs)
+        read = [[float(name == state) for state in self._model_states()] for name in self.vanes]
+        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, *read]))
+        loop = Loop(np.array(self.lag), 0.0, period)
+        for frozen in (some for count in range(len(read) + 1) for some in combinations(self.vanes, count)):
+            flown = without_frozen(params, [name in frozen for name in self.vanes])
+            without = f" without {' and '.join(frozen)}" if frozen else ""
+            radius = spectral_radius(filter_matrix(flown))
+            unstable = f"a spectral radius of {radius:.6g}{without}"
+            require(radius < 1.0, "observer.vanes.L", unstable, "less than 1: it is unstable")
+            linear = linear_law(TunedLaw(law, flown), m, period)
+            for part in MARGIN_PARTS:
+                late = part * max(observer.margin, self.delay)
+                stable = is_stable(plant, linear, loop, np.full(m, late))
+                found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late{without}"
+                expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
+                require(stable, "observer.margin", found, expected_margin)
+                yield
+
+    def _model_states(self) -> tuple[str, ...]:
+        return () if self.feedforward is None else self.feedforward.states
+
+    @property
+    def vanes(self) -> tuple[str, ...]:
+        """The channels of y for the observer alone."""
+        return () if self.observer is None or self.observer.vanes is None else self.observer.vanes.channels
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """The channels of y for the controller: the outputs, then the vanes."""
+        return (*self.outputs, *self.vanes)
+
+    def without_vanes(self) -> Self:
+        """The parameters with the observer of y alone."""
+        if self.observer is None or not self.vanes:
+            return self
+        return self.model_copy(update={"observer": self.observer.model_copy(update={"vanes": None})})
 
     def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """The values with changes by dotted name, not validated; None removes a parameter. Raises ParameterError."""
@@ -327,13 +382,17 @@ class ControllerConfig(NodeConfig):
         limits = Limits(part * bound.lower, part * bound.upper, rate)
         fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
         Phi, Gamma, H, L, F = self.observer.matrices(nominal)
-        return TunedLaw(with_observer(law), ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate)))
+        section, vanes = self.observer.vanes, None
+        if section is not None:
+            vanes = section.params(self.outputs, self._model_states(), len(Phi))
+        observed = ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate), vanes)
+        return TunedLaw(with_observer(law) if section is None else with_observer(law, vanes=True), observed)
 
     def logged_groups(self) -> dict[str, tuple[str, ...]]:
         """Groups of channels of `internals` and the names in each."""
         estimates = () if self.observer is None else self.observer.states
         effectors = () if self.allocation is None else self.allocation.effectors
-        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors)
+        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors, self.vanes)
 
     @property
     def effectors(self) -> tuple[str, ...]:
@@ -380,6 +439,7 @@ class ControllerConfig(NodeConfig):
             history=self.history_ticks(),
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=None if self.observer is not None and self.observer.part == 0.0 else self.nominal(),
+            vanes=tuple(self._model_states().index(name) for name in self.vanes),
         )
 
 

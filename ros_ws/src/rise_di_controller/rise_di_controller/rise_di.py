@@ -100,7 +100,7 @@ class RiseDiConfig(ControllerConfig):
             require(
                 self.allocation is None, "learn", "an allocation beside it", "none: A and B are those of the inputs of the law"
             )
-            require(self.allocation is None, "learn", "an allocation beside it", "none: a learner knows the inputs of the law")
+            require(not self.vanes, "learn", "observer.vanes beside it", "none: a learner designs the observer of y alone")
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
             spacing = self.learn.spacing()

@@ -47,6 +47,7 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     require(
         controller.allocation is None, "controller.allocation", "a section", "none: the C code has the inputs of the law alone"
     )
+    require(not controller.vanes, "controller.observer.vanes", "a section", "none: the C code has the observer of y alone")
     require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
     flies = controller.observer is None or controller.observer.part > 0.0
     require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")

@@ -117,7 +117,11 @@ def linear_loop(controller: ControllerConfig, airframe: Airframe, A: FloatArray,
     """
     rows, columns = law_order(airframe, controller)
     loop = loop_of(controller)
-    plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], airframe.matrix_c()[rows])
+    if not set(controller.vanes) <= set(airframe.states):  # y_dot = Omega u has no angles: the observer of y alone
+        controller = controller.without_vanes()
+    read = [[float(name == state) for state in airframe.states] for name in controller.vanes]
+    C = np.vstack([airframe.matrix_c()[rows], *read])
+    plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
     model = f"model: {airframe.name}"
     return LinearLoop(model, controller.inputs, plant, linear_law(controller.tuned_law(), len(rows), loop.period), loop)
 

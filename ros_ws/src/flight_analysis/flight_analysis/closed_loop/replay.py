@@ -23,7 +23,7 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, StoredFile, read_run
 from rise_di_controller import feedforward, guard, internals
 from rise_di_controller.control_law import TunedLaw, restored
-from rise_di_controller.guard import ControllerState, GuardParams
+from rise_di_controller.guard import ControllerState, GuardParams, Vanes
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import OF_NODE, ControllerConfig, as_controller
 
@@ -162,8 +162,8 @@ def _replay(
         require(listed, "changes", short_repr(changes), "a list of changes, each a mapping of dotted names")
     tape, parameters, changes = _recorded(run, parameters, changes)
     ticks = _Ticks(tape, parameters)
-    for key in ("outputs", "inputs", "effectors"):
-        wanted, found = getattr(parameters, key), getattr(others or parameters, key)
+    for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
+        wanted, found = getattr(parameters, names), getattr(others or parameters, names)
         require(found == wanted, f"controller.{key}", ", ".join(found), f"{', '.join(wanted)}, as recorded")
     in_force = _ParametersInForce(others or parameters, changes)
     computed, checked = np.full_like(ticks.values, np.nan), np.zeros(len(ticks.number), dtype=bool)
@@ -289,7 +289,10 @@ class _Ticks:
         self._engages = self.flies & (signal["dt"] == 0.0)
         self._offset_ns = np.round(signal["y_m_offset"] * NANOSECONDS).astype(np.int64)
         self._groups = {name: signal.group(name).values for name in groups}
-        self._y, self.y_found = _as_published(tape, "y", parameters.outputs, self.stamp_ns, self._groups["y"])
+        y = self._groups["y"]
+        if parameters.vanes:
+            y = np.column_stack([y, self._groups["vane"]])
+        self._y, self.y_found = _as_published(tape, "y", parameters.measured, self.stamp_ns, y)
         commanded = self._groups[internals.EFFECTOR if parameters.allocation is not None else "u"]
         u, self.u_found = _as_published(tape, "u", parameters.effectors, self.stamp_ns, commanded)
         self.values = np.column_stack([signal.values, u])
@@ -313,7 +316,8 @@ class _Ticks:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
         logged = ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
-        return logged._replace(effectors=effectors, effectors_failsafe=effectors)
+        vanes = Vanes(row["vane"], row["vane_m"]) if limits.vanes else None
+        return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)
 
     def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
         """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without output."""
@@ -329,7 +333,8 @@ class _Ticks:
         # After a gap the log has the feedforward's output but not its state: only the law is computed.
         only_law = limits.nominal is not None and state.mode is Mode.ENGAGED and state.feedforward is None
         u_ff = self._groups["u_ff"][k] if only_law else None
-        after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff)
+        vane_m = self._groups["vane_m"][k] if only_law and limits.vanes else None
+        after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff, vane_m)
         if used is None:
             return after, np.full(len(self.names), np.nan)
         late, age = float(self._signal["late"][k]), float(self._signal["age"][k])

@@ -244,6 +244,8 @@ def check_together(scenario: Scenario) -> None:
     unknown = [name for name in controller.outputs if name not in channels.outputs]
     measured = f"some of the outputs of {airframe}: {', '.join(channels.outputs)}"
     require(not unknown, "controller.outputs", ", ".join(controller.outputs), measured)
+    missing = [name for name in controller.vanes if name not in channels.outputs]
+    require(not missing, "controller.observer.vanes.channels", ", ".join(controller.vanes), "those of aircraft.vanes.channels")
     require_channels("reference_model.outputs", reference.outputs, controller.outputs, "those of controller.outputs")
     control_ns = period_ns(controller.rate, "controller.rate")
     for key, rate in (("aircraft.rate", scenario.aircraft.rate), ("reference_model.rate", reference.rate)):

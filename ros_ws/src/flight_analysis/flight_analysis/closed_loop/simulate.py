@@ -101,7 +101,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
     flight that diverges or is interrupted (Ctrl-C) ends early.
     """
     require_guidable(scenario)
-    outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
+    outputs, measured, inputs = scenario.controller.outputs, scenario.controller.measured, scenario.controller.effectors
     reference, controller = Reference(scenario.reference_model), control(scenario.controller)
     guidance = None if scenario.guidance is None else guide(scenario.guidance)
     learning = _learning(scenario.controller, learn, announce)
@@ -126,7 +126,7 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
             if t_ns % aircraft.period_ns == 0:
                 for sample in aircraft.sample(t_ns // aircraft.period_ns, u):
                     signals["y"].add(sample.stamp_ns, sample.value)
-                    controller.take_y(StampedVector(sample.stamp_ns, select(outputs, aircraft.outputs, sample.value)), t_ns)
+                    controller.take_y(StampedVector(sample.stamp_ns, select(measured, aircraft.outputs, sample.value)), t_ns)
                     if guidance is not None:
                         y = select(scenario.reference_model.outputs, aircraft.outputs, sample.value)
                         with suppress(ChannelError):  # refused, as by the node

@@ -56,7 +56,7 @@ from rise_di_controller.decomposition import DecompositionError, coupling, searc
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
-from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46, "climb": 0.46}
@@ -633,6 +633,16 @@ def yaml_template(text: str) -> Template:
 
 
 CONTROLLER_YAML = yaml_template("""\
+{% macro listed(keys, indent) %}
+{% for key, rows in keys.items() %}
+{{ " " * indent }}{{ key }}:
+{%- if rows is mapping %}
+
+{{ listed(rows, indent + 2) }}
+{%- else %} {{ rows if rows is string else "[" ~ rows | join(",\n" ~ " " * (indent + 3 + key | length)) ~ "]" }}
+{% endif %}
+{% endfor %}
+{% endmacro %}
 # Gains for the airframe {{ airframe }} {{ origin }}.
 {%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
 {%- if margins %}
@@ -647,10 +657,8 @@ CONTROLLER_YAML = yaml_template("""\
 {% endfor %}
 {% for name, (comment, keys) in sections.items() %}
     {{ name }}:  # an extension of the paper: {{ comment }}
-{% for key, rows in keys.items() %}
-      {{ key }}: {{ rows if rows is string else "[" ~ rows | join(",\n" ~ " " * (9 + key | length)) ~ "]" }}
-{% endfor %}
-{% endfor %}
+{{ listed(keys, 6) }}
+{%- endfor %}
 """)
 
 
@@ -737,21 +745,23 @@ def _shown_response(responses: FloatArray) -> str:
     return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
 
 
-def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, str | list[str]]]]:
+def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, Any]]]:
     """The sections allocation, feedforward and observer, if any: a comment, and each parameter in flow style."""
     along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
     corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
     distributes = "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
     comments = {"allocation": distributes, "feedforward": along, "observer": corrects}
     return {
-        name: (comment, _matrix_rows(section, _columns_of(section, len(controller.inputs))))
+        name: (comment, _matrix_rows(section, len(controller.inputs)))
         for name, comment in comments.items()
         if (section := getattr(controller, name)) is not None
     }
 
 
-def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig, m: int) -> dict[str, int]:
+def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, int]:
     """The columns of each matrix of a section."""
+    if isinstance(section, VanesConfig):
+        return {"H": len(section.H) // len(section.channels), "L": m + 1}
     if isinstance(section, AllocationConfig):
         return {"T": m, "effect": len(section.effectors)}
     n = len(section.states)
@@ -760,12 +770,14 @@ def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig, 
     return {"Phi": n, "Gamma": m, "L": m, "F": n}
 
 
-def _matrix_rows(
-    section: AllocationConfig | FeedforwardConfig | ObserverConfig, columns_of: Mapping[str, int]
-) -> dict[str, str | list[str]]:
+def _matrix_rows(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, Any]:
     """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an observer."""
-    rows: dict[str, str | list[str]] = {}
+    rows: dict[str, Any] = {}
+    columns_of = _columns_of(section, m)
     for key, value in section.model_dump(exclude_none=True).items():
+        if isinstance(value, dict):
+            rows[key] = _matrix_rows(getattr(section, key), m)
+            continue
         if not isinstance(value, tuple):
             rows[key] = yaml_flow(value)
             continue

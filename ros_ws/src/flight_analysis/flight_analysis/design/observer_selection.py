@@ -9,11 +9,14 @@ the extended-state observer are taken as slower.
 """
 
 from collections.abc import Callable, Mapping
+from itertools import product
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import AIR_STATE
 from aircraft_sim.turbulence import MODERATE, dryden
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.nominal_model import NominalModel
@@ -22,8 +25,10 @@ from control_laws.observer_design import (
     Names,
     ObserverDesign,
     Weights,
+    aircraft_model,
     aircraft_observer,
     extended_state_observer,
+    vane_correction,
 )
 from flight_analysis.closed_loop.margins import law_order, loop_of
 from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K, Condition, failing
@@ -38,11 +43,13 @@ from flight_analysis.design.requirement import (
 )
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
+from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import gain
-from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law, spectral_radius
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law, spectral_radius
 from rise_di_controller.margins import loop_margins
-from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig
+from rise_di_controller.observer import without_frozen
+from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 RELAXATION = 1.05
@@ -55,6 +62,9 @@ PATIENCE, PROGRESS = 20, 1.01  # the search ends after so many steps in which th
 DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 
 WORST_OF, WORST_UNCERTAINTY, WORST_SEED = 50, 0.3, 1  # uncertain aircraft whose least phase margin counts
+
+GUST_WITH_VANE = 2.0  # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
+STILL = 1.4  # of the noise of a vane: a motion of less counts as none
 
 SHARE = 0.9  # of the integral gain of PI that is Lambda; the rest is the slope of the softened sign
 
@@ -130,9 +140,11 @@ def with_aircraft_observer(
     noise: FloatArray,
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
+    vanes: Mapping[str, float] = MappingProxyType({}),
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
+    `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta.
     The phase margin is also that of WORST_OF uncertain aircraft. Raises ParameterError for an airframe with another D or
     without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
@@ -149,8 +161,24 @@ def with_aircraft_observer(
         return aircraft_observer(model, names, gains.weights._replace(effort=effort))
 
     A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF, WORST_SEED)
-    plant = LinearPlant(A + model.gravity, B[:, :, columns], model.C)
-    return _within_margin(base, model, plant, gains, design, margin, needed)
+    read = [[float(name == state) for state in airframe.states] for name in vanes]
+    plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *read]))
+    section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
+    return _within_margin(base, model, plant, gains, design, margin, needed, section)
+
+
+def _vanes(airframe: Airframe, model: NominalModel, names: Names, weights: Weights, vanes: Mapping[str, float]) -> VanesConfig:
+    """The section of the vanes: alpha and beta less the wind along their axes over V0."""
+    sampled, H, L = aircraft_model(model, names, weights.wind_time), [], []
+    blowing = {AIR_STATE[axis]: f"wind.{axis}" for axis in airframe.gusts}
+    for name, noise in vanes.items():
+        parts = {f"x.{name}": 1.0, blowing.get(name, ""): -1.0 / airframe.speed}
+        row = np.array([parts.get(state, 0.0) for state in sampled.states])
+        with_vane = weights._replace(gust=GUST_WITH_VANE * weights.gust)
+        H += row.tolist()
+        L += vane_correction(sampled, model, (weights, with_vane), row, noise).ravel().tolist()
+    least = [STILL * noise for noise in vanes.values()]
+    return VanesConfig(channels=tuple(vanes), H=tuple(H), L=tuple(L), least=tuple(least))
 
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
@@ -249,29 +277,32 @@ def _within_margin(
     design: Callable[[FloatArray], ObserverDesign],
     margin: float,
     needed: Requirement,
+    vanes: VanesConfig | None = None,
 ) -> SelectedObserver:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
     The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
-    The damping asked for is at most that of the zeros of the aircraft, which no feedback moves.
+    The damping asked for is at most the damping of the zeros of the aircraft: no feedback moves a zero.
     """
     loop = Loop(model.lag, 0.0, model.period)  # the delay margin counts the declared delay too
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
     needed = above_zeros(needed, nominal)
 
     def relaxed(relaxation: FloatArray) -> SelectedObserver:
-        controller = _parameters(base, model, gains, design(relaxation), relaxation)
-        law = linear_law(controller.tuned_law(), m, model.period)
-        delay = delay_margin(nominal, law, loop, longest=DELAYS * margin)
-        margins = loop_margins(nominal, law, loop_of(controller), together=False)
-        of_delay = delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
-        return SelectedObserver(
-            controller, delay, float(margins.phase.min()), min(of_delay, least_fraction(margins, needed)), relaxation
-        )
+        controller = _parameters(base, model, gains, design(relaxation), relaxation, vanes)
+        delays, phases, parts = [], [], []
+        for law in _laws(controller):
+            delays.append(delay_margin(nominal, law, loop, longest=DELAYS * margin))
+            margins = loop_margins(nominal, law, loop_of(controller), together=False)
+            phases.append(float(margins.phase.min()))
+            parts.append(least_fraction(margins, needed))
+        of_delay = min(delays) / (margin + RESOLUTION) if margin > 0.0 else 1.0
+        return SelectedObserver(controller, min(delays), min(phases), min(of_delay, *parts), relaxation)
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
-        law, uncertain = linear_law(controller.tuned_law(), m, model.period), plant._replace(A=plant.A[1:], B=plant.B[1:])
-        return np.asarray(loop_margins(uncertain, law, loop_of(controller), together=False).phase.min(axis=0))
+        uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
+        each = (loop_margins(uncertain, law, loop_of(controller), together=False) for law in _laws(controller))
+        return np.asarray(np.min([margins.phase.min(axis=0) for margins in each], axis=0))
 
     def stepped(channel: int) -> SelectedObserver:
         return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])
@@ -294,23 +325,39 @@ def _within_margin(
     checked["observer"]["margin"] = margin
     found = RiseDiConfig.validate_mapping(checked, "controller")
     return selected._replace(
-        controller=found, delay_margin=delay_margin(nominal, linear_law(found.tuned_law(), m, model.period), loop)
+        controller=found,
+        delay_margin=min(delay_margin(nominal, law, loop) for law in _laws(found)),
     )
 
 
+def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
+    """The linear laws of a controller, for every set of vanes in use."""
+    (law, params), period = controller.tuned_law(), 1.0 / controller.rate
+    sets = product((False, True), repeat=len(controller.vanes))
+    flown = (without_frozen(params, frozen) for frozen in sets)
+    return [linear_law(TunedLaw(law, of), len(controller.outputs), period) for of in flown]
+
+
 def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
-    """What the last step of the search lacks, in sentences."""
-    law = linear_law(selected.controller.tuned_law(), len(loop.lag), loop.period)
-    margins = loop_margins(nominal, law, loop_of(selected.controller), together=False)
+    """The margins missing at the last step of the search, in sentences."""
+    controller, lacking = selected.controller, []
+    for law in _laws(controller):
+        margins = loop_margins(nominal, law, loop_of(controller), together=False)
+        delay = Condition("delay margin (ms)", None, 1e3 * delay_margin(nominal, law, loop), 1e3 * margin)
+        failed = failing((delay, *nominal_conditions(margins, needed)))
+        lacking += [condition.sentence(controller.outputs) for condition in failed]
     phase = np.degrees(needed.of_uncertain)
     phases = f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
-    delay = Condition("delay margin (ms)", None, 1e3 * selected.delay_margin, 1e3 * margin)
-    lacking = failing((delay, *nominal_conditions(margins, needed)))
-    return "; ".join(condition.sentence(selected.controller.outputs) for condition in lacking) or phases
+    return "; ".join(dict.fromkeys(lacking)) or phases
 
 
 def _parameters(
-    base: RiseDiConfig, model: NominalModel, gains: ObserverGains, design: ObserverDesign, relaxation: FloatArray
+    base: RiseDiConfig,
+    model: NominalModel,
+    gains: ObserverGains,
+    design: ObserverDesign,
+    relaxation: FloatArray,
+    vanes: VanesConfig | None,
 ) -> RiseDiConfig:
     """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale: the same loop."""
     K = gains.K / relaxation
@@ -320,7 +367,7 @@ def _parameters(
     k_g = MIN_K - 1.0
     Phi, Gamma, L, F = (tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F))
     require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
-    observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0)
+    observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0, vanes=vanes)
     changes: dict[str, Any] = {
         "k_g": k_g,
         "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),

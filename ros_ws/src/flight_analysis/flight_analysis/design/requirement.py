@@ -77,11 +77,11 @@ def requirement(phase_margin: float, *, accept: bool = False) -> Requirement:
 
 
 def above_zeros(needed: Requirement, plant: LinearPlant) -> Requirement:
-    """A requirement with a damping that a loop around an aircraft can have: at most about that of its zeros.
+    """A requirement with a damping within reach of a loop around an aircraft: at most about the damping of the zeros.
 
     No feedback moves a zero, and a loop with small errors has modes near the zeros.
     """
-    zeros = invariant_zeros(plant.A, plant.B, plant.C)
+    zeros = invariant_zeros(plant.A, plant.B, plant.C[: plant.B.shape[-1]])  # without vanes
     modes = zeros[(np.abs(zeros.imag) > NO_MOTION) & (np.abs(zeros) > NO_MOTION)]
     least = float(np.min(-modes.real / np.abs(modes), initial=1.0))
     return needed._replace(damping=min(needed.damping, OF_ZERO * max(least, 0.0)))

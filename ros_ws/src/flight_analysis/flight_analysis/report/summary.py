@@ -173,7 +173,7 @@ def summarise(
         "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
         "guidance": guidance_summary(tape),
         "account": of.as_json(),
-        "notes": [*notes, *late_u(scenario, age), *tape.notes, *guidance_notices(tape, scenario.guidance)],
+        "notes": [*notes, *late_u(scenario, age), *tape.notes, *vane_notes(tape), *guidance_notices(tape, scenario.guidance)],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
 
@@ -234,6 +234,7 @@ def command_results(summary: Mapping[str, Any]) -> str:
     return "; ".join(parts)
 
 
+STANDS_STILL = 5.0  # s, after which a vane at the end of a flight is named
 BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 
 
@@ -279,6 +280,19 @@ def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -
         end = "the end of the log" if engagement["stop"] is None else f"{engagement['stop']:.1f} s: {engagement['reason']}"
         sentences.append(f"engaged from {engagement['start']:.1f} s to {end}")
     return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
+
+
+def vane_notes(tape: Tape) -> list[str]:
+    """Sentences on vanes of an observer at a standstill at the end of a flight."""
+    if "internals" not in tape:
+        return []
+    measures, t, notes = tape["internals"].group("vane_measures"), tape.time("internals"), []
+    for name in measures.names:
+        moved = np.flatnonzero(measures[name] != 0.0)
+        since = float(t[moved[-1]] if len(moved) else t[0])
+        if t[-1] - since > STANDS_STILL:
+            notes.append(f"vane {name} stands still from t = {since:.1f} s on and is left out: frozen, or in calm air")
+    return notes
 
 
 def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class Table(NamedTuple):
 
 
 class Event(NamedTuple):
-    """A gust, a failsafe mode or a saturation, from the first to the last instant in s."""
+    """A gust, a failsafe mode, a saturation or a still vane, from the first to the last instant in s."""
 
     name: str
     start: float
@@ -78,7 +78,7 @@ class Event(NamedTuple):
 
 
 def events(tape: Tape, gusts: Windows) -> list[Event]:
-    """Gusts, modes other than ENGAGED, and saturations of the inputs, in order of the start."""
+    """Gusts, modes other than ENGAGED, saturations of the inputs, and still vanes, in order of the start."""
     listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
@@ -93,6 +93,11 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
                 listed.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
+        measures = tape["internals"].group("vane_measures")
+        for name in measures.names:
+            if (still := measures[name] == 0.0).any():
+                first, last = t[still][[0, -1]]
+                listed.append(Event(f"vane {name} stands still: left out", first, last, f"{still.sum()} of {len(still)} ticks"))
     return sorted(listed, key=lambda event: event.start)
 
 
