@@ -370,6 +370,18 @@ def test_polygon_without_all_corners_is_no_smaller_fence(rows: Any, sentence: st
         read_fence_file(path, ZURICH)
 
 
+def test_zone_that_is_not_told_to_keep_in_or_out_refused(tmp_path: Path) -> None:
+    """A text such as "no" is true in many languages, and would turn the fence inside out."""
+    path = tmp_path / "fence.geojson"
+    path.write_text(json.dumps(GEOJSON_FENCE).replace("true", '"no"'), encoding="utf-8")
+    with pytest.raises(ParameterError, match="exclude: 'no', expected true or false"):
+        read_fence_file(path, ZURICH)
+    path = tmp_path / "fence.plan"
+    path.write_text(json.dumps(PLAN_FENCE).replace('"inclusion"', '"Inclusion"'), encoding="utf-8")
+    with pytest.raises(ParameterError, match="inclusion: None, expected true or false"):
+        read_fence_file(path)
+
+
 def test_file_without_fence_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.geojson"
     path.write_text(json.dumps({"type": "LineString", "coordinates": [[8.5, 47.4], [8.51, 47.4]]}), encoding="utf-8")

@@ -507,10 +507,10 @@ def _plan_fence(tree: Any, key: str) -> FencePlaces:
     zones = []
     for zone in _entries(fence, "polygons", key):
         corners = [_lat_lon(corner) for corner in _listed(_member(zone, "polygon"), key)]
-        zones.append(Area(corners, None, not _member(zone, "inclusion")))
+        zones.append(Area(corners, None, not _flag(zone, "inclusion", None, key)))
     for zone in _entries(fence, "circles", key):
-        circle = _member(zone, "circle")
-        zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not _member(zone, "inclusion")))
+        circle, inclusion = _member(zone, "circle"), _flag(zone, "inclusion", None, key)
+        zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not inclusion))
     rally = [_lat_lon(point, Above.HOME) for point in _entries(_member(tree, "rallyPoints"), "points", key)]
     back = _member(fence, "breachReturn")
     home = _home(_member(_member(tree, "mission"), "plannedHomePosition"))
@@ -525,7 +525,7 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
         node, properties = _member(feature, "geometry") or feature, _member(feature, "properties")
         kind, coordinates = _member(node, "type"), _listed(_member(node, "coordinates"), key)
         require(kind in ("Polygon", "MultiPolygon", "Point"), key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
-        exclude, radius = bool(_member(properties, "exclude")), _member(properties, "radius")
+        exclude, radius = _flag(properties, "exclude", False, key), _member(properties, "radius")
         if kind == "Point":
             require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
             zones.append(Area([_lon_lat(coordinates)], radius, exclude))
@@ -577,6 +577,13 @@ def _entries(tree: Any, name: str, key: str) -> list[Any]:
     value = _member(tree, name)
     require(value is None or isinstance(value, list), key, f"{name}: {short_repr(value)}", "a list")
     return list(value or ())
+
+
+def _flag(tree: Any, name: str, absent: bool | None, key: str) -> bool:
+    """A member of a JSON object that is true or false, also as 1 or 0; `absent`: its value where the object lacks it."""
+    value = absent if _member(tree, name) is None else tree[name]
+    require(value in (True, False), key, f"{name}: {short_repr(value)}", "true or false")
+    return bool(value)
 
 
 def _listed(value: Any, key: str) -> list[Any]:
