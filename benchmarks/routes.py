@@ -116,6 +116,8 @@ def duration(route: Route, section: GuidanceConfig) -> float:
     for k, leg in enumerate(route.legs):
         if isinstance(leg, Line):
             length += path.length(leg)
+            if path.turns_back(leg, next(iter(route.legs[k + 1 :]), None)):
+                length += 4.0 * math.pi * route.radius  # at most two turns to join the next leg
         elif path.is_orbit(leg):
             length += 2.0 * math.pi * route.radius * (leg.end is not None)
             change = route.altitude[k] - route.from_altitude[k]
