@@ -49,6 +49,14 @@ def test_gust_has_peak_and_length_of_formula(H: float, peak: float) -> None:
     assert speeds == pytest.approx([0.0, 0.0, 0.5 * peak, peak, 0.5 * peak, 0.0, 0.0], rel=1e-6, abs=1e-9)
 
 
+def test_gust_comes_again_after_its_time() -> None:
+    once, again = single(Gusts, 2.0, 5.0, 15.0), single(Gusts, 2.0, 5.0, 15.0, 7.0)
+    t = np.linspace(0.0, 6.0, 50)[:, None]
+    np.testing.assert_array_equal(one_minus_cosine(t, again, np.array(V0)), one_minus_cosine(t, once, np.array(V0)))
+    later = one_minus_cosine(t + 21.0, again, np.array(V0))[t > 2.0]  # before the first entry there was none
+    assert later == pytest.approx(one_minus_cosine(t, once, np.array(V0))[t > 2.0], abs=1e-12)
+
+
 def test_wind_along_axis_changes_relative_velocity() -> None:
     # x_rel = x - w gives minus the column of V, of beta = v / V0 and, published to three digits, of alpha = w / V0.
     osprey = load_airframe("osprey")

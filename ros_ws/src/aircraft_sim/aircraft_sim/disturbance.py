@@ -25,6 +25,7 @@ class Gusts(NamedTuple):
     start: Array  # (G,) instant of entry, s
     speed: Array  # (G,) peak speed U_ds, m/s
     length: Array  # (G,) distance H from entry to peak, m, > 0
+    every: Array | None = None  # (G,) time after which each comes again, s, > 0, infinite for never; None: none does
 
 
 class Bias(NamedTuple):
@@ -44,14 +45,17 @@ class Sines(NamedTuple):
 
 
 def one_minus_cosine(t: Array, gusts: Gusts, airspeed: Array) -> Array:
-    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 (t - start) clipped to [0, 2H].
+    """Speeds of the gusts in m/s, shape (G,): w = U_ds/2 (1 - cos(pi s/H)), s = V0 ((t - start) mod every) up to 2H.
 
-    Zero before entry and after 2H/V0 seconds. The derivative is continuous and at most U_ds/2 pi V0/H, which meets Assumption
-    2. Source of the form: FAR/CS 25.341(a).
+    Zero before entry, and after 2H/V0 seconds until it comes again. The derivative is continuous and at most U_ds/2 pi V0/H,
+    which meets Assumption 2. Source of the form: FAR/CS 25.341(a).
     """
     xp = array_namespace(gusts.speed)
+    since = t - gusts.start
+    if gusts.every is not None:
+        since = xp.where(since > 0.0, since % gusts.every, since)
     # minimum and maximum are several times faster than clip, which checks the types of its limits first
-    s = xp.minimum(xp.maximum(airspeed * (t - gusts.start) / gusts.length, 0.0), 2.0)
+    s = xp.minimum(xp.maximum(airspeed * since / gusts.length, 0.0), 2.0)
     return gusts.speed / 2.0 * (1.0 - xp.cos(xp.pi * s))
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the simulated aircraft, validated once, and their conversion to the arrays of the equations."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal, NamedTuple
 
@@ -45,6 +46,9 @@ class Gust(Config):
     start: NonNegative = Field(description="the instant of entry, s")
     speed: Number = Field(description="the peak speed U_ds, m/s")
     length: Positive = Field(description="the distance H from entry to peak, m")
+    every: Annotated[float, Field(gt=0, allow_inf_nan=True)] = Field(
+        default=math.inf, description="after how long it comes again, s; .inf is never"
+    )
 
 
 class TurbulenceConfig(Config):
@@ -433,7 +437,8 @@ class AircraftConfig(NodeConfig):
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
         """The gusts as arrays, along these axes."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
-        return Gusts(*(np.array([getattr(gust, key) for gust in gusts]) for key in Gusts._fields))
+        start, speed, length, every = (np.array([getattr(gust, key) for gust in gusts]) for key in Gust.model_fields)
+        return Gusts(start, speed, length, every if np.isfinite(every).any() else None)
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
         section = self.turbulence

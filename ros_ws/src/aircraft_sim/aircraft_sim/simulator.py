@@ -5,6 +5,7 @@
 The node and the loop in one process use this simulator, for every kind of aircraft.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -200,6 +201,7 @@ class Simulator:
                 continue
             require(gust.start >= t, f"gusts.{axis}.start", f"{gust.start:g} s", f"at least t = {t:g} s")
             end = old.start + 2.0 * old.length / self._speed if old is not None and old.speed else t
+            end = math.inf if old is not None and old.speed and math.isfinite(old.every) else end
             over = old is None or t <= old.start or end <= t
             require(over, f"gusts.{axis}", "a change of a gust that acts", f"one after its end at t = {end:g} s")
         if (drift := parameters.drift) != (before := self._drift_section):
