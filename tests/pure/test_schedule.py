@@ -138,7 +138,7 @@ def test_without_section_nothing_logged_and_nothing_changes() -> None:
 
 @pytest.mark.parametrize("name", ["osprey_observer"])
 def test_model_of_trim_beside_schedule_refused(name: str) -> None:
-    with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer beside it, expected neither"):
+    with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer that holds at the trim speed"):
         find_scenario(name).vary(controller={"schedule": {"speed": 25.0}})
 
 

@@ -68,6 +68,10 @@ def build_course(scenario: Scenario) -> Course:
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
     fixed = getattr(controller, "learn", None) is None
     require(fixed, "controller.learn", "a section", "none: a campaign does not learn, rise-di fly --in-process does")
+    at_trim = controller.guard().over_speed is None
+    require(
+        at_trim, "controller.schedule", "models at other speeds", "none: the aircraft of a campaign fly at their trim speed"
+    )
     allocation = controller.allocation
     require(allocation is None, "controller.allocation", "a section", "none: many aircraft at once fly the inputs of the law")
     airframe, plant = aircraft.load()[0], aircraft.plant()

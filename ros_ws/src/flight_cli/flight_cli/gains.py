@@ -30,7 +30,7 @@ from rise_di.gain_design import check_gains, select_gains
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "phase_margin", "mixing")
+PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "speeds", "phase_margin", "mixing")
 """Options of which `select_gains` says what is wrong, beside those of the loop."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
@@ -71,6 +71,12 @@ def gains(
         str | None, typer.Option(help="Airframe that the observer takes as its model, as rise-di identify --log writes it.")
     ] = None,
     margin: Annotated[float, typer.Option(help="Least delay margin of the nominal loop with the observer, s.")] = 0.03,
+    speeds: Annotated[
+        str | None,
+        typer.Option(
+            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a schedule that flies them."
+        ),
+    ] = None,
     phase_margin: Annotated[
         float, typer.Option(help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.")
     ] = PHASE_MARGIN,
@@ -129,6 +135,7 @@ def gains(
                 observer=observer,
                 model=model,
                 margin=margin,
+                speeds=() if speeds is None else parse_numbers(speeds) or speeds,
                 phase_margin=phase_margin,
                 accept=accept,
                 mixing=mixing,

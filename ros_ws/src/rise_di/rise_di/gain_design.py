@@ -32,6 +32,7 @@ MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
 PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
+LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # parts of the trim speed, within the range of the schedule's factor
 
 
 def select_gains(
@@ -51,6 +52,7 @@ def select_gains(
     observer: bool = False,
     model: FilePath | Airframe | None = None,
     margin: float = 0.03,
+    speeds: ArrayLike = (),
     phase_margin: float = PHASE_MARGIN,
     accept: bool = False,
     mixing: str = DIAGONAL,
@@ -76,6 +78,8 @@ def select_gains(
         observer: Whether they have a feedforward and an observer, and gains beside these.
         model: Airframe that the observer takes as its model; None: the airframe itself.
         margin: Least delay margin of the nominal loop with the observer, s.
+        speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A schedule flies the observer
+            from the one to the other. Empty: the observer holds at the trim speed alone.
         phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a sensitivity of at most 2 and
             a damping of 0.4; 35 deg with the observer.
         accept: Whether less than 40 deg are accepted.
@@ -100,12 +104,19 @@ def select_gains(
     )
     require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
+    ratios = as_numbers(speeds, "speeds", expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4")
+    require(
+        observer or not ratios, "speeds", speeds, "observer beside them: the bare law follows the airspeed by schedule alone"
+    )
+    pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
+    fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
+    require(fits, "speeds", speeds, f"{expected}, from {LEAST_SPEED:g} to {MOST_SPEED:g}")
     known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
     selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
     if not observer:
         return selection
     needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
-    controller, origin = observed(selection.chosen, chosen, known_model, margin, needed)
+    controller, origin = observed(selection.chosen, chosen, known_model, margin, needed, speeds=pair)
     return replace(selection, chosen=controller, origin=origin)
 
 
@@ -254,12 +265,16 @@ def observed(
     model: Airframe,
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
+    *,
+    uncertain: bool = True,
+    speeds: tuple[float, float] | None = None,
 ) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
     The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
     where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
-    margins change least, then the one of the least cost.
+    margins change least, then the one of the least cost. `uncertain` counts the phase margin of uncertain aircraft too, and
+    `speeds` are two ratios to the trim speed, with models there.
     """
     channels = scenario.aircraft.channels().outputs
     by_name = dict(zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True))
@@ -283,7 +298,10 @@ def observed(
     selected, refusal = [], None
     for gains, origin in candidates:
         try:
-            selected.append((with_aircraft_observer(controller, model, gains, noise, margin, needed, vanes), origin))
+            found = with_aircraft_observer(
+                controller, model, gains, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds
+            )
+            selected.append((found, origin))
         except ParameterError as error:  # another gain set may have the margin
             refusal = error
     if refusal is not None and not selected:

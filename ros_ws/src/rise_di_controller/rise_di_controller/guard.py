@@ -25,6 +25,7 @@ from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
 from rise_di_controller.saturation import Limits, saturate
+from rise_di_controller.schedule import OverSpeed, nominal_at
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of the difference more than 20 times.
@@ -47,6 +48,7 @@ class GuardParams(NamedTuple):
     history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
     vanes: tuple[int, ...] = ()  # states of the nominal model read by vanes; the readings follow the outputs in y
+    over_speed: OverSpeed | None = None  # the nominal model over the airspeed, beside a schedule; None: the one of the trim
 
 
 # The measured dt is clipped to this range of periods. The upper end integrates lost ticks in full: with half of the ticks
@@ -197,7 +199,7 @@ def tick(
         for _ in range(missed):
             law_state = control_law.missed(law_state, held, params)
     if guard.nominal is not None and ff_state is not None:
-        ff_state, u_ff = feedforward.step(ff_state, reference, dt, guard.nominal)
+        ff_state, u_ff = feedforward.step(ff_state, reference, dt, _nominal(guard.nominal, guard, law_state))
         u_trim = u_trim + u_ff
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
@@ -219,6 +221,11 @@ def tick(
         law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
     )
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def _nominal(nominal: Nominal, guard: GuardParams, law: Any) -> Nominal:
+    """The nominal model of the feedforward, at the speed of a schedule if there is one."""
+    return nominal if guard.over_speed is None else nominal_at(nominal, guard.over_speed, law.scale)
 
 
 def _vanes(

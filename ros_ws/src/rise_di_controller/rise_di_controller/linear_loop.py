@@ -61,7 +61,9 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     linear anywhere.
     """
     control_law, params = law
-    of_law = getattr(params, "law", params)  # the law under an observer or a schedule
+    of_law = params
+    while hasattr(of_law, "law"):  # under an observer or a schedule
+        of_law = of_law.law
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     sets = () if candidates is None else (candidates,)

@@ -2,20 +2,44 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 
 from flight_core.fields import Field
-from flight_core.parameters import Config, Positive, Positives, require, require_length
+from flight_core.parameters import Config, Numbers, ParameterError, Positive, Positives, require, require_length
+from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, TunedLaw
+from rise_di_controller.guard import GuardParams
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.schedule import ScheduleParams, with_schedule
+from rise_di_controller.schedule import (
+    OverSpeed,
+    ScheduleParams,
+    nominal_at,
+    nominal_side_by_side,
+    observer_at,
+    over_speed,
+    side_by_side,
+    with_schedule,
+)
 
 HISTORY = 5.0  # s, over which a new observer runs before it flies: its disturbances then hold what the law held
+
+
+class SpeedConfig(Config):
+    """The models of feedforward and observer at another airspeed. SI units, matrices row by row as in these sections."""
+
+    ratio: Positive = Field(description="this airspeed over the trim speed")
+    A: Numbers = Field(description="A of the feedforward")
+    B: Numbers = Field(description="B of the feedforward")
+    gravity: Numbers | None = Field(default=None, description="gravity of the feedforward")
+    Phi: Numbers = Field(description="Phi of the observer")
+    Gamma: Numbers = Field(description="Gamma of the observer")
+    L: Numbers = Field(description="L of the observer")
+    F: Numbers = Field(description="F of the observer")
 
 
 class ScheduleConfig(Config):
@@ -23,12 +47,15 @@ class ScheduleConfig(Config):
 
     speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s: airspeed is speed + V of y")
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
+    slow: SpeedConfig | None = Field(
+        default=None, description="beside an observer: models below the trim speed; between the speeds they are interpolated"
+    )
+    fast: SpeedConfig | None = Field(default=None, description="beside an observer: models above the trim speed")
 
-    def extended(self, law: TunedLaw, outputs: Sequence[str]) -> TunedLaw:
-        """A law with the schedule."""
-        airspeed = np.array([float(name == "V") for name in outputs])
-        params = ScheduleParams(law.params, np.float64(self.speed), airspeed, np.float64(self.time))
-        return TunedLaw(with_schedule(law.control_law), params)
+    @property
+    def models(self) -> tuple[SpeedConfig, ...]:
+        """The models at other speeds: two, or none."""
+        return () if self.slow is None or self.fast is None else (self.slow, self.fast)
 
 
 class LearnConfig(Config):
@@ -92,9 +119,7 @@ class RiseDiConfig(ControllerConfig):
         if isinstance(self.softening, tuple):
             require_length("softening", self.softening, self.outputs)
         if self.schedule is not None:
-            require("V" in self.outputs, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them")
-            alone = self.feedforward is None and self.observer is None
-            require(alone, "schedule", "a feedforward or an observer beside it", "neither: their model holds at the trim speed")
+            self._check_schedule(self.schedule)
         if self.learn is not None:
             require(self.observer is not None, "learn", "no observer", "one, with part 0 if it does not fly yet")
             require(
@@ -107,10 +132,93 @@ class RiseDiConfig(ControllerConfig):
             least = f"at most {spacing:g} s, the shortest time between two identifications"
             require(self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least)
 
+    def _check_schedule(self, schedule: ScheduleConfig) -> None:
+        """V is an output, and a feedforward and an observer beside it have models below and above the trim speed."""
+        require("V" in self.outputs, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them")
+        if self.feedforward is None and self.observer is None:
+            require(
+                schedule.slow is None and schedule.fast is None,
+                "schedule",
+                "models at other speeds",
+                "none without an observer",
+            )
+            return
+        both = self.observer is not None and len(schedule.models) == len(("slow", "fast"))
+        expected = "an observer with slow and fast, as rise-di gains --observer --speeds writes them"
+        require(both, "schedule", "a feedforward or an observer that holds at the trim speed alone", expected)
+        slow, fast = (model.ratio for model in schedule.models)
+        require(slow < 1.0 < fast, "schedule", f"ratios of {slow:g} and {fast:g}", "one below 1 and one above")
+        require(self.learn is None, "learn", "a schedule beside it", "none: a model is learned at one speed")
+        require(not self.vanes, "observer.vanes", "a schedule beside them", "none: they read the model of the trim speed")
+
+    def checks(self) -> Iterator[None]:
+        """Beside models at other speeds: of the controller at the trim speed, at these speeds, and halfway to each of them."""
+        if self.schedule is None or not self.schedule.models:
+            yield from super().checks()
+            return
+        yield from self.model_copy(update={"schedule": None}).checks()
+        self.check_law()
+        slow, fast = (model.ratio for model in self.schedule.models)
+        for ratio in (slow, (1.0 + slow) / 2.0, (1.0 + fast) / 2.0, fast):
+            try:
+                yield from self.at_speed(ratio).checks()
+            except ParameterError as error:
+                raise ParameterError(f"schedule, at {ratio:.3g} of the trim speed: {error}") from None
+
+    def at_speed(self, ratio: float) -> Self:
+        """The parameters that fly at a part of the trim speed in steady flight, with the models of there and no schedule."""
+        params, guard = self.tuned_law().params, self.guard()
+        assert guard.nominal is not None and guard.over_speed is not None  # noqa: S101, PT018 - the schedule has models
+        scale = params.airspeed + (1.0 - params.airspeed) / ratio**2
+        sections: dict[str, Any] = {}
+        for key, matrices, names in (
+            ("feedforward", nominal_at(guard.nominal, guard.over_speed, scale), ("A", "B", "gravity")),
+            ("observer", observer_at(params, scale), ("Phi", "Gamma", "L", "F")),
+        ):
+            values = {name: tuple(getattr(matrices, name).ravel().tolist()) for name in names}
+            sections[key] = getattr(self, key).model_copy(update=values)
+        input_scale = tuple((np.array(self.input_scale) * scale).tolist())
+        return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
+
+    def _airspeed(self) -> FloatArray:
+        return np.array([float(name == "V") for name in self.outputs])
+
+    def _over_speed(self, matrices: Callable[["RiseDiConfig", FloatArray], FloatArray]) -> OverSpeed | None:
+        """Matrices of these parameters, and with the models at the other speeds, with the factors of input_scale there."""
+        if self.schedule is None or not self.schedule.models:
+            return None
+        airspeed, values = self._airspeed(), []
+        for model in (None, *self.schedule.models):
+            ratio, changed = 1.0, dict[str, Any]()
+            if model is not None:
+                ratio, keys = model.ratio, {"feedforward": ("A", "B", "gravity"), "observer": ("Phi", "Gamma", "L", "F")}
+                for section, names in keys.items():
+                    own = {name: getattr(model, name) for name in names}
+                    changed[section] = getattr(self, section).model_copy(update=own)
+            values.append(
+                matrices(self.model_copy(update=changed | {"schedule": None}), airspeed + (1.0 - airspeed) / ratio**2)
+            )
+        slow, fast = (model.ratio for model in self.schedule.models)
+        return over_speed((slow, fast), (values[0], values[1], values[2]), airspeed)
+
+    def guard(self) -> GuardParams:
+        """Also the models of the feedforward over the airspeed."""
+
+        def of_feedforward(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
+            nominal = config.nominal()
+            assert nominal is not None  # noqa: S101 - beside an observer
+            return nominal_side_by_side(nominal, scale)
+
+        return super().guard()._replace(over_speed=self._over_speed(of_feedforward))
+
     def tuned_law(self) -> TunedLaw:
         """The law with parameters, extended by the observer or the schedule, if any."""
         law = super().tuned_law()
-        return law if self.schedule is None else self.schedule.extended(law, self.outputs)
+        if self.schedule is None:
+            return law
+        over = self._over_speed(lambda config, scale: side_by_side(config.tuned_law().params, scale))
+        speed, time = np.float64(self.schedule.speed), np.float64(self.schedule.time)
+        return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
 
     def history_ticks(self) -> int:
         """HISTORY where the models are learned."""

@@ -4,19 +4,55 @@
 
 A control surface answers with the dynamic pressure: Omega grows with V^2, and the delay margin of fixed gains falls as much.
 The schedule keeps Omega input_scale near the value of the trim. The schedule extends a law with the parameter input_scale; the
-law's own equations do not change.
+law's own equations do not change. The models of a feedforward and of an observer beside it are those of the airspeed too.
 """
 
 import math
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
-from flight_core.vectors import Array, array_namespace
+import numpy as np
+
+from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements
+from rise_di_controller.feedforward import Nominal
+from rise_di_controller.observer import ObserverParams
 from rise_di_controller.saturation import Limits
 
 SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
+
+
+class OverSpeed(NamedTuple):
+    """Matrices side by side over the airspeed: at + d (slope + d curvature), with d = V / V0 - 1 from `least` to `most`.
+
+    What turns y_dot into u, as F of an observer and the inverse of Omega, is over the factor of input_scale.
+    """
+
+    at: Array  # (k, l)
+    slope: Array
+    curvature: Array
+    least: float
+    most: float
+    airspeed: Array  # (m,) 1 for the output V, else 0
+
+    def matrices(self, scale: Array) -> Array:
+        """The matrices where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
+        xp = array_namespace(scale)
+        d = 1.0 / xp.sqrt(xp.max((1.0 - self.airspeed) * scale, axis=0)) - 1.0
+        d = xp.minimum(xp.maximum(d, self.least + 0.0 * d), self.most + 0.0 * d)
+        return self.at + d * (self.slope + d * self.curvature)
+
+
+def over_speed(
+    ratios: tuple[float, float], values: tuple[FloatArray, FloatArray, FloatArray], airspeed: FloatArray
+) -> OverSpeed:
+    """Through `values` at the trim speed and at two ratios to it, the first below 1 and the second above."""
+    at, slow, fast = values
+    least, most = (ratio - 1.0 for ratio in ratios)
+    curvature = ((fast - at) / most - (slow - at) / least) / (most - least)
+    return OverSpeed(at, (slow - at) / least - least * curvature, curvature, least, most, airspeed)
 
 
 class ScheduleParams(NamedTuple):
@@ -26,6 +62,7 @@ class ScheduleParams(NamedTuple):
     speed: Array  # () trim speed V0, m/s
     airspeed: Array  # (m,) 1 for the output V, else 0
     time: Array  # () time constant, s
+    observer: OverSpeed | None = None  # [Phi, Gamma, L, F'], the law being one with an observer
 
 
 class ScheduleState(NamedTuple):
@@ -53,6 +90,39 @@ def target_scale(y: Array, params: ScheduleParams) -> Array:
     return params.airspeed + (1.0 - params.airspeed) * (ratio * ratio)
 
 
+def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
+    """[Phi, Gamma, L, F'] of an observer with the factors `scale` of input_scale, (s, s + 3 m)."""
+    return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
+
+
+def observer_at(params: ScheduleParams, scale: Array) -> ObserverParams:
+    """The observer's parameters at a speed."""
+    observer: ObserverParams = params.law
+    if params.observer is None:
+        return observer
+    matrices, (s, m) = params.observer.matrices(scale), np.shape(observer.Gamma)
+    F = matrices[:, s + 2 * m :].T * scale[:, None]
+    return observer._replace(Phi=matrices[:, :s], Gamma=matrices[:, s : s + m], L=matrices[:, s + m : s + 2 * m], F=F)
+
+
+def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
+    """[A, gravity, B, path A, path gravity, inverse'] of a feedforward with the factors `scale`; the last in n rows."""
+    n, m = nominal.B.shape
+    inverse = np.zeros((n, m))
+    inverse[:m] = (nominal.inverse / scale[:, None]).T
+    return np.hstack([nominal.A, nominal.gravity, nominal.B, nominal.path_A, nominal.path_gravity, inverse])
+
+
+def nominal_at(nominal: Nominal, over: OverSpeed, scale: Array) -> Nominal:
+    """The nominal model of the feedforward at a speed."""
+    n, m = nominal.B.shape
+    matrices = over.matrices(scale)
+    ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
+    A, gravity, B, path_A, path_gravity, inverse = (matrices[:, first:last] for first, last in pairwise(ends))
+    inverse = inverse[:m].T * scale[:, None]
+    return nominal._replace(A=A, gravity=gravity, B=B, path_A=path_A, path_gravity=path_gravity, inverse=inverse)
+
+
 @lru_cache(maxsize=64)
 def with_schedule(law: ControlLaw) -> ControlLaw:
     """A control law with input_scale scheduled over the dynamic pressure:
@@ -60,17 +130,25 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         scale += min(dt / time, 1) (target_scale(y) - scale)
         the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
-    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y).
+    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An observer keeps its
+    estimates, which have the same meaning at every speed, and u_o goes on to -F z at its own rate.
     """  # noqa: D400, D415 - what follows is an equation
 
-    def at(params: ScheduleParams, scale: Array) -> Any:
+    def scaled(params: ScheduleParams, scale: Array) -> Any:
+        if isinstance(params.law, ObserverParams):
+            of_law = params.law.law
+            return params.law._replace(law=of_law._replace(input_scale=of_law.input_scale * scale))
         return params.law._replace(input_scale=params.law.input_scale * scale)
+
+    def at(params: ScheduleParams, scale: Array) -> Any:
+        known = params if params.observer is None else params._replace(law=observer_at(params, scale))
+        return scaled(known, scale)
 
     def followed(state: ScheduleState, y: Array, dt: Array, params: ScheduleParams) -> ScheduleState:
         xp = array_namespace(y)
         part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
         scale = state.scale + part * (target_scale(y, params) - state.scale)
-        return ScheduleState(law.retune(state.law, at(params, state.scale), at(params, scale)), scale)
+        return ScheduleState(law.retune(state.law, scaled(params, state.scale), scaled(params, scale)), scale)
 
     def engage(measured: Measurements, params: ScheduleParams) -> ScheduleState:
         scale = target_scale(measured.y, params)
@@ -89,7 +167,7 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         return state._replace(law=of_law), u_free, u
 
     def retune(state: ScheduleState, old: ScheduleParams, new: ScheduleParams) -> ScheduleState:
-        return state._replace(law=law.retune(state.law, at(old, state.scale), at(new, state.scale)))
+        return state._replace(law=law.retune(state.law, scaled(old, state.scale), scaled(new, state.scale)))
 
     def missed(state: ScheduleState, measured: Measurements, params: ScheduleParams) -> ScheduleState:
         return state._replace(law=law.missed(state.law, measured, at(params, state.scale)))

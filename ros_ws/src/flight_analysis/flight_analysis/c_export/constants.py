@@ -49,6 +49,8 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     )
     require(not controller.vanes, "controller.observer.vanes", "a section", "none: the C code has the observer of y alone")
     require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
+    at_trim = controller.schedule is None or not controller.schedule.models
+    require(at_trim, "controller.schedule", "models at other speeds", "none: the C code has those of the trim speed")
     flies = controller.observer is None or controller.observer.part > 0.0
     require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")
     some = controller.feedforward is not None and controller.feedforward.inputs is not None

@@ -714,7 +714,7 @@ def section_yaml(
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(
-            exclude_defaults=True, exclude={"allocation", "feedforward", "observer"}
+            exclude_defaults=True, exclude={"allocation", "feedforward", "observer", "schedule"}
         ).items()
     ]
     return CONTROLLER_YAML.render(
@@ -751,11 +751,19 @@ def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tup
     corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
     distributes = "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
     comments = {"allocation": distributes, "feedforward": along, "observer": corrects}
-    return {
+    sections = {
         name: (comment, _matrix_rows(section, len(controller.inputs)))
         for name, comment in comments.items()
         if (section := getattr(controller, name)) is not None
     }
+    if isinstance(controller, RiseDiConfig) and (schedule := controller.schedule) is not None:
+        rows: dict[str, str | list[str]] = {"speed": yaml_flow(schedule.speed), "time": yaml_flow(schedule.time)}
+        for name, model in (("slow", schedule.slow), ("fast", schedule.fast)):
+            if model is not None:
+                values = (f"{key}: {yaml_flow(value, 10)}" for key, value in model.model_dump(exclude_none=True).items())
+                rows[name] = "{" + ",\n             ".join(values) + "}"
+        sections["schedule"] = ("input_scale, and the models of the sections above, follow the airspeed; m/s, s", rows)
+    return sections
 
 
 def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, int]:

@@ -8,7 +8,7 @@ then `effort` is raised, and K and the integral are lowered, in the channel in w
 the extended-state observer are taken as slower.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -41,6 +41,7 @@ from flight_analysis.design.requirement import (
     least_fraction,
     nominal_conditions,
 )
+from flight_analysis.design.speed import at_speed
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
@@ -50,7 +51,7 @@ from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_m
 from rise_di_controller.margins import loop_margins
 from rise_di_controller.observer import without_frozen
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di import RiseDiConfig, SpeedConfig
 
 RELAXATION = 1.05
 """Factor by which `effort` rises, and K and the integral fall, in a step of the search for the margins."""
@@ -141,30 +142,51 @@ def with_aircraft_observer(
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
     vanes: Mapping[str, float] = MappingProxyType({}),
+    *,
+    uncertain: bool = True,
+    speeds: tuple[float, float] | None = None,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
-    `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta.
-    The phase margin is also that of WORST_OF uncertain aircraft. Raises ParameterError for an airframe with another D or
-    without a wind, one that a feedforward refuses, and for margins that no relaxation reaches.
+    `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
+    WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
+    a schedule then, and the margins at these speeds too. Raises ParameterError for an airframe with another D or without a
+    wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
     require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
     rows, columns = law_order(airframe, controller)
     Omega = airframe.matrix_c()[rows] @ airframe.matrix_b()[:, columns]
     _require_signs(Omega, controller, f"airframe {airframe.name}")
-    base = with_feedforward(controller.model_copy(update={"observer": None}), airframe)
-    model = model_for(airframe, controller, noise)
+    base = with_feedforward(controller.model_copy(update={"observer": None, "schedule": None}), airframe)
     names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
 
-    def design(slower: FloatArray) -> ObserverDesign:
-        effort = slower * gains.weights.effort
-        return aircraft_observer(model, names, gains.weights._replace(effort=effort))
+    def designer(model: NominalModel) -> Callable[[FloatArray], ObserverDesign]:
+        return lambda slower: aircraft_observer(model, names, gains.weights._replace(effort=slower * gains.weights.effort))
 
-    A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF, WORST_SEED)
+    def at(ratio: float) -> AtSpeed:
+        frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
+        model, feedforward = model_for(frame, controller, noise), with_feedforward(base, frame).feedforward
+        assert feedforward is not None  # noqa: S101 - it was added
+        plant = LinearPlant(model.A + model.gravity, model.B, model.C)
+        scale = np.array([1.0 if name == "V" else ratio**-2.0 for name in controller.outputs])
+        return AtSpeed(ratio, plant, feedforward, scale, designer(model))
+
+    model, others = model_for(airframe, controller, noise), []
+    if speeds is not None:
+        require(not vanes, "speeds", f"the vanes {', '.join(vanes)}", "none: they read the model of the trim speed")
+        require("V" in controller.outputs, "speeds", f"the outputs {', '.join(controller.outputs)}", "V among them")
+        others = [at(ratio) for ratio in speeds]
+    A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF * uncertain, WORST_SEED)
     read = [[float(name == state) for state in airframe.states] for name in vanes]
     plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *read]))
     section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
-    return _within_margin(base, model, plant, gains, design, margin, needed, section)
+    selected = _within_margin(base, model, plant, gains, designer(model), margin, needed, section, others)
+    if not others:
+        return selected
+    slow, fast = (there.model(selected.relaxation).model_dump() for there in others)
+    schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
+    scheduled = RiseDiConfig.validate_mapping(selected.controller.model_dump() | {"schedule": schedule}, "controller")
+    return selected._replace(controller=scheduled)
 
 
 def _vanes(airframe: Airframe, model: NominalModel, names: Names, weights: Weights, vanes: Mapping[str, float]) -> VanesConfig:
@@ -179,6 +201,35 @@ def _vanes(airframe: Airframe, model: NominalModel, names: Names, weights: Weigh
         L += vane_correction(sampled, model, (weights, with_vane), row, noise).ravel().tolist()
     least = [STILL * noise for noise in vanes.values()]
     return VanesConfig(channels=tuple(vanes), H=tuple(H), L=tuple(L), least=tuple(least))
+
+
+class AtSpeed(NamedTuple):
+    """The design at a ratio to the trim speed."""
+
+    ratio: float
+    plant: LinearPlant
+    feedforward: FeedforwardConfig
+    scale: FloatArray  # (m,) factors of input_scale
+    design: Callable[[FloatArray], ObserverDesign]
+
+    def model(self, slower: FloatArray) -> SpeedConfig:
+        """The models of feedforward and observer."""
+        design = self.design(slower)
+        matrices = {key: tuple(getattr(design, key).ravel().tolist()) for key in ("Phi", "Gamma", "L", "F")}
+        of_nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
+        return SpeedConfig(ratio=self.ratio, **of_nominal, **matrices)
+
+    def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
+        """What flies at this speed; not checked."""
+        assert controller.observer is not None  # noqa: S101 - it was designed
+        model = self.model(slower)
+        own = {key: getattr(model, key) for key in ("Phi", "Gamma", "L", "F")}
+        changed = {
+            "observer": controller.observer.model_copy(update=own),
+            "feedforward": self.feedforward,
+            "input_scale": tuple((np.array(controller.input_scale) * self.scale).tolist()),
+        }
+        return controller.model_copy(update=changed)
 
 
 EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
@@ -278,6 +329,7 @@ def _within_margin(
     margin: float,
     needed: Requirement,
     vanes: VanesConfig | None = None,
+    others: Sequence[AtSpeed] = (),
 ) -> SelectedObserver:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
@@ -288,16 +340,22 @@ def _within_margin(
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
     needed = above_zeros(needed, nominal)
 
-    def relaxed(relaxation: FloatArray) -> SelectedObserver:
-        controller = _parameters(base, model, gains, design(relaxation), relaxation, vanes)
+    def assessed(controller: RiseDiConfig, plant: LinearPlant) -> tuple[float, float, float]:
+        """Delay margin, least phase margin, and the least of what is found over what is needed, with any vanes in use."""
         delays, phases, parts = [], [], []
         for law in _laws(controller):
-            delays.append(delay_margin(nominal, law, loop, longest=DELAYS * margin))
-            margins = loop_margins(nominal, law, loop_of(controller), together=False)
+            delays.append(delay_margin(plant, law, loop, longest=DELAYS * margin))
+            margins = loop_margins(plant, law, loop_of(controller), together=False)
             phases.append(float(margins.phase.min()))
             parts.append(least_fraction(margins, needed))
         of_delay = min(delays) / (margin + RESOLUTION) if margin > 0.0 else 1.0
-        return SelectedObserver(controller, min(delays), min(phases), min(of_delay, *parts), relaxation)
+        return min(delays), min(phases), min(of_delay, *parts)
+
+    def relaxed(relaxation: FloatArray) -> SelectedObserver:
+        controller = _parameters(base, model, gains, design(relaxation), relaxation, vanes)
+        delay, phase, fraction = assessed(controller, nominal)
+        elsewhere = [assessed(there.flown(controller, relaxation), there.plant)[2] for there in others]
+        return SelectedObserver(controller, delay, phase, min([fraction, *elsewhere]), relaxation)
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
@@ -312,7 +370,9 @@ def _within_margin(
     while True:
         ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
         if selected.relaxation.max() > MAX_RELAXATION or ended:
-            raise ParameterError(f"--margin: {_lacking(selected, nominal, loop, margin, needed)}")
+            lacking = _lacking(selected, nominal, loop, margin, needed)
+            elsewhere = "speeds: found less than the margins at another speed, expected speeds nearer to that of the trim"
+            raise ParameterError(elsewhere if others and not lacking else f"--margin: {lacking or _phases(needed)}")
         if selected.fraction < 1.0:
             best = max((stepped(channel) for channel in range(m)), key=lambda candidate: candidate.fraction)
             selected = best if best.fraction > selected.fraction else relaxed(selected.relaxation * RELAXATION)
@@ -339,16 +399,19 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
 
 
 def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
-    """The margins missing at the last step of the search, in sentences."""
+    """The margins missing around the nominal aircraft at the last step of the search, in sentences."""
     controller, lacking = selected.controller, []
     for law in _laws(controller):
         margins = loop_margins(nominal, law, loop_of(controller), together=False)
         delay = Condition("delay margin (ms)", None, 1e3 * delay_margin(nominal, law, loop), 1e3 * margin)
         failed = failing((delay, *nominal_conditions(margins, needed)))
         lacking += [condition.sentence(controller.outputs) for condition in failed]
+    return "; ".join(dict.fromkeys(lacking))
+
+
+def _phases(needed: Requirement) -> str:
     phase = np.degrees(needed.of_uncertain)
-    phases = f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
-    return "; ".join(dict.fromkeys(lacking)) or phases
+    return f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
 
 
 def _parameters(

@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An observer over the airspeed: the airframe at another speed, models between the speeds, flights with u late, replay."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import as_yaml
+from flight_analysis.c_export.constants import exportable
+from flight_analysis.closed_loop.margins import law_order
+from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.speed import at_speed
+from flight_bringup.scenarios import find_scenario
+from flight_campaign.benchmark_course import build_course
+from flight_core.parameters import ParameterError
+from rise_di.gain_design import observed
+from rise_di_controller.control_law import Measurements
+from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
+from rise_di_controller.rise_di import RiseDiConfig
+
+pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
+
+FASTER, LATE = 1.32, 0.02  # of the trim speed; s
+OSPREY = load_airframe("osprey")
+SHIPPED = find_scenario("osprey_observer").vary(
+    aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0}, flight={"duration": 12.0}
+)
+
+
+@pytest.fixture(scope="module")
+def scheduled() -> RiseDiConfig:
+    """From 0.7 to 1.4 of the trim speed."""
+    return observed(SHIPPED.rise_di(), SHIPPED, OSPREY, 0.03, uncertain=False, speeds=(0.7, 1.4))[0]
+
+
+def margin(controller: RiseDiConfig, ratio: float) -> float:
+    """Delay margin of a controller around the osprey at another speed, s."""
+    frame = at_speed(OSPREY, ratio, "thrust")
+    rows, columns = law_order(frame, controller)
+    plant = LinearPlant(frame.matrix_a() + frame.matrix_gravity(), frame.matrix_b()[:, columns], frame.matrix_c()[rows])
+    return delay_margin(plant, linear_law(controller.tuned_law(), 4, 0.01), Loop(np.array(controller.lag), 0.0, 0.01))
+
+
+def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
+    """An aircraft of one shape moves alike along its path: frequencies and rates by a surface grow with V."""
+    places = [OSPREY.index(name) for name in ("alpha", "q")]
+    moved = at_speed(OSPREY, 1.3, "thrust")
+    before, after = (frame.matrix_a()[np.ix_(places, places)] for frame in (OSPREY, moved))
+    assert np.sort_complex(np.linalg.eigvals(after)) == pytest.approx(1.3 * np.sort_complex(np.linalg.eigvals(before)))
+    steady = [np.linalg.solve(A, frame.matrix_b()[places, 0]) for A, frame in ((before, OSPREY), (after, moved))]
+    assert steady[1] == pytest.approx(steady[0] * np.array([1.0, 1.3]))  # alpha as before, q with V
+    assert moved.matrix_gravity()[OSPREY.index("beta"), OSPREY.index("phi")] == pytest.approx(9.81 / (1.3 * 25.0), rel=0.01)
+    vertical = moved.gust_direction("vertical")  # m/s of wind change alpha by 1 / V
+    assert vertical == pytest.approx(-moved.matrix_a()[:, 1] / moved.speed, abs=0.003)
+    assert moved.gust_direction("longitudinal") == pytest.approx(-moved.matrix_a()[:, 0])
+
+
+def test_margin_holds_from_slow_to_fast(scheduled: RiseDiConfig) -> None:
+    # that of the shipped observer falls to 17 ms at 1.32 of the trim speed
+    assert margin(SHIPPED.rise_di(), FASTER) < LATE
+    for ratio in (0.7, 0.8, 1.0, 1.15, FASTER, 1.4):
+        assert margin(scheduled.at_speed(ratio), ratio) > 0.03
+
+
+def test_observer_of_the_speed_flies_where_the_fixed_one_is_lost(scheduled: RiseDiConfig, tmp_path: Path) -> None:
+    path = tmp_path / "fast.yaml"
+    path.write_text(as_yaml(at_speed(OSPREY, FASTER, "thrust")), encoding="utf-8")
+    sensors = SHIPPED.aircraft.sensors.model_dump() | {"delay": LATE}
+    fast = SHIPPED.vary(aircraft={"airframe": str(path), "sensors": sensors})
+    largest = []
+    for controller in (SHIPPED.rise_di(), scheduled.at_speed(FASTER)):
+        truth = simulate(fast.vary(controller=controller))["truth"]
+        largest.append(float(np.abs(truth["x.q"]).max()))
+    assert largest[1] < 0.15  # rad/s: the command is 0.1
+    assert largest[0] > 1.0
+
+
+def test_law_at_a_steady_speed_is_that_of_its_models(scheduled: RiseDiConfig) -> None:
+    zero, V = np.zeros(4), np.array([0.0, 0.0, 0.0, (FASTER - 1.0) * 25.0])
+    rng, outputs = np.random.default_rng(1), []
+    errors = rng.normal(size=(20, 4)) * np.array([0.01, 0.01, 0.01, 0.0])
+    for controller in (scheduled, scheduled.at_speed(FASTER)):
+        law, params = controller.tuned_law()
+        state = law.engage(Measurements(V, V, zero, zero, zero), params)
+        for e in errors:
+            state, u = law.step(state, Measurements(V + e, V, zero, zero, zero), np.float64(0.01), params)
+        outputs.append(u)
+    assert outputs[0] == pytest.approx(outputs[1], rel=1e-9)
+
+
+def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(scheduled: RiseDiConfig) -> None:
+    pulse = {"V": {"start": [1.0], "stop": [9.0], "value": [6.0]}}
+    flown = SHIPPED.vary(controller=scheduled, reference_model={"pulses": pulse})
+    tape = simulate(flown)
+    scale = tape["internals"]["scale.q"]
+    assert scale.min() < 0.75
+    assert replay(tape).equal()
+    step = np.abs(np.diff(tape["u"].values, axis=0)).max(axis=0)
+    fixed = np.abs(np.diff(simulate(flown.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)).max(axis=0)
+    assert (step < 1.2 * fixed).all()  # noise of the sensors moves u of both
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"slow": None}, "schedule: found a feedforward or an observer that holds at the trim speed alone"),
+        ({"slow": {"ratio": 1.1}}, "schedule: found ratios of 1.1 and 1.4, expected one below 1 and one above"),
+        ({"fast": {"F": -1.0}}, r"schedule, at 1.4 of the trim speed: observer.F: found a spectral radius"),
+    ],
+)
+def test_wrong_models_at_other_speeds_refused(scheduled: RiseDiConfig, changes: dict[str, Any], sentence: str) -> None:
+    values = scheduled.model_dump()
+    for name, change in changes.items():
+        if change is None:
+            values["schedule"][name] = None
+        elif "F" in change:
+            values["schedule"][name]["F"] = [change["F"] * value for value in values["schedule"][name]["F"]]
+        else:
+            values["schedule"][name] |= change
+    with pytest.raises(ParameterError, match=sentence):
+        RiseDiConfig.validate_mapping(values, "controller")
+
+
+def test_campaign_and_export_refuse_models_at_other_speeds(scheduled: RiseDiConfig) -> None:
+    with pytest.raises(ParameterError, match=r"^controller\.schedule: found models at other speeds"):
+        build_course(SHIPPED.vary(controller=scheduled))
+    with pytest.raises(ParameterError, match=r"^controller\.schedule: found models at other speeds"):
+        exportable(scheduled)
