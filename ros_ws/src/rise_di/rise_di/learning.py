@@ -35,7 +35,7 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         airframe = _prior(controller.learn.prior, airframe)
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        return observed(start, scenario, model, margin)[0]
+        return observed(start, scenario, model, margin, uncertain=False)[0]
 
     return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0)
 

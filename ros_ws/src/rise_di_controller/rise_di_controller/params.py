@@ -306,7 +306,10 @@ class ControllerConfig(NodeConfig):
         )
         require(observer.rate == self.rate, "observer.rate", f"{observer.rate:g} Hz", f"controller.rate, {self.rate:g} Hz")
         Phi, Gamma, H, L, F = observer.matrices(nominal)
-        for key, matrix in (("L", Phi @ (np.eye(len(Phi)) - L @ H)), ("F", Phi - Gamma @ F)):
+        matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
+        if F.any(axis=1).all():  # channels without it fly the law alone, which the loop below has
+            matrices["F"] = Phi - Gamma @ F
+        for key, matrix in matrices.items():
             radius = spectral_radius(matrix)
             require(radius < 1.0, f"observer.{key}", f"a spectral radius of {radius:.6g}", "less than 1: it is unstable")
         flies = not self.vanes or observer.part > 0.0

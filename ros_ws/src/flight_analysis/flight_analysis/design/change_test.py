@@ -8,13 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.design.innovation_filters import TRANSIENT, Actuation, Recording, blocks, delayed, filter_model
-from flight_analysis.design.model_identification import Fit, Search
+from flight_analysis.design.innovation_filters import Actuation, Block, Recording, blocks, filter_model
+from flight_analysis.design.model_identification import Search, Unknown
 from flight_core.vectors import FloatArray
 
 RECORD = 10.0  # s, of the flight that is tested
 LEAST_DEVIATION, FREE_DEVIATION = 0.03, 0.3  # 1, of an entry if the aircraft is the same, and if it has changed
 MAX_GAIN = 15.0  # of log-likelihood: without a change 1 is usual and 10 was the largest of 80 tests; with a change 40 is usual
+ANGLE = 0.3  # rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
+EXACT = 1e-4  # 1, standard deviation of an entry that is what it is
+NO_EFFECT = 1e-6  # 1, of the effect of an input: 0 would have no input scale
 DEAD_WITHIN = MAX_GAIN / 2.0  # of log-likelihood: so close to the refit a dead input explains the flight as well
 
 
@@ -32,7 +35,11 @@ class Change(NamedTuple):
 
 
 def change_test(
-    recorded: Recording, flown: Airframe, actuation: Actuation, deviation: Mapping[str, float]
+    recorded: Recording,
+    flown: Airframe,
+    actuation: Actuation,
+    deviation: Mapping[str, float],
+    delays: Mapping[tuple[str, ...], float] | None = None,
 ) -> tuple[Change, ...]:
     """The gain G of log-likelihood of each part of the aircraft by a change of its entries, and an input without effect.
 
@@ -40,34 +47,40 @@ def change_test(
         G = min J(theta; max(deviation, LEAST_DEVIATION)) - min J(theta; FREE_DEVIATION)
 
     Where G > MAX_GAIN, the input j is dead if B[:, j] = 0 in the flown model has a J that is lower by more than MAX_GAIN, and
-    at most DEAD_WITHIN above that of the refit. Arguments: `deviation` of the entries by name, 1.
+    at most DEAD_WITHIN above that of the refit. Winds, and the angles at the begin of the record, are free in each J.
+    Arguments: `deviation` of the entries by name, 1; `delays` of u by the outputs of a part, s, where it is not that of
+    `actuation`.
     """
-    recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
-    model = filter_model(flown, actuation, recorded)
-    known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     found = []
-    for block in blocks(model):
-        search = Search(recorded, model, block, flown)
-
-        def refit(s: FloatArray, search: Search = search) -> tuple[Fit, float]:
-            search.believe(s)
-            fit = search.fit(known, lambda: None)
-            return fit, -float(np.sum(fit.after.log_likelihood[known])) + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0
-
-        def cost(theta: FloatArray, search: Search = search) -> float:
-            return -float(np.sum(search.best_levels(theta).log_likelihood[known]))
-
-        size = len(search.prior) - len(block.winds)
-        free, changed = refit(np.full(size, FREE_DEVIATION))
-        entries = search.entries(free)
-        same = refit(np.array([max(deviation.get(entry.name, 0.0), LEAST_DEVIATION) for entry in entries]))[1]
+    for block in blocks(filter_model(flown, actuation, recorded)):
+        outputs = tuple(flown.outputs[i] for i in block.outputs)
+        delay = (delays or {}).get(outputs, actuation.delay)
+        search = _search(recorded, flown, actuation, block, delay)
+        near = np.array([max(deviation.get(entry.name, 0.0), LEAST_DEVIATION) for entry in search.nominal_entries()])
+        changed, changed_cost = _least(search, np.full(search.count, FREE_DEVIATION))
+        same, _ = _least(search, near)
         dead = ""
         if same - changed > MAX_GAIN:
-            flown_cost, free_cost = cost(np.zeros(len(search.prior))), cost(free.theta)
+            _, flown_cost = _least(search, np.full(search.count, EXACT))
             for name in search.names.inputs:
-                without = [-float(entry.matrix == "B" and entry.column == name) for entry in entries]
-                lost = cost(np.concatenate([without, np.zeros(len(block.winds))]))
-                if flown_cost - lost > MAX_GAIN and lost < free_cost + DEAD_WITHIN:
+                B = flown.matrix_b() * np.array([NO_EFFECT if column == name else 1.0 for column in flown.inputs])
+                without = flown.with_matrices(flown.matrix_a(), B, np.ones((len(B), len(flown.gusts))))
+                of_dead = _search(recorded, without, actuation, block, delay)
+                _, cost = _least(of_dead, np.full(of_dead.count, EXACT))
+                if flown_cost - cost > MAX_GAIN and cost < changed_cost + DEAD_WITHIN:
                     dead = name
-        found.append(Change(search.names.outputs, same - changed, dead))
+        found.append(Change(outputs, same - changed, dead))
     return tuple(found)
+
+
+def _search(recorded: Recording, flown: Airframe, actuation: Actuation, block: Block, delay: float) -> Search:
+    return Search(recorded, filter_model(flown, actuation, recorded), block, flown, delay, Unknown(angle=ANGLE))
+
+
+def _least(search: Search, deviation: FloatArray) -> tuple[float, float]:
+    """The least J with these standard deviations of the entries, and its -sum log p."""
+    search.believe(deviation)
+    known = search.known()
+    fit = search.fit(known, lambda: None)
+    cost = -float(np.sum(fit.after.log_likelihood[known]))
+    return cost + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0, cost

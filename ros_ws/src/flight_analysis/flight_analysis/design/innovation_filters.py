@@ -112,7 +112,7 @@ class FilterBank(NamedTuple):
 
             r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
 
-        with r = 0 in the update where y, (K, m), is lost; u (K, m).
+        with r = 0 in the update where y, (K, m), is lost; u (K, m), or (F, K, m) where the filters have inputs of their own.
         """
         H, Phi, L = self.sampled.H, self.sampled.Phi[member, 0], self.L[member, level]
         n, s, angles = len(self.gravity), Phi.shape[1], np.flatnonzero(self.gravity.any(axis=0))
@@ -123,7 +123,9 @@ class FilterBank(NamedTuple):
         states = np.zeros((len(y) + 1, len(z), size, 1))
         states[0, :, :s, 0] = z
         states[1:, :, :s, 0] = np.einsum("fsm,km->kfs", Phi @ L, np.where(np.isfinite(y), y, 0.0))
-        states[1:, :, :s, 0] += np.einsum("fsm,km->kfs", self.sampled.Gamma[member, 0], u)
+        states[1:, :, :s, 0] += np.einsum(
+            "fsm,km->kfs" if u.ndim == y.ndim else "fsm,fkm->kfs", self.sampled.Gamma[member, 0], u
+        )
         step = [steps[int(k_seen)] for k_seen in seen.tolist()]
         moved = np.empty(states.shape[1:])
         for k, (now, following) in enumerate(pairwise(states)):

@@ -14,18 +14,27 @@ import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning import Proposal
-from flight_analysis.design.change_test import MAX_GAIN, RECORD, Change, change_test
+from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_analysis.design.gain_conditions import MIN_GAIN
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import TRANSIENT, Actuation, Recording
-from flight_analysis.design.model_identification import PRIOR, Entry, Identification, Part, identify, with_entries
+from flight_analysis.design.model_identification import (
+    MAX_WHITENESS,
+    PRIOR,
+    Entry,
+    Identification,
+    Part,
+    Unknown,
+    identify,
+    with_entries,
+)
 from flight_core.parameters import SMALLEST, ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
 
-MAX_WHITENESS = 3.0  # 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft does
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
+DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
 SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
@@ -37,6 +46,7 @@ class Known(NamedTuple):
 
     end_ns: int  # of its window
     deviation: Mapping[str, float]  # of its entries by name, 1
+    delay: float  # of its inputs, s
 
 
 class Learner:
@@ -128,7 +138,14 @@ class Learner:
         ]
         gone = self._dead | dead
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
-        identified = self.identification = identify(self.recording(), self._prior, self._actuation, channels, at_bound=AT_BOUND)
+        identified = self.identification = identify(
+            self.recording(),
+            self._prior,
+            self._actuation,
+            channels,
+            at_bound=AT_BOUND,
+            unknown=Unknown(DELAY_DEVIATION, ANGLE),
+        )
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
         for part in identified.parts:
@@ -140,7 +157,8 @@ class Learner:
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
             model = with_entries(model, relative(entries, self._prior, model))
-            known[part.outputs] = Known(end_ns, {entry.name: entry.deviation / (1.0 + entry.error) for entry in entries})
+            deviation = {entry.name: entry.deviation / (1.0 + entry.error) for entry in entries}
+            known[part.outputs] = Known(end_ns, deviation, self._actuation.delay if rough else part.delay)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
             )
@@ -172,7 +190,9 @@ class Learner:
             return []
         deviation = {name: value for known in old.values() for name, value in known.deviation.items()}
         recent = self.recording(end_ns - nanoseconds(RECORD))
-        return [change for change in change_test(recent, self._model, self._actuation, deviation) if change.outputs in old]
+        delays = {part: known.delay for part, known in old.items()}
+        changes = change_test(recent, self._model, self._actuation, deviation, delays)
+        return [change for change in changes if change.outputs in old]
 
     def _designed(
         self, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]

@@ -49,6 +49,7 @@ RECOVERY = 2  # spans after a gust that do not count either: the estimates recov
 SPAN = 1.0  # s, within which the level is constant
 HELD_OUT = 3  # Every third span is held out: each command and gust is then in both parts. A last third has no command.
 MAX_DEVIATION = 0.1  # of the best known effect of an input on each output: two deviations are then a fifth of the loop gain
+MAX_WHITENESS = 3.0  # 1 for white innovations, with a deviation of 0.3: a model with more leaves out what the aircraft does
 LAGS = 20  # of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
@@ -65,10 +66,30 @@ class Innovations(NamedTuple):
     log_likelihood: FloatArray  # (T,) of a sample, up to a constant
 
 
+class Models(NamedTuple):
+    """The filters of N models, and their inputs."""
+
+    bank: FilterBank
+    begin: FloatArray  # (N, s) estimates at the begin
+    u: FloatArray  # (T, m), or (N, T, m) where the delay is identified
+
+
+class Unknown(NamedTuple):
+    """Standard deviations of what else is identified; 0: it is known."""
+
+    delay: float = 0.0  # s, of u
+    angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
+
+
+KNOWN = Unknown()
+
+
 class Fit(NamedTuple):
     """The most probable theta of a block."""
 
-    theta: FloatArray  # (p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of the winds
+    theta: FloatArray
+    """(p,) relative errors of the uncertain entries of A, then of B; logarithms of the strengths of the winds; where they are
+    identified, the angles at the begin and the error of the delay, in units of their deviations."""
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
@@ -100,22 +121,41 @@ class Entry(NamedTuple):
 class Search:
     """The data of one block, and the functions of theta over them."""
 
-    def __init__(self, recorded: Recording, model: NominalModel, block: Block, airframe: Airframe) -> None:
-        """The prior of each relative error is PRIOR; `believe` replaces it."""
+    def __init__(
+        self,
+        recorded: Recording,
+        model: NominalModel,
+        block: Block,
+        airframe: Airframe,
+        delay: float,
+        unknown: Unknown = KNOWN,
+    ) -> None:
+        """The prior of each relative error is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known."""
+        self._period = recorded.period
+        self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
+        angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
+        self._angles, self._angle_deviation = angles if unknown.angle else angles[:0], unknown.angle
         self._model, self._block, self._airframe = block.of(model), block, airframe
         named = (tuple(airframe.states), tuple(airframe.inputs), airframe.outputs, tuple(airframe.gusts))
         self.names = Names(*(tuple(names[k] for k in part) for names, part in zip(named, block, strict=True)))
         self._y, self._u = recorded.y[:, block.outputs], recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
-        entries = sum(int(mask.sum()) for mask in uncertain(self._model))
-        self.believe(np.full(entries, PRIOR))
+        self.count = sum(int(mask.sum()) for mask in uncertain(self._model))  # of the entries that are identified
+        self.believe(np.full(self.count, PRIOR))
 
     def believe(self, deviation: FloatArray) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
-        self.prior = np.concatenate([deviation, np.full(len(self._block.winds), WIND_PRIOR)])
+        of_delay = np.ones(1 if self._delay_deviation else 0)
+        of_winds = np.full(len(self._block.winds), WIND_PRIOR)
+        self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
         self.bound = MAX_ERROR / PRIOR * self.prior
+        self._lower = -self.bound
+        if len(of_delay):  # no u acts before it is sent
+            self._lower[-1] = max(self._lower[-1], -self._delay / self._delay_deviation)
         self._errors = np.arange(len(self.prior)) < len(deviation)
+        self._winds = slice(len(deviation), len(deviation) + len(of_winds))
+        self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that acts by the model's own A."""
@@ -131,50 +171,57 @@ class Search:
         wind = gust_directions(self._airframe, whole, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
-    def bank(self, thetas: FloatArray) -> FilterBank:
-        """The filters of relative errors (N, p)."""
-        strength = np.exp(thetas[:, len(self.prior) - len(self._block.winds) :])
-        return filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength)
+    def models(self, thetas: FloatArray) -> Models:
+        """The filters of theta, (N, p)."""
+        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, np.exp(thetas[:, self._winds]))
+        first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
+        begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
+        begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
+        if not self._delay_deviation:
+            return Models(bank, begin, delayed(self._u, self._delay))
+        periods = self._delay + self._delay_deviation * thetas[:, -1]
+        return Models(bank, begin, np.array([delayed(self._u, value) for value in np.maximum(periods, 0.0).tolist()]))
 
-    def levels(self, bank: FilterBank) -> NDArray[np.int64]:
-        """The level of the wind in each span for the first model of a bank, shape (spans,).
+    def delay(self, fit: Fit) -> float:
+        """The delay of u, periods."""
+        return self._delay + self._delay_deviation * (float(fit.theta[-1]) if self._delay_deviation else 0.0)
+
+    def levels(self, models: Models) -> NDArray[np.int64]:
+        """The level of the wind in each span for the first of some models, shape (spans,).
 
         Every level predicts the span from the estimates at its begin. The calmest one is taken whose log-likelihood is within
         CHANGE of the best.
         """
+        bank, u = models.bank, models.u if models.u.ndim == self._u.ndim else models.u[0]
         every, zeros = np.arange(len(LEVELS)), np.zeros(len(LEVELS), dtype=np.int64)
         precision, log_det = np.linalg.inv(bank.covariance[0]), np.linalg.slogdet(bank.covariance[0])[1]
-        z, found = self._start(bank, len(LEVELS)), []
+        z, found = np.repeat(models.begin[:1], len(LEVELS), axis=0), []
         for span in self._spans:
-            r, after = bank.advance(z, self._y[span], self._u[span], zeros, every)
+            r, after = bank.advance(z, self._y[span], u[span], zeros, every)
             gain = -np.nansum(np.einsum("kli,lij,klj->kl", r, precision, r) + log_det, axis=0) / 2.0
             found.append(int(np.argmax(gain >= gain.max() - CHANGE)))
             z = np.repeat(after[found[-1]][None], len(LEVELS), axis=0)
         return np.array(found)
 
-    def innovations(self, bank: FilterBank, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def innovations(self, models: Models, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Innovations of all models at given levels, and normalised, (N, T, m), and half the log of det S, (N, T)."""
+        bank, z, u = models
         every = np.arange(len(bank.L))
         root = np.linalg.cholesky(bank.covariance)
         inverse, half_log_det = np.linalg.inv(root), np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-        r, z = np.empty((len(every), *self._y.shape)), self._start(bank, len(every))
+        r = np.empty((len(every), *self._y.shape))
         normalised, weight = np.empty_like(r), np.empty(r.shape[:2])
         for span, level in zip(self._spans, levels, strict=True):
-            ahead, z = bank.advance(z, self._y[span], self._u[span], every, np.full(len(every), level))
+            ahead, z = bank.advance(z, self._y[span], u[..., span, :], every, np.full(len(every), level))
             r[:, span] = np.swapaxes(ahead, 0, 1)
             normalised[:, span] = r[:, span] @ np.swapaxes(inverse[:, level], -1, -2)
             weight[:, span] = half_log_det[:, level, None]
         return r, normalised, weight
 
-    def _start(self, bank: FilterBank, count: int) -> FloatArray:
-        first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
-        return np.tile(first @ bank.sampled.H, (count, 1))
-
     def best_levels(self, theta: FloatArray) -> Innovations:
         """The innovations of one theta, (p,)."""
-        bank = self.bank(theta[None])
-        levels = self.levels(bank)
-        (r,), (normalised,), (weight,) = self.innovations(bank, levels)
+        models = self.models(theta[None])
+        (r,), (normalised,), (weight,) = self.innovations(models, self.levels(models))
         return Innovations(r, normalised, -np.sum(normalised**2, axis=1) / 2.0 - weight)
 
     def fit(self, used: NDArray[np.bool_], progress: Callable[[], None]) -> Fit:
@@ -186,22 +233,23 @@ class Search:
         hardly a second minimum. Then the levels follow theta, and their strengths are part of it. At last the spans of gusts do
         not count: a gust is no noise. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
-        size, errors = len(self.prior), self._errors
+        size, errors, free = len(self.prior), self._errors, np.ones(len(self.prior), dtype=bool)
+        free[self._winds] = False
         theta, levels, follows, gusts = np.zeros(size), np.full(len(self._spans), STRONG), False, False
         for iteration in range(MAX_ITERATIONS + 1):
             progress()
-            bank, before = self.bank(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)])), levels
-            levels = self.levels(bank) if follows else levels
+            models, before = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)])), levels
+            levels = self.levels(models) if follows else levels
             settled = follows and np.array_equal(levels, before)
             counted = used & self._quiet(levels) if gusts else used
-            costs, e, half_log_det = self._costs(bank, levels, counted, theta[None])
+            costs, e, half_log_det = self._costs(models, levels, counted, theta[None])
             rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
             J = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(size, -1)
             hessian = J @ J.T + np.diag(self.prior**-2)
             slope = J @ (e[0] / rms).ravel() + (half_log_det[1:] - half_log_det[0]) / DIFFERENCE + theta / self.prior**2
-            steps = damped_steps(theta, slope, hessian, self.bound, follows | errors)
-            tried = np.clip(theta + steps, -self.bound, self.bound)
-            lower, _, _ = self._costs(self.bank(tried), levels, counted, tried)
+            steps = damped_steps(theta, slope, hessian, self._lower, self.bound, follows | free)
+            tried = np.clip(theta + steps, self._lower, self.bound)
+            lower, _, _ = self._costs(self.models(tried), levels, counted, tried)
             progressed = costs[0] - lower.min()
             if iteration == MAX_ITERATIONS or (settled and gusts and progressed < MIN_PROGRESS):
                 break
@@ -212,14 +260,24 @@ class Search:
         nominal = np.where(errors, 0.0, theta)
         return Fit(theta, deviation, self.best_levels(nominal), self.best_levels(theta), iteration)
 
-    def entries(self, fit: Fit) -> list[Entry]:
-        """The identified entries of A and B."""
+    def nominal_entries(self) -> list[Entry]:
+        """The entries of A and B that are identified, before the flight."""
         places = []
         for matrix, mask, columns in zip("AB", uncertain(self._model), (self.names.states, self.names.inputs), strict=True):
             values = self._model.A if matrix == "A" else self._model.B
             places += [(matrix, self.names.states[i], columns[j], float(values[i, j])) for i, j in np.argwhere(mask)]
-        found = zip(places, fit.theta.tolist(), fit.deviation.tolist(), strict=False)  # the winds follow the entries
-        return [Entry(*place, error, deviation) for place, error, deviation in found]
+        return [Entry(*place, 0.0, deviation) for place, deviation in zip(places, self.prior.tolist(), strict=False)]
+
+    def entries(self, fit: Fit) -> list[Entry]:
+        """The identified entries of A and B."""
+        found = zip(
+            self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
+        )  # winds follow the entries
+        return [entry._replace(error=error, deviation=deviation) for entry, error, deviation in found]
+
+    def known(self) -> NDArray[np.bool_]:
+        """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
+        return np.isfinite(self._y).all(axis=1) & (np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5)
 
     def _quiet(self, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mask of the samples, (T,), that are neither in a gust nor within RECOVERY spans after one."""
@@ -228,10 +286,10 @@ class Search:
         return ~np.repeat(recent, self._spans[0].stop)[: len(self._y)]
 
     def _costs(
-        self, bank: FilterBank, levels: NDArray[np.int64], used: NDArray[np.bool_], thetas: FloatArray
+        self, models: Models, levels: NDArray[np.int64], used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Costs of the models of a bank, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
-        _, normalised, half_log_det = self.innovations(bank, levels)
+        """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
+        _, normalised, half_log_det = self.innovations(models, levels)
         e, total = normalised[:, used], np.sum(half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total
         costs = costs + np.sum((thetas / self.prior) ** 2, axis=1) / 2.0
@@ -239,7 +297,12 @@ class Search:
 
 
 def damped_steps(
-    theta: FloatArray, slope: FloatArray, hessian: FloatArray, bound: FloatArray, free: NDArray[np.bool_]
+    theta: FloatArray,
+    slope: FloatArray,
+    hessian: FloatArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    free: NDArray[np.bool_],
 ) -> FloatArray:
     """Steps -(hessian + d diag hessian)^-1 slope for every damping d, and fractions of the first, (k, p).
 
@@ -251,7 +314,7 @@ def damped_steps(
         damped = part + np.array(DAMPINGS)[:, None, None] * np.diag(np.diag(part))
         steps[:] = 0.0
         steps[:, free] = -np.linalg.solve(damped, slope[free, None])[..., 0]
-        outwards = free & (np.abs(theta) >= bound) & (steps[0] * theta > 0.0)
+        outwards = free & (((theta >= upper) & (steps[0] > 0.0)) | ((theta <= lower) & (steps[0] < 0.0)))
         if not outwards.any():
             return np.vstack([steps, np.outer(FRACTIONS, steps[0])])
         free = free & ~outwards
@@ -277,6 +340,7 @@ class Part(NamedTuple):
     before: Prediction  # of the nominal model
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
+    delay: float  # s, of its inputs
 
 
 class Identification(NamedTuple):
@@ -308,14 +372,14 @@ def identify(
     channels: ChannelPairing | None = None,
     progress: Callable[..., None] = lambda **_: None,
     at_bound: int = 0,
+    unknown: Unknown = KNOWN,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `at_bound` how many entries of a part may lie at their bound; `progress` is called with the steps
-    `completed` of the search, and their largest number `total`.
+    airframe's order; `at_bound` how many entries of a part may lie at their bound; `unknown` what else is identified;
+    `progress` is called with the steps `completed` of the search, and their largest number `total`.
     """
-    recorded = recorded._replace(u=delayed(recorded.u, actuation.delay / recorded.period))
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     held_out = known & (np.arange(len(recorded.t)) // span_length(recorded) % HELD_OUT == HELD_OUT - 1)
@@ -323,7 +387,7 @@ def identify(
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     parts, before, after = [], [], []
     for block in every:
-        search = Search(recorded, model, block, airframe)
+        search = Search(recorded, model, block, airframe, actuation.delay, unknown)
         fit = search.fit(known & ~held_out, lambda: progress(completed=next(done), total=len(every) * (MAX_ITERATIONS + 1)))
         outputs, entries = search.names.outputs, search.entries(fit)
         predictions = prediction(fit.before, held_out), prediction(fit.after, held_out)
@@ -333,7 +397,8 @@ def identify(
             other_signs(airframe, with_entries(airframe, entries), paired),
             no_better(*predictions),
         )
-        parts.append(Part(search.names.inputs, outputs, tuple(entries), *predictions, next(filter(None, sentences), "")))
+        refusal, delay = next(filter(None, sentences), ""), recorded.period * search.delay(fit)
+        parts.append(Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay))
         before.append(fit.before)
         after.append(fit.after)
     first, last = joined(before, every), joined(after, every)
@@ -437,13 +502,13 @@ def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairin
 
 
 def no_better(before: Prediction, after: Prediction) -> str:
-    """Whether the model does not predict the held-out samples better, or not with whiter innovations."""
+    """Whether the model does not predict the held-out samples better, or neither with white nor with whiter innovations."""
     if after.log_likelihood <= before.log_likelihood:
         return (
             f"held-out samples: found a log-likelihood of {after.log_likelihood:.4g} a sample, expected more than the"
             f" {before.log_likelihood:.4g} of the nominal airframe, which explains this flight as it is"
         )
-    if np.sum(after.whiteness) >= np.sum(before.whiteness):
+    if np.sum(after.whiteness) >= np.sum(before.whiteness) and np.max(after.whiteness) > MAX_WHITENESS:
         return (
             f"held-out samples: found innovations with a whiteness of {np.mean(after.whiteness):.3g}, expected less than the"
             f" {np.mean(before.whiteness):.3g} of the nominal airframe"
