@@ -1,162 +1,504 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Learning in the air: errors of uncertain aircraft before and after, beside the law alone, the file's model and the true one.
+"""Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's model and the true one.
 
-python -m benchmarks.learning --aircraft 10     # osprey_learn at +-30 % and +-50 %, in turbulence: 20 s an aircraft
-python -m benchmarks.learning --air calm
+python -m benchmarks.learning --aircraft 20                    # every cell; run again, it flies what is missing
+python -m benchmarks.learning --aircraft 20 --cell turbulence  # of one cell
 
-A row an aircraft goes to the file of results. Run again, it flies those that are missing. It draws docs/images/learning.png.
+An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
+osprey_observer, as the others do. A row an aircraft goes to build/learning.csv. The figures go to docs/evidence/learning.csv,
+and the picture to docs/images/learning.png.
 """
 
-import json
-from enum import StrEnum
+import csv
+import math
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
+from benchmarks import evidence_data
+from benchmarks.evidence_data import row
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.turbulence import MODERATE
-from flight_analysis.closed_loop.replay import replay
+from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
+from flight_analysis.closed_loop.learning import Learn, Learner, Proposal
+from flight_analysis.closed_loop.margins import law_order
+from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
-from flight_campaign.statistics import score_units
+from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
+from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
 from rise_di.gain_design import observed
 from rise_di.learning import learner
 from rise_di_controller.learning import Event
+from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di import RiseDiConfig
 
-IMAGE = Path(__file__).parents[1] / "docs" / "images" / "learning.png"
-SEED, UNCERTAINTIES = 11, (0.3, 0.5)
-WINDOWS = ((0.0, 14.0), (14.0, 24.0), (24.0, 34.0), (34.0, 60.0))  # s: the first model flies at 14 s at the earliest
-PALETTE = 32  # colours of the picture
-MARGIN, WITHIN = 0.03, 1.1  # s; an error within 10 % of that of the true model
+REPOSITORY = Path(__file__).parents[1]
+IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
+SEED = 11  # of the aircraft
+LEARNED, DAMAGED, SETTLED, END = 64.0, 60.0, 75.0, 100.0  # s: when the last model flies; the fault, and what counts after it
+LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
+REPEATED = 35.0  # s, after which the commands of osprey_learn come again
+ROUGH = 0.6  # deviation of the logarithms of the entries of a rough prior
+WEAK, COUPLING = 0.5, 0.1
+ALARM_FLIGHT = 600.0  # s
 COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
 LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
+PALETTE = 32  # colours of the picture
+TRAIN = {  # m/s, m, s: a gust every 3 to 7 s
+    "vertical": {"start": 1.0, "speed": 8.0, "length": 15.0, "every": 4.7},
+    "lateral": {"start": 2.5, "speed": 5.0, "length": 12.0, "every": 6.1},
+    "longitudinal": {"start": 4.0, "speed": 4.0, "length": 25.0, "every": 9.7},
+}
+AIR: dict[str, dict[str, Any]] = {
+    "turbulence": {"turbulence": MODERATE},
+    "gusts": {"turbulence": None, "gusts": TRAIN},
+    "calm": {"turbulence": None},
+    "light turbulence": {"turbulence": MODERATE | {"wind": 7.7}},
+    "severe turbulence": {"turbulence": MODERATE | {"wind": 23.1}},
+    "turbulence and gusts": {"turbulence": MODERATE, "gusts": TRAIN},
+}
 
 
-class Air(StrEnum):
-    """The air of all flights of an aircraft."""
+class Cell(NamedTuple):
+    """What the aircraft of a cell have in common."""
 
-    TURBULENCE = "turbulence"
-    CALM = "calm"
+    kind: str  # "learn", "rough", "coupled", "late", "weak", "dead" or "alarm"
+    air: str
+    uncertainty: float
+    share: float = 1.0  # of --aircraft
+
+
+CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbulence", "gusts", "calm") for p in (0.3, 0.5)} | {
+    "rough prior": Cell("rough", "turbulence", 0.3, 0.5),
+    "coupled": Cell("coupled", "turbulence", 0.3, 0.25),
+    "u late": Cell("late", "turbulence", 0.3, 0.25),
+    "weak": Cell("weak", "turbulence", 0.3, 0.5),
+    "dead": Cell("dead", "turbulence", 0.3, 0.5),
+    **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1) for air in AIR},
+}
 
 
 class Row(NamedTuple):
-    """One aircraft: scores in WINDOWS, by controller; empty where no observer has the margins."""
+    """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not flown."""
 
-    air: str
-    uncertainty: float
+    cell: str
     number: int
-    scores: dict[str, list[float]]
-    learned: list[float]  # s, flight times at which a model began to fly
-    events: list[str]
-    replayed: bool
+    alone: float = math.nan
+    file: float = math.nan
+    learner: float = math.nan
+    true: float = math.nan
+    late_alone: int = 0  # 1: unstable with u LATE
+    late_file: int = 0
+    late_learner: int = 0
+    late_true: int = 0
+    first: float = math.nan  # s, when the first model flew
+    models: int = 0
+    refused: int = 0
+    alarms: int = 0  # of the change test
+    dead: str = ""  # the input without effect
+    found: str = ""  # the input found to be without effect
+    found_at: float = math.nan  # s
+    lost: int = 0  # 1: with the learner alone of the two
+    identification: float = 0.0  # s of a core, the longest
+    replayed: int = 0
+    events: str = ""
 
 
-def scenario(air: str, uncertainty: float, number: int) -> Scenario:
-    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own."""
-    sampled = {"A": uncertainty, "B": uncertainty, "seed": SEED, "number": number}
-    wind = {"turbulence": MODERATE | {"seed": 1000 + number} if air == Air.TURBULENCE else None}
-    shipped = find_scenario("osprey_learn")
-    noise = {"noise": shipped.aircraft.sensors.noise, "seed": 1000 + number}
-    aircraft = {"rate": 100.0, "step": 0.005, "uncertainty": sampled, "sensors": noise} | wind
+class Timed:
+    """A learner, and how long its longest step takes on one core."""
+
+    def __init__(self, own: Learner) -> None:
+        self._own, self.longest = own, 0.0
+
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
+        """Of the learner."""
+        self._own.take(stamp_ns, y, u)
+
+    def propose(self) -> Proposal:
+        """Of the learner."""
+        begin = time.process_time()
+        proposal = self._own.propose()
+        self.longest = max(self.longest, time.process_time() - begin)
+        return proposal
+
+
+def learning(cell: Cell, number: int, duration: float, **changed: Any) -> Scenario:
+    """osprey_learn at 100 Hz with an aircraft, wind and noise of its own, and its commands again and again."""
+    shipped, seed = find_scenario("osprey_learn"), {"seed": 1000 + number}
+    sampled = {"A": cell.uncertainty, "B": cell.uncertainty, "seed": SEED, "number": number}
+    air = AIR[cell.air]
+    air = air | ({"turbulence": air["turbulence"] | seed} if air["turbulence"] else {})
+    pulses: dict[str, dict[str, list[float]]] = {}
+    for name, pulse in shipped.reference_model.pulses.items():
+        begins = [REPEATED * k for k in range(math.ceil(duration / REPEATED))]
+        times = {key: [begin + t for begin in begins for t in getattr(pulse, key)] for key in ("start", "stop")}
+        pulses[name] = times | {"value": list(pulse.value) * len(begins)}
+    sensors = shipped.aircraft.sensors.model_dump() | seed | ({"delay": LATE} if cell.kind == "late" else {})
+    aircraft = {"rate": 100.0, "step": 0.005, "uncertainty": sampled, "sensors": sensors} | air | changed
+    reference = {"rate": 100.0, "pulses": pulses}
+    return shipped.vary(flight={"duration": duration}, aircraft=aircraft, reference_model=reference)
+
+
+def evaluation(flown: Scenario) -> Scenario:
+    """osprey_observer, its commands and two gusts, with the aircraft of a flight that learned and other noise."""
+    shipped = find_scenario("osprey_observer")
+    own = {key: getattr(flown.aircraft, key).model_dump() for key in ("uncertainty", "actuators", "sensors")}
+    aircraft = own | {"airframe": flown.aircraft.airframe, "rate": 100.0, "step": 0.005}
+    aircraft["sensors"]["seed"] += 5000
     return shipped.vary(aircraft=aircraft, reference_model={"rate": 100.0})
 
 
-def scores(tape: Tape) -> list[float]:
-    """Sum over the outputs of the true rms error in units of a score, in each window."""
+def score(tape: Tape, first: float = 0.0, without: Sequence[str] = ()) -> float:
+    """Sum over the outputs of the true rms error in units of a score; infinite for a flight that ended early."""
+    if tape.outcome != COMPLETED:
+        return math.inf
     y_m, truth, t = tape["y_m"], tape["truth"], tape.time("y_m")
-    outputs = tuple(y_m.names)
-    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)
-    units = score_units(outputs, load_airframe("osprey").units_of_outputs())
-    return [float(np.sum(np.sqrt(np.mean(e[(t >= first) & (t < last)] ** 2, axis=0)) / units)) for first, last in WINDOWS]
+    outputs = tuple(name for name in y_m.names if name not in without)
+    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[t >= first]
+    return float(np.sum(np.sqrt(np.mean(e**2, axis=0)) / score_units(outputs, load_airframe("osprey").units_of_outputs())))
 
 
-def fly(air: str, uncertainty: float, number: int) -> Row:
-    """Fly an aircraft with the law alone, the observers of the file and of the true model, and the learner."""
-    chosen, events = scenario(air, uncertainty, number), list[Event]()
-    alone, learn = chosen.vary(controller={"learn": None}), learner(chosen)
+def designed(start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False) -> RiseDiConfig | None:
+    """The start with feedforward and observer of a model; None where no relaxation has the margins."""
+    try:
+        return observed(start, scenario, model, MARGIN, uncertain=uncertain)[0]
+    except ParameterError:
+        return None
 
-    def with_model(model: Airframe) -> list[float]:
-        try:
-            return scores(simulate(alone.vary(controller=observed(alone.rise_di(), alone, model, MARGIN)[0])))
-        except ParameterError:
-            return []
 
-    tape = simulate(chosen, learn=learn, announce=events.append)
-    found = {
-        "alone": scores(simulate(alone)),
-        "file": with_model(load_airframe("osprey")),
-        "learner": scores(tape),
-        "true": with_model(chosen.aircraft.sampled_airframe()),
+def is_unstable(controller: ControllerConfig, aircraft: Airframe) -> int:
+    """1 where the linear loop of an aircraft is unstable with u LATE, else 0."""
+    rows, columns = law_order(aircraft, controller)
+    plant = LinearPlant(
+        aircraft.matrix_a() + aircraft.matrix_gravity(), aircraft.matrix_b()[:, columns], aircraft.matrix_c()[rows]
+    )
+    loop, m = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate), len(columns)
+    return int(not is_stable(plant, linear_law(controller.tuned_law(), m, loop.period), loop, np.full(m, LATE)))
+
+
+class Learned(NamedTuple):
+    """A flight that learned."""
+
+    tape: Tape
+    controller: RiseDiConfig  # at its end, without the section learn
+    row: Row
+
+
+def fly(name: str, number: int, chosen: Scenario) -> Learned:
+    """Fly a scenario that learns."""
+    make, events, timed = learner(chosen), list[Event](), list[Timed]()
+    assert make is not None  # noqa: S101 - for the type checker
+
+    def watched(parameters: RiseDiConfig, make: Learn = make) -> Learner:
+        timed.append(Timed(make(parameters)))
+        return timed[0]
+
+    tape = simulate(chosen, learn=watched, announce=events.append)
+    controller: ControllerConfig = chosen.controller
+    for change in tape.changes:
+        controller = vary(controller, change)
+    assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
+    taken = [event for event in events if event.change]
+    dead = [event for event in events if "has no effect" in event.sentence]
+    found = dead[0].sentence.partition(" has no effect")[0].split()[-1] if dead else ""
+    summary = Row(
+        name,
+        number,
+        first=taken[0].stamp_ns / 1e9 if taken else math.nan,
+        models=len(taken),
+        refused=sum(not event.change for event in events),
+        alarms=sum("changed, log-likelihood" in event.sentence for event in events),
+        found=found,
+        found_at=dead[0].stamp_ns / 1e9 if dead else math.nan,
+        identification=timed[0].longest,
+        replayed=int(replay(tape).equal()),
+        events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
+    )
+    return Learned(tape, controller.model_copy(update={"learn": None}), summary)
+
+
+def start_of(chosen: Scenario) -> RiseDiConfig:
+    """The controller of the start, without the section learn."""
+    return chosen.rise_di().model_copy(update={"learn": None})
+
+
+@lru_cache(maxsize=4)
+def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
+    """Score in the flight with gusts, and whether unstable with u late, of what does not learn: the same in every air."""
+    chosen = learning(Cell("learn", "calm", uncertainty), number, LEARNED)
+    flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
+    controllers = {
+        "alone": start,
+        "file": designed(start, chosen, load_airframe("osprey"), uncertain=True),
+        "true": designed(start, chosen, aircraft),
     }
-    learned = [event.stamp_ns / 1e9 for event in events if event.change]
-    sentences = [f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events]
-    return Row(air, uncertainty, number, found, learned, sentences, replay(tape).equal())
+    return {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
 
 
-def plot(rows: list[Row]) -> Figure:
-    """The score in each window, an aircraft a line and the mean a thick line, a panel an uncertainty."""
+def frozen(controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe) -> tuple[float, int]:
+    """Score of a controller in a flight, and whether it is unstable with u late."""
+    if controller is None:
+        return math.nan, 0
+    return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
+
+
+def learn(name: str, cell: Cell, number: int) -> Row:
+    """A learner beside what does not learn."""
+    with TemporaryDirectory() as folder:
+        chosen = learning(cell, number, LEARNED)
+        others = beside(cell.uncertainty, number) if cell.kind in {"learn", "rough"} else {}
+        if cell.kind == "rough":
+            prior = rough(number)
+            Path(folder, "prior.yaml").write_text(as_yaml(prior), encoding="utf-8")
+            chosen = with_prior(chosen, folder)
+        elif cell.kind == "coupled":
+            Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")), encoding="utf-8")
+            Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)), encoding="utf-8")
+            chosen = with_prior(learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder)
+        flown = fly(name, number, chosen)
+        flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
+        if cell.kind == "rough":
+            others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
+        if cell.kind in {"coupled", "late"}:
+            models = {"file": load_airframe("osprey"), "true": aircraft}
+            controllers = {"alone": start} | {key: designed(start, chosen, model) for key, model in models.items()}
+            others = {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
+        others = others | {"learner": frozen(flown.controller, flight, aircraft)}
+    values: dict[str, Any] = {key: value for key, (value, _) in others.items()}
+    values |= {f"late_{key}": late for key, (_, late) in others.items()}
+    return flown.row._replace(**values)
+
+
+def with_prior(chosen: Scenario, folder: str) -> Scenario:
+    """A scenario whose learner begins with the airframe of a file."""
+    settings = chosen.rise_di().model_dump()["learn"] | {"prior": str(Path(folder, "prior.yaml"))}
+    return chosen.vary(controller={"learn": settings})
+
+
+def rough(number: int) -> Airframe:
+    """The osprey with every entry off by a factor exp(ROUGH N), those of C B by up to 30 %; rows of angles stay."""
+    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number])
+    A, B = airframe.matrix_a(), airframe.matrix_b()
+    dynamic = np.array([[float(state not in {"theta", "phi"})] for state in airframe.states])
+    direct = np.array([[float(state in airframe.outputs)] for state in airframe.states]) * (np.abs(B) > 0.0)
+    of_A, of_B = (np.exp(ROUGH * dynamic * rng.standard_normal(matrix.shape)) for matrix in (A, B))
+    of_B = np.where(direct > 0.0, 1.0 + rng.uniform(-0.3, 0.3, B.shape), of_B)
+    return airframe.with_matrices(A * of_A, B * of_B, wind_factors(airframe, (A * of_A)[None], AIR_RELATIVE)[0])
+
+
+def coupled(number: int) -> Airframe:
+    """The osprey with entries between its two parts of up to COUPLING of the largest effect on the row, in units of motion."""
+    airframe, rng = load_airframe("osprey"), np.random.default_rng([SEED, number, 1])
+    A, B, size = airframe.matrix_a(), airframe.matrix_b(), np.array([1.0 if name == "V" else 0.1 for name in airframe.states])
+    of_lon = np.array([name in {"V", "alpha", "q", "theta"} for name in airframe.states])
+    other = of_lon[:, None] != of_lon[None, :]
+    other_input = of_lon[:, None] != np.array([name in {"elevator", "thrust"} for name in airframe.inputs])[None, :]
+    dynamic = np.array([name not in {"theta", "phi"} for name in airframe.states])
+    row_A, row_B = np.sqrt(np.sum((A * size) ** 2, axis=1)), np.abs(B).max(axis=1)
+    A = A + COUPLING * rng.uniform(-1.0, 1.0, A.shape) * (row_A * dynamic)[:, None] / size * other * dynamic[None, :]
+    B = B + COUPLING * rng.uniform(-1.0, 1.0, B.shape) * (row_B * dynamic)[:, None] * other_input
+    return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
+
+
+def damage(name: str, cell: Cell, number: int) -> Row:
+    """A learner beside the others when elevator and aileron lose half of their effect, or one surface all of it."""
+    inputs = tuple(load_airframe("osprey").inputs)
+    surfaces = [key for key in inputs if key != "thrust"]
+    dead = surfaces[number % len(surfaces)] if cell.kind == "dead" else ""
+    hit = {dead} if dead else {"elevator", "aileron"}
+    key = "lost_at" if dead else "weak_at"
+    actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
+    actuators[key] = [DAMAGED if channel in hit else math.inf for channel in inputs]
+    chosen = learning(cell, number, END, actuators=actuators)
+    flown, start, aircraft = fly(name, number, chosen), start_of(chosen), chosen.aircraft.sampled_airframe()
+    B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
+    damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
+    controllers = {"alone": start, "file": designed(start, chosen, load_airframe("osprey"), uncertain=True)}
+    controllers |= {} if dead else {"true": designed(start, chosen, damaged)}
+    tapes = {key: simulate(chosen.vary(controller=value)) for key, value in controllers.items() if value is not None}
+    without = {"elevator": "q", "aileron": "p", "rudder": "r"}.get(dead, "")
+    found: dict[str, Any] = {key: score(tape, SETTLED, (without,)) for key, tape in (tapes | {"learner": flown.tape}).items()}
+    lost = int(found["learner"] > LOSS_OF_TRACK_SCORE >= found["alone"])
+    return flown.row._replace(**found, dead=dead, lost=lost)
+
+
+def alarms(name: str, cell: Cell, number: int) -> Row:
+    """A learner in a long flight without any damage."""
+    return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
+
+
+FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
+
+
+def flown_row(name: str, number: int) -> Row:
+    """The row of an aircraft."""
+    return FLIGHTS[CELLS[name].kind](name, CELLS[name], number)
+
+
+# The results
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of a file of results."""
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as stream:
+        return [
+            Row(*(kind(value) for kind, value in zip(KINDS, line.values(), strict=True))) for line in csv.DictReader(stream)
+        ]
+
+
+KINDS = tuple(Row.__annotations__.values())
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write the rows, sorted."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerows((Row._fields, *sorted(rows, key=lambda each: (list(CELLS).index(each.cell), each.number))))
+
+
+def figures(rows: Sequence[Row]) -> Iterator[evidence_data.Row]:
+    """The figures of every cell, with their goals."""
+    for name, cell in CELLS.items():
+        chosen = [each for each in rows if each.cell == name]
+        if chosen:
+            yield row(f"{name}: aircraft", float(len(chosen)))
+            yield row(f"{name}: replay equal", float(np.mean([each.replayed for each in chosen])), at_least=1.0)
+            yield row(f"{name}: longest identification", max(each.identification for each in chosen), "s")
+            yield from CELL_FIGURES[cell.kind](name, cell, chosen)
+
+
+def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+    """Scores beside those of the others."""
+    yield from scores(name, chosen)
+    known = [each for each in chosen if not math.isnan(each.true)]
+    near = {"learn": 0.95 if cell.uncertainty < 0.5 else 0.9, "rough": 0.75}.get(cell.kind)
+    within = COUPLED_WITHIN if cell.kind == "coupled" else WITHIN
+    share = float(np.mean([each.learner <= within * each.true for each in known]))
+    yield row(f"{name}: share within {100 * (within - 1.0):.0f} % of the true model", share, at_least=near)
+    yield row(f"{name}: worse than the law alone", float(sum(each.learner > each.alone for each in chosen)), at_most=0.0)
+    for key, label in LABELS.items():
+        unstable = float(np.mean([getattr(each, f"late_{key}") for each in chosen]))
+        limit = (0.0 if cell.uncertainty < 0.5 else 0.01) if key == "learner" else None
+        yield row(f"{name}: share unstable with u {1e3 * LATE:.0f} ms late, {label}", unstable, at_most=limit)
+    begun = [each.first for each in chosen if not math.isnan(each.first)]
+    yield row(f"{name}: without a model", float(len(chosen) - len(begun)))
+    if begun:
+        yield row(f"{name}: first model, median", float(np.median(begun)), "s")
+
+
+def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+    """Mean and largest score of each."""
+    for key, label in LABELS.items():
+        values = np.array([getattr(each, key) for each in chosen])
+        values = values[np.isfinite(values)]
+        if len(values):
+            yield row(f"{name}: score, {label}", float(np.mean(values)))
+            yield row(f"{name}: largest score, {label}", float(np.max(values)))
+
+
+def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+    """Scores from SETTLED on; whether a dead input was found in time."""
+    yield from scores(name, chosen)
+    yield row(
+        f"{name}: lost with the learner and not with the law alone", float(sum(each.lost for each in chosen)), at_most=0.0
+    )
+    if cell.kind == "weak":
+        ratio = np.mean([each.learner for each in chosen]) / np.mean([each.true for each in chosen])
+        yield row(f"{name}: mean over that of the true model", float(ratio), at_most=1.05)
+        yield row(f"{name}: share found to have changed", float(np.mean([each.alarms > 0 for each in chosen])))
+        return
+    right = [each.found == each.dead and each.found_at <= SETTLED for each in chosen]
+    yield row(f"{name}: share found within {SETTLED - DAMAGED:.0f} s", float(np.mean(right)), at_least=0.95)
+    wrong = [each.found not in {"", each.dead} for each in chosen]
+    yield row(f"{name}: another input found", float(sum(wrong)), at_most=0.0)
+
+
+def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+    """Alarms without damage."""
+    yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
+    yield row(f"{name}: false alarms", float(sum(each.alarms + (each.found != "") for each in chosen)), at_most=0.0)
+
+
+COUPLED_WITHIN = 1.15
+CELL_FIGURES = {
+    "learn": learn_figures,
+    "rough": learn_figures,
+    "coupled": learn_figures,
+    "late": learn_figures,
+    "weak": damage_figures,
+    "dead": damage_figures,
+    "alarm": alarm_figures,
+}
+
+
+def plot(rows: Sequence[Row]) -> Figure:
+    """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the mean."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    for axis, uncertainty in zip(figure.subplots(1, len(UNCERTAINTIES), sharey=True), UNCERTAINTIES, strict=True):
-        chosen = [row for row in rows if row.uncertainty == uncertainty]
-        for name, colour in COLOURS.items():
-            lines = np.array([row.scores[name] for row in chosen if row.scores[name]])
-            if name == "learner" and len(lines):
-                axis.plot(lines.T, color=colour, linewidth=0.5, alpha=0.5)
-            if len(lines):
-                axis.plot(lines.mean(axis=0), color=colour, linewidth=2.2, marker="o", label=LABELS[name])
-        axis.set_xticks(range(len(WINDOWS)), [f"{first:g} to {last:g} s" for first, last in WINDOWS])
-        axis.set_title(f"A and B +-{100 * uncertainty:g} %, {len(chosen)} aircraft: score", fontsize=10, loc="left")
-        axis.set_ylim(bottom=0.0)
-        axis.grid(color="#dddddd", linewidth=0.6)
+    for axis, uncertainty in zip(figure.subplots(1, 2, sharey=True), (0.3, 0.5), strict=True):
+        columns: dict[str, tuple[str, list[float]]] = {}
+        for name, cell in CELLS.items():
+            if cell.kind == "learn" and cell.uncertainty == uncertainty:
+                chosen = [each for each in rows if each.cell == name]
+                for key in ("alone", "file", "true"):
+                    columns.setdefault(
+                        LABELS[key].replace(" of", "\nof"), (COLOURS[key], [getattr(each, key) for each in chosen])
+                    )
+                columns[f"learned in\n{cell.air}"] = COLOURS["learner"], [each.learner for each in chosen]
+        for place, (colour, values) in enumerate(columns.values()):
+            spread = place + 0.5 * (np.arange(len(values)) / max(len(values) - 1, 1) - 0.5)
+            axis.plot(spread, values, ".", color=colour, markersize=3, alpha=0.6)
+            axis.plot([place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2)
+        axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
+        axis.set_title(f"A and B +-{100 * uncertainty:g} %: score", fontsize=10, loc="left")
+        axis.set_ylim(0.0, 3.0)
+        axis.grid(axis="y", color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
-        axis.legend(frameon=False, fontsize=9)
     return figure
 
 
-def report(rows: list[Row], air: str, uncertainty: float) -> str:
-    """Means and worst of the last window, and how many aircraft are near the true model or worse than the law alone."""
-    chosen = [row for row in rows if (row.air, row.uncertainty) == (air, uncertainty) and row.scores["true"]]
-    last = {name: np.array([row.scores[name][-1] if row.scores[name] else np.nan for row in chosen]) for name in COLOURS}
-    means = ", ".join(f"{LABELS[name]} {np.nanmean(values):.2f} ({np.nanmax(values):.2f})" for name, values in last.items())
-    near = np.mean(last["learner"] <= WITHIN * last["true"])
-    worse, replayed = int(np.sum(last["learner"] > last["alone"])), sum(row.replayed for row in chosen)
-    first = np.median([row.learned[0] for row in chosen if row.learned])
-    return (
-        f"{air}, +-{100 * uncertainty:g} %, {len(chosen)} aircraft, {WINDOWS[-1][0]:g} to {WINDOWS[-1][1]:g} s: {means}; within"
-        f" {100 * (WITHIN - 1.0):.0f} % of the true model {100 * near:.0f} %, worse than the law alone {worse}, first model at"
-        f" {first:g} s (median), replay equal {replayed}"
-    )
-
-
 def main(
-    aircraft: Annotated[int, typer.Option(help="Aircraft of each uncertainty.")] = 10,
-    air: Annotated[Air, typer.Option(help="The air.")] = Air.TURBULENCE,
-    results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = Path("learning.jsonl"),
+    aircraft: Annotated[int, typer.Option(help="Aircraft of a cell; some have a part of it.")] = 20,
+    cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
+    results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
+    jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
 ) -> None:
-    """Fly the aircraft that are missing in the results, print the figures and draw the picture."""
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
-    rows = [Row(**json.loads(line)) for line in lines]
-    known = {(row.air, row.uncertainty, row.number) for row in rows}
-    cases: list[tuple[Any, ...]] = [(air, p, number) for number in range(aircraft) for p in UNCERTAINTIES]
-    for case in track([case for case in cases if case not in known], "aircraft"):
-        rows.append(fly(*case))
-        with results.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(rows[-1]._asdict()) + "\n")
-    for uncertainty in UNCERTAINTIES:
-        print(report(rows, air, uncertainty))
-    if air == Air.TURBULENCE:
+    """Fly the aircraft that are missing in the results, and write the figures and the picture."""
+    rows, begun = read(results), evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
+    known = {(each.cell, each.number) for each in rows}
+    # aircraft by aircraft, so that a run that ends early has some of each cell
+    cases = [(n, name) for n in range(aircraft) for name in cell if n < math.ceil(CELLS[name].share * aircraft)]
+    with ProcessPoolExecutor(jobs) as pool:
+        pending = [pool.submit(flown_row, name, n) for n, name in cases if (name, n) not in known]
+        for future in track(as_completed(pending), "aircraft", total=len(pending)):
+            rows.append(future.result())
+            write(results, rows)
+    found = list(figures(rows))
+    for each in found:
+        print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
+    if set(cell) == set(CELLS):
+        evidence_data.write("learning", found, begun)
         rendered = BytesIO()
-        plot([row for row in rows if row.air == air]).savefig(rendered, dpi=110)
+        plot(rows).savefig(rendered, dpi=110)
         Image.open(rendered).convert("RGB").quantize(PALETTE).save(IMAGE, optimize=True)
 
 
