@@ -160,7 +160,7 @@ def test_equation_1_is_sum_of_parts() -> None:
 def test_f_of_states_in_columns_is_f_of_each_state() -> None:
     gusts = {"vertical": {"start": 0.0, "speed": 10.0, "length": 15.0}}
     single = aircraft_parameters(gusts=gusts, inertial_coupling=1.0).load()[1]
-    batched = single._replace(gusts=Gusts(*(values[:, None] for values in single.gusts)))
+    batched = single._replace(gusts=Gusts(*(values[:, None] for values in single.gusts[:3])))
     columns = np.random.default_rng(1).uniform(-1.0, 1.0, (8, 5))
     f = dynamics.f(0.3, columns, batched)
     for k in range(5):
