@@ -14,7 +14,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import DESIGNED, Event, Learning, Proposal, Updates, changes
+from rise_di_controller.learning import DESIGNED, Event, Learning, Proposal, Updates, changes, designed
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.package("rise_di_controller")
@@ -63,6 +63,20 @@ def test_proposal_flies_after_certificate_in_parts() -> None:
     expected = RiseDiConfig.validate_mapping(START.changed(CHANGE), "expected")
     assert flight.controller.digest == expected.digest()
     assert flight.events[0].change == changes(START, expected)
+
+
+def test_part_that_is_learned_later_gets_its_feedforward() -> None:
+    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    lateral = RiseDiConfig.validate_mapping(whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral")
+    flight, acting = Flight(), []
+    for model in (lateral, whole):
+        flight.receive(designed(START, model))
+        flight.step()
+        flight.now_ns += 10 * NANOSECONDS
+        flown = flight.controller.parameters.feedforward
+        assert flown is not None
+        acting.append(flown.inputs)
+    assert acting == [("aileron", "rudder"), None]
 
 
 def scaled(name: str, factor: float) -> dict[str, Any]:

@@ -18,6 +18,9 @@ from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 DESIGNED = frozenset({"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer"})
 """Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs."""
 
+OPTIONAL = ("feedforward.inputs", "feedforward.gravity")
+"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
+
 
 class Proposal(NamedTuple):
     """What a learner found in its window, as the controller receives it."""
@@ -203,12 +206,12 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
 
 
 def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
-    """All of DESIGNED of a new set by dotted name; None for what an old set has besides."""
+    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies meanwhile, may have besides."""
     before, after = (
         {name: value for name, value in flatten(parameters.model_dump()) if name.split(".")[0] in DESIGNED}
         for parameters in (old, new)
     )
-    return dict.fromkeys(before) | after
+    return dict.fromkeys([*before, *OPTIONAL]) | after
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
