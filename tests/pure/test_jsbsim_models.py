@@ -119,6 +119,21 @@ def test_model_cut_short_is_one_sentence(electric: Path, tmp_path: Path) -> None
         trim_solution(condition)
 
 
+def test_model_without_trim_of_its_own_trims_by_its_elevator(electric: Path, tmp_path: Path) -> None:
+    # as flying wings have it: no surface reads fcs/pitch-trim-cmd-norm
+    text = electric.read_text(encoding="utf-8")
+    cut = text.replace("fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
+    assert cut != text
+    for part in electric.parent.iterdir():
+        if part.is_dir():
+            (tmp_path / part.name).symlink_to(part)
+    model = tmp_path / electric.name
+    model.write_text(cut, encoding="utf-8")
+    solution = trim_solution(FlightCondition(str(model), 46.3, 1219.2, STEP_NS))
+    assert solution is not None
+    assert solution[-1] == 1.0  # all of it by the elevator
+
+
 def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     tree = tmp_path / "root"
     model = write_model(tree / "aircraft" / "mine", "electric147kW", "mine.xml")

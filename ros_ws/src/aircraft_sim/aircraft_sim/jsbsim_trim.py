@@ -45,8 +45,19 @@ FROZEN: Mapping[str, float] = {
 
 MIXTURE = 0.9  # of piston engines: rich
 SETTLE, SPIN_UP = 10.0, 30.0  # s of frozen flight: for running engines, and for engines that have just been started
+SLOW_SETTLE, SLOW_SPIN_UP = 80.0, 300.0
+"""The same for a propeller that is slow to reach its speed, such as one of an electric engine with a time constant of 10 s."""
+
+ATTEMPTS = ((SETTLE, SPIN_UP, 0.0), (SLOW_SETTLE, SLOW_SPIN_UP, 0.0), (SETTLE, SPIN_UP, 1.0), (SLOW_SETTLE, SLOW_SPIN_UP, 1.0))
+"""Settling times, s, and the part of the pitch trim given by the elevator: all, for a model without a trim of its own."""
+
+NEAR = 100.0  # of TOLERANCE: accelerations that an engine leaves which has not settled; with more it is not the engine
+FAR = 1e6  # of TOLERANCE: of a motion whose accelerations are not finite
+IDLE = 0.01  # throttle below which an engine without thrust is no failure
+
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
+LOWEST, HIGHEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5), (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)  # of these unknowns
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])  # m/s^2, rad/s^2: a tenth of a degree of attitude
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
@@ -54,15 +65,16 @@ PROBE_SIZE = 0.02  # how far the test flight moves each command
 TIMEOUT = 30.0  # s of processor time for trim and test flight; every aircraft that trims needs less than one
 
 TrimSolution = tuple[float, ...] | None
-"""The solver's unknowns of frozen flight, scaled; None where JSBSim's own trim succeeds. It gives the same bits everywhere."""
+"""The solver's unknowns of frozen flight, scaled, then spin-up and elevator part of ATTEMPTS; None where JSBSim's own trim
+succeeds. It gives the same bits everywhere."""
 
 
 class _Log(jsbsim.FGLogger):
-    """Keeps JSBSim's output off the console. `last` is the last error."""
+    """Keeps JSBSim's output off the console. `last` has the last two errors: the second often says only where."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.last = ""
+        self.last: tuple[str, ...] = ()
         self._level = jsbsim.LogLevel.BULK
         self._message = ""
 
@@ -80,7 +92,7 @@ class _Log(jsbsim.FGLogger):
 
     def flush(self) -> None:
         if self._level in {jsbsim.LogLevel.ERROR, jsbsim.LogLevel.FATAL}:
-            self.last = " ".join(self._message.split())
+            self.last = (*self.last[-1:], " ".join(self._message.split()).rstrip("."))
 
 
 @cache
@@ -118,9 +130,10 @@ def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsb
     if solution is None:
         _jsbsim_trim(fdm)
     else:
+        *unknowns, spin_up, by_elevator = solution
         _start_engines(fdm)
-        _set_unknowns(fdm, np.array(solution))
-        settle(fdm, SPIN_UP)
+        _set_unknowns(fdm, np.array(unknowns), by_elevator)
+        settle(fdm, spin_up)
     states = np.array([fdm[quantity.property] * quantity.si for quantity in STATES.values()])
     return fdm, Trim(*_commands_and_limits(fdm), states, _residuals(fdm))
 
@@ -209,14 +222,20 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
     try:
         if _jsbsim_trim(fdm):
             return None
-        solution = _solve_accelerations(fdm)
-        fdm, _ = trimmed_fdm(condition, solution)
+        nearest, left, problem = np.inf, np.inf, ""
+        for settling, spin_up, by_elevator in ATTEMPTS:
+            if spin_up == SLOW_SPIN_UP and left > NEAR:
+                continue
+            solution = (*_solve_accelerations(fdm, settling, by_elevator), spin_up, by_elevator)
+            found, _ = trimmed_fdm(condition, solution)
+            if _is_trimmed(found):
+                return solution
+            left = float(np.max(np.abs(_residuals(found)) / TOLERANCE))
+            if left < nearest or not problem:
+                nearest, problem = left, _trim_failure(found)
+            fdm = _load(condition)  # a solver far from a trim may have left it with numbers that are not finite
     except jsbsim.BaseError as error:
         problem = error_text(error)
-    else:
-        if _is_trimmed(fdm):
-            return solution
-        problem = _trim_failure(fdm)
     raise FlightEnded(f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} m: {problem}")
 
 
@@ -241,7 +260,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     except jsbsim.BaseError as error:
         raise FlightEnded(f"{condition.title} cannot be loaded: {error_text(error)}") from None
     if not loaded:
-        raise FlightEnded(f"{condition.title} cannot be loaded: {log.last or 'JSBSim gives no reason'}")
+        raise FlightEnded(f"{condition.title} cannot be loaded: {'; '.join(log.last) or 'JSBSim gives no reason'}")
     fdm.disable_output()
     fdm.set_dt(seconds(condition.step_ns))
     manager, engines = fdm.get_property_manager(), engine_count(fdm)
@@ -282,16 +301,25 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
     return _is_trimmed(fdm)
 
 
-def _solve_accelerations(fdm: jsbsim.FGFDMExec) -> tuple[float, ...]:
-    """The solver's root of the accelerations of frozen flight: unknowns x = START + (scaled - 1) SCALE."""
-    from scipy.optimize import fsolve  # noqa: PLC0415 - takes a sixth of a second, which other aircraft do not need
+def _solve_accelerations(fdm: jsbsim.FGFDMExec, settling: float, by_elevator: float) -> tuple[float, ...]:
+    """The solver's root of the accelerations after `settling` s of frozen flight: unknowns x = START + (scaled - 1) SCALE."""
+    from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 
     def accelerations(scaled: FloatArray) -> FloatArray:
-        _set_unknowns(fdm, scaled)
-        settle(fdm, SETTLE)
+        _set_unknowns(fdm, scaled, by_elevator)
+        settle(fdm, settling)
         return _residuals(fdm)
 
     _start_engines(fdm)
+    if by_elevator:  # inside the stops, also where an input has no effect: a flying wing has no rudder
+
+        def weighted(scaled: FloatArray) -> FloatArray:
+            return np.asarray(np.nan_to_num(accelerations(scaled) / TOLERANCE, nan=FAR, posinf=FAR, neginf=-FAR))
+
+        low, high = (1.0 + (np.array(end) - START) / SCALE for end in (LOWEST, HIGHEST))
+        steps = np.full(len(START), 1e-3)
+        found = least_squares(weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40)
+        return tuple(found.x.tolist())
     # Differences over a thousandth of the scales: engines settle more accurately than that.
     scaled, *_ = fsolve(accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True)
     return tuple(scaled.tolist())
@@ -303,13 +331,15 @@ def _start_engines(fdm: jsbsim.FGFDMExec) -> None:
     settle(fdm, SPIN_UP)
 
 
-def _set_unknowns(fdm: jsbsim.FGFDMExec, scaled: FloatArray) -> None:
+def _set_unknowns(fdm: jsbsim.FGFDMExec, scaled: FloatArray, by_elevator: float = 0.0) -> None:
     alpha, throttle, pitch_trim, aileron, rudder, bank = (START + (scaled - 1.0) * SCALE).tolist()
     fdm["ic/alpha-rad"], fdm["ic/gamma-deg"], fdm["ic/phi-rad"] = alpha, 0.0, bank
+    fdm["ic/beta-rad"] = 0.0  # a change of alpha in a bank leaves some
     fdm.run_ic()
     for i in range(engine_count(fdm)):
         fdm[f"fcs/throttle-cmd-norm[{i}]"] = throttle
-    fdm["fcs/pitch-trim-cmd-norm"], fdm["fcs/elevator-cmd-norm"] = pitch_trim, 0.0
+    fdm["fcs/pitch-trim-cmd-norm"] = (1.0 - by_elevator) * pitch_trim
+    fdm["fcs/elevator-cmd-norm"] = by_elevator * pitch_trim
     fdm["fcs/aileron-cmd-norm"], fdm["fcs/rudder-cmd-norm"] = aileron, rudder
 
 
@@ -327,7 +357,9 @@ def _is_trimmed(fdm: jsbsim.FGFDMExec) -> bool:
 def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
     """Why the solver's result is no trim, as a sentence."""
     engines = range(engine_count(fdm))
-    stopped = [str(i + 1) for i in engines if not fdm[running_property(i)] and fdm[thrust_property(i)] <= 0.0]
+    throttle = INPUTS["throttle"].property
+    idle = [fdm[f"{throttle}[{i}]"] < IDLE for i in engines]
+    stopped = [str(i + 1) for i in engines if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0]
     if stopped:
         return f"engine {', '.join(stopped)} cannot be started"
     linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)
