@@ -30,6 +30,8 @@ from tests.closed_loop import error
 from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
 
+from aircraft_sim.airframe import load_airframe
+from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.margins import linear_loop
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
@@ -113,8 +115,9 @@ def test_a_score_counts_errors_in_their_units() -> None:
     rms = np.array([[0.010], [0.020], [0.010], [0.1]])
     units = {"q": "rad/s", "p": "rad/s", "r": "rad/s", "V": "m/s", "theta": "rad"}
     assert score(rms, score_units(("q", "p", "r", "V"), units)) == pytest.approx([4.0])
-    with pytest.raises(ParameterError, match=r"^outputs: found theta in rad, expected units a score counts: rad/s, m/s"):
+    with pytest.raises(ParameterError, match=r"^outputs: found theta in rad, expected rad/s or m/s, or a unit of the score"):
         score_units(("q", "theta"), units)
+    assert score_units(("q", "theta"), units, {"theta": 0.05, "q": 0.02}).tolist() == [0.02, 0.05]
 
 
 def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_path: Path) -> None:
@@ -128,6 +131,43 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
     unit = score_units(outputs, again.aircraft.channels().outputs)
     assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)  # as of single flights: tests of fleets
+
+
+def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
+    """One entry at its own limits, the others at theirs, and a score with a unit of its own."""
+    units, spread = {"V": 0.2}, Spread({"B[V,thrust]": 0.6}, "corners")
+    of = define(SHORT, 4, 0.2, 7, 4, spread=spread, units=units)
+    campaign = fly_campaign(tmp_path / "own", of)
+    rows = campaign.rows().collect()
+    airframe = load_airframe(SHORT.aircraft.airframe)
+    thrust = (
+        rows["B[V,thrust]"].to_numpy() / airframe.matrix_b()[airframe.index("V"), list(airframe.inputs).index("thrust")] - 1.0
+    )
+    assert np.abs(thrust) == pytest.approx(0.6)
+    assert np.abs(
+        rows["A[q,q]"].to_numpy() / airframe.matrix_a()[airframe.index("q"), airframe.index("q")] - 1.0
+    ) == pytest.approx(0.2)
+    worst = campaign.tally(0).worst[0]
+    again = campaign.definition.aircraft_scenario(worst.number)
+    true, outputs = error(simulate(again)), again.controller.outputs
+    at_ticks = true.stamp_ns % 10_000_000 == 0
+    rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
+    unit = score_units(outputs, again.aircraft.channels().outputs, units)
+    assert worst.score == pytest.approx(score(rms, unit)[0], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"spread": Spread({"A[q,gamma]": 0.5})}, r"entry A\[q,gamma\], expected an entry of the airframe"),
+        ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
+        ({"units": {"theta": 0.1}}, "expected an output of the controller"),
+        ({"units": {"V": 0.0}}, r"^score\.V: found 0, expected a unit"),
+    ],
+)
+def test_unknown_entry_and_unit_refused(options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        define(SHORT, 4, 0.2, 7, 4, **options)
 
 
 ROUTE = find_scenario("osprey_route")

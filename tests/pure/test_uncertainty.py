@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from tests.builders import aircraft_parameters
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
-from aircraft_sim.uncertainty import as_yaml, gust_directions, nominal_and_sampled, sample_airframe
+from aircraft_sim.uncertainty import Spread, as_yaml, gust_directions, nominal_and_sampled, sample_airframe
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
@@ -34,6 +34,16 @@ def test_entries_are_uniform_and_independent() -> None:
     others = (A[1:, q, 1] / A[0, q, 1] - 1.0, B[1:, q, 0] / B[0, q, 0] - 1.0)
     for entry in others:  # 1/sqrt(2000) = 0.022 is the standard deviation for independent samples; the limit is four of them
         assert abs(np.corrcoef(d, entry)[0, 1]) < 0.09
+
+
+def test_normal_deviations_have_limit_at_three_standard_deviations() -> None:
+    """2000 samples: the standard deviation is known to 1/sqrt(4000) = 1.6 %, the limit is four of these."""
+    A, _ = nominal_and_sampled(OSPREY, 0.3, 2000, seed=3, spread=Spread(distribution="normal"))
+    q = OSPREY.index("q")
+    d = A[1:, q, q] / A[0, q, q] - 1.0
+    assert np.std(d) == pytest.approx(0.1, rel=0.065)
+    assert np.abs(d).max() <= 0.3 + 1e-12
+    assert kstest(d, "norm", args=(0.0, 0.1)).pvalue > 0.01
 
 
 def test_sampled_airframe_keeps_zeros_angles_and_everything_but_and_b() -> None:

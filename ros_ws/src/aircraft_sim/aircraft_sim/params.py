@@ -18,12 +18,22 @@ from aircraft_sim.plant import Drift, PlantParams
 from aircraft_sim.pose import every
 from aircraft_sim.sensors import Sensors
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, Turbulence, dryden, filters
-from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
+from aircraft_sim.uncertainty import AIR_RELATIVE, Distribution, Spread, WindEffect
 from aircraft_sim.vanes import ANGLES, Vanes
 from flight_core import parameters
 from flight_core.channels import POSE
 from flight_core.fields import Field
-from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numbers, ParameterError, Positive, require
+from flight_core.parameters import (
+    Config,
+    NodeConfig,
+    NonNegative,
+    Number,
+    Numbers,
+    ParameterError,
+    Positive,
+    require,
+    require_length,
+)
 from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -88,16 +98,28 @@ class SineConfig(Config):
 
 
 class UncertaintyConfig(Config):
-    """An aircraft sampled around the airframe: every entry times 1 + d, d uniform and independent; rows of angles stay."""
+    """An aircraft sampled around the airframe: every entry times 1 + d, d independent; rows of angles stay."""
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
+    entries: tuple[str, ...] = Field(default=(), description="entries with a largest d of their own, as A[q,alpha]")
+    parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(default=(), description="the largest d of these entries")
+    distribution: Distribution = Field(
+        default="uniform", description="of d: uniform, normal with its limit at three standard deviations, or its two limits"
+    )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
         description="effect of wind on x_dot: by the aircraft's own A, alpha, beta and V relative to the air, or published",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
+
+    def _check(self) -> None:
+        require_length("parts", self.parts, self.entries)
+
+    def spread(self) -> Spread:
+        """How the entries are drawn."""
+        return Spread(dict(zip(self.entries, self.parts, strict=True)), self.distribution)
 
 
 class DriftConfig(Config):
@@ -330,7 +352,7 @@ class AircraftConfig(NodeConfig):
             require(getattr(self, key) is not None, key, "none", f"the {unit}")
         for name in self.gusts:
             require(name in AXES, f"gusts.{name}", f"{name!r}", f"an axis of the wind: {', '.join(AXES)}")
-        uncertain = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0
+        uncertain = self.uncertainty.A > 0.0 or self.uncertainty.B > 0.0 or bool(self.uncertainty.entries)
         for key, value in (
             ("bias", self.bias),
             ("sines", self.sines),
@@ -366,7 +388,7 @@ class AircraftConfig(NodeConfig):
         """The airframe in flight: the named airframe, or a sample of `uncertainty` around the named airframe."""
         chosen = self.uncertainty
         return uncertainty.sample_airframe(
-            load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind
+            load_airframe(self.airframe), chosen.A, chosen.B, chosen.seed, chosen.number, chosen.wind, chosen.spread()
         )
 
     def drifted_airframe(self) -> Airframe:

@@ -3,7 +3,8 @@
 """Uncertain aircraft for Monte Carlo campaigns: A and B sampled around a published airframe, repeatable by seed."""
 
 from collections.abc import Mapping
-from typing import Literal
+from types import MappingProxyType
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -22,26 +23,51 @@ WindEffect = Literal["air_relative", "published"]
 
 AIR_RELATIVE: WindEffect = "air_relative"
 
+Distribution = Literal["uniform", "normal", "corners"]
+"""Of the relative deviations d within +-uncertainty: uniform; normal, cut at three standard deviations; or
+the two limits, with equal probability."""
 
-def nominal_and_sampled(airframe: Airframe, uncertainty: float, samples: int, seed: int) -> tuple[FloatArray, FloatArray]:
+
+class Spread(NamedTuple):
+    """How the entries of A and B are drawn."""
+
+    entries: Mapping[str, float] = MappingProxyType({})  # uncertainty by entry, named as in `drawn_entries`
+    distribution: Distribution = "uniform"
+
+
+UNIFORM = Spread()
+
+
+def nominal_and_sampled(
+    airframe: Airframe, uncertainty: float, samples: int, seed: int, spread: Spread = UNIFORM
+) -> tuple[FloatArray, FloatArray]:
     """A and B, shapes (1 + samples, n, n) and (1 + samples, n, m), SI: as published, then numbers 0, 1, ... of the seed.
 
-    Raises ParameterError for an uncertainty outside [0, 1).
+    Raises as `sampled_matrices`.
     """
-    A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples)
+    A, B = sampled_matrices(airframe, uncertainty, uncertainty, seed, 0, samples, spread)
     return np.concatenate([airframe.matrix_a()[None], A]), np.concatenate([airframe.matrix_b()[None], B])
 
 
 def sample_airframe(
-    airframe: Airframe, of_A: float, of_B: float, seed: int, number: int = 0, wind: WindEffect = AIR_RELATIVE
+    airframe: Airframe,
+    of_A: float,
+    of_B: float,
+    seed: int,
+    number: int = 0,
+    wind: WindEffect = AIR_RELATIVE,
+    spread: Spread = UNIFORM,
 ) -> Airframe:
-    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0 and 0 give the published airframe.
+    """Uncertain airframe `number` of a seed, with uncertainties of A and of B. 0, 0 and no entry give the published airframe.
 
-    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises ParameterError for an uncertainty
-    outside [0, 1).
+    The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises as `sampled_matrices`.
     """
-    A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1)
-    return airframe if of_A == of_B == 0.0 else airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
+    A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1, spread)
+    return (
+        airframe
+        if of_A == of_B == 0.0 and not spread.entries
+        else airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
+    )
 
 
 def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatArray:
@@ -68,23 +94,42 @@ def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> Floa
 
 
 def sampled_matrices(
-    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int
+    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int, spread: Spread = UNIFORM
 ) -> tuple[FloatArray, FloatArray]:
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
-    Every entry is multiplied by 1 + d, d uniform in +-uncertainty and independent. The rows of angles stay. An aircraft
-    depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1).
+    Every entry is multiplied by 1 + d, d independent and within +-uncertainty, as `spread` says. The rows of angles stay. An
+    aircraft depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1), and for
+    an unknown entry.
     """
-    for part in (of_A, of_B):
+    parts = {"A": np.full(airframe.matrix_a().shape, of_A), "B": np.full(airframe.matrix_b().shape, of_B)}
+    places = _drawn_places(airframe)
+    for name, part in spread.entries.items():
+        require(name in places, "uncertainty", f"entry {name}", f"an entry of the airframe: {', '.join(places)}")
+        matrix, i, j = places[name]
+        parts[matrix][i, j] = part
+    for part in (of_A, of_B, *spread.entries.values()):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
     A, B = airframe.matrix_a(), airframe.matrix_b()
     uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
     known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
-    def spread(matrix: FloatArray, uncertainty: float, numbers: FloatArray) -> FloatArray:
-        return np.asarray(matrix * (1.0 + known * uncertainty * (2.0 * numbers.reshape(count, *matrix.shape) - 1.0)))
+    def drawn(matrix: FloatArray, part: FloatArray, numbers: FloatArray) -> FloatArray:
+        d = _deviations(numbers.reshape(count, *matrix.shape), spread.distribution)
+        return np.asarray(matrix * (1.0 + known * part * d))
 
-    return spread(A, of_A, uniform[:, : A.size]), spread(B, of_B, uniform[:, A.size :])
+    return drawn(A, parts["A"], uniform[:, : A.size]), drawn(B, parts["B"], uniform[:, A.size :])
+
+
+def _deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
+    """Deviations in [-1, 1] from numbers in [0, 1)."""
+    if distribution == "uniform":
+        return 2.0 * uniform - 1.0
+    if distribution == "corners":
+        return np.where(uniform < 0.5, -1.0, 1.0)
+    from scipy.special import ndtri  # noqa: PLC0415 - a tenth of a second, only for this
+
+    return np.asarray(np.clip(ndtri(uniform) / 3.0, -1.0, 1.0))
 
 
 def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str, FloatArray]:

@@ -5,7 +5,8 @@
 The folder of a campaign holds its definition, a table for each completed chunk, and at the end its figures and its report.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.uncertainty import WindEffect, drawn_entries, gust_directions, sampled_matrices
+from aircraft_sim.uncertainty import Distribution, Spread, WindEffect, drawn_entries, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
 from flight_campaign.benchmark_course import Course, build_course
@@ -80,6 +81,14 @@ class Definition(Config):
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
     chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
     sweep: Sweep | None = None
+    entries: dict[str, float] = Field(default={}, description="the largest part of entries with one of their own, by name")
+    distribution: Distribution = Field(default="uniform", description="of the parts, within the largest")
+    score_units: dict[str, float] = Field(default={}, description="unit of an rms error in the score by output, SI, if its own")
+
+    @property
+    def spread(self) -> Spread:
+        """How the entries are drawn."""
+        return Spread(self.entries, self.distribution)
 
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
@@ -91,7 +100,14 @@ class Definition(Config):
 
     def aircraft_scenario(self, number: int, case: int = 0) -> Scenario:
         """The scenario of one aircraft of the campaign, as `rise-di fly` flies it."""
-        uncertainty = {"A": self.uncertainty, "B": self.uncertainty, "wind": self.wind, "seed": self.seed, "number": number}
+        uncertainty: dict[str, Any] = {
+            "A": self.uncertainty,
+            "B": self.uncertainty,
+            "wind": self.wind,
+            "seed": self.seed,
+            "number": number,
+        }
+        uncertainty |= {"entries": [*self.entries], "parts": [*self.entries.values()], "distribution": self.distribution}
         return self.scenario(case).vary(aircraft={"uncertainty": uncertainty})
 
     @property
@@ -132,8 +148,13 @@ def define(
     chunk: int,
     sweep: Sweep | None = None,
     wind: WindEffect | None = None,
+    spread: Spread | None = None,
+    units: Mapping[str, float] | None = None,
 ) -> Definition:
-    """The definition of a campaign over a scenario; `wind` None: that of the scenario's `aircraft.uncertainty`.
+    """The definition of a campaign over a scenario.
+
+    `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units of the
+    score by output, SI.
 
     Raises ParameterError if a campaign cannot fly it.
     """
@@ -144,6 +165,15 @@ def define(
 
         missions.build(scenario, build_course(scenario))
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
+    spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
+    outputs, own = scenario.controller.outputs, dict(units or {})
+    for name, unit in own.items():
+        require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
+        require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
+    if scenario.guidance is None:
+        score_units(outputs, scenario.aircraft.channels().outputs, own)
+    if not scenario.aircraft.is_jsbsim:
+        sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, spread)
     values = {
         "name": scenario.name,
         "sections": {
@@ -155,6 +185,9 @@ def define(
         "seed": seed,
         "chunk": chunk,
         "sweep": sweep,
+        "entries": dict(spread.entries),
+        "distribution": spread.distribution,
+        "score_units": own,
     }
     definition = Definition.validate_mapping(values, "campaign")
     for case in range(definition.cases):
@@ -178,14 +211,14 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     scenario, course, vehicle, law, mission = _prepare(text, case)
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
-    A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk)
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
     result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
     if result.mission is None:
-        figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs))}
+        figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
     else:
         figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
@@ -273,7 +306,7 @@ class Campaign:
         """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
         of, scenario = self.definition, self.definition.scenario(case)
         try:
-            return margins(scenario, min(of.aircraft, MARGIN_AIRCRAFT), of.uncertainty, of.seed)
+            return margins(scenario, min(of.aircraft, MARGIN_AIRCRAFT), of.uncertainty, of.seed, of.spread)
         except ParameterError:
             return None
 
@@ -290,7 +323,7 @@ class Campaign:
             rows.head(RANKED).collect(),
             rows.filter(pl.col("number") == worst).collect(),
             {name: float(value[0]) for name, value in published.items()},
-            self.definition.uncertainty,
+            {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published},
         )
 
     def _read(self, job: Job) -> "pl.DataFrame":

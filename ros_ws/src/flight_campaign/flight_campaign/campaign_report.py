@@ -61,6 +61,9 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
             "scenario": definition.name,
             "aircraft": definition.aircraft,
             "uncertainty": definition.uncertainty,
+            "entries": definition.entries,
+            "distribution": definition.distribution,
+            "score_units": definition.score_units,
             "wind": definition.wind,
             "seed": definition.seed,
             "sweep": None if definition.sweep is None else definition.sweep.parameter,
@@ -120,9 +123,10 @@ def write_page(
     title = f"Campaign {definition.name}"
     text = (
         f"{tallies[0].flights} aircraft, every entry of A and B within"
-        f" ±{100 * definition.uncertainty:g} % of the airframe, seed {definition.seed}; the same wind and noise for all, the"
-        f" effect of wind on x_dot {WIND_EFFECTS[definition.wind]}; true errors at the controller's ticks."
-        f" Score: {score_meaning(scenario)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
+        f" ±{100 * definition.uncertainty:g} % of the airframe{_spread_of_entries(definition)}, seed {definition.seed};"
+        f" the same wind and noise for all, the effect of wind on x_dot {WIND_EFFECTS[definition.wind]};"
+        " true errors at the controller's ticks."
+        f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
@@ -154,12 +158,22 @@ def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence
     return Table("Score and margins", [Column("", label) for label in _labels(definition)], rows, OVERVIEW_LEGEND)
 
 
-def score_meaning(scenario: Scenario) -> str:
-    """What the score of a campaign counts."""
+def _spread_of_entries(definition: Definition) -> str:
+    """Uncertainties by entry, and a distribution beside the uniform."""
+    parts = [f"{name} ±{100 * part:g} %" for name, part in definition.entries.items()]
+    if definition.distribution != "uniform":
+        parts.append(definition.distribution)
+    return "".join(f", {part}" for part in parts)
+
+
+def score_meaning(scenario: Scenario, own: Mapping[str, float] | None = None) -> str:
+    """What the score of a campaign counts, with own units by output, SI."""
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.aircraft.channels().speed
         return f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s of flight at the trim speed"
-    return "the sum over the channels of rms error in 10 mrad/s (p: 20) and 0.1 m/s"
+    units = display_units(scenario)
+    stated = [f"{name} {unit * units[name].factor:g} {units[name].unit}" for name, unit in (own or {}).items()]
+    return f"the sum over the channels of rms error in {', '.join([*stated, '10 mrad/s (p: 20) and 0.1 m/s'])}"
 
 
 def _labels(definition: Definition) -> list[str]:

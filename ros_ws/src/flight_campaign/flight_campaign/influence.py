@@ -48,12 +48,12 @@ def chance_level(aircraft: int, entries: int) -> float:
 
 
 def influence(
-    table: "pl.DataFrame", worst: "pl.DataFrame", published: Mapping[str, float], uncertainty: float
+    table: "pl.DataFrame", worst: "pl.DataFrame", published: Mapping[str, float], uncertainty: Mapping[str, float]
 ) -> dict[str, Any]:
     """Rank correlations of a case as figures of a file: of `table`, beside the entries of the row `worst`, the worst aircraft.
 
-    "worst_aircraft" and "worst_corner" are parts of the published entry: that of the worst aircraft, and the limit of
-    the uncertainty on the side of the higher score, 0 for an entry within chance.
+    `uncertainty` is the largest part by entry. "worst_aircraft" and "worst_corner" are parts of the published entry: of
+    the worst aircraft, and the limit of the uncertainty on the side of the higher score, 0 for an entry within chance.
     """
     correlations = rank_correlations(table, published)
     level = chance_level(table.height, len(correlations)) if correlations else None
@@ -62,7 +62,7 @@ def influence(
             "entry": name,
             "rank_correlation": value,
             "worst_aircraft": worst[name][0] / published[name] - 1.0,
-            "worst_corner": math.copysign(uncertainty, value) if level is not None and abs(value) > level else 0.0,
+            "worst_corner": math.copysign(uncertainty[name], value) if level is not None and abs(value) > level else 0.0,
         }
         for name, value in correlations.items()
     ]

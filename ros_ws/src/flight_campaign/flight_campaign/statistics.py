@@ -146,12 +146,16 @@ def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
 
-def score_units(outputs: Sequence[str], units: Mapping[str, str]) -> FloatArray:
-    """Units of the rms errors of the channels in the score, SI, shape (m,). Raises ParameterError for an unknown unit."""
+def score_units(outputs: Sequence[str], units: Mapping[str, str], own: Mapping[str, float] | None = None) -> FloatArray:
+    """Units of the rms errors of the channels in the score, SI, shape (m,); `own` replaces usual units by output.
+
+    Raises ParameterError for an output without a unit in the score.
+    """
+    known = SCORE_UNIT_OF | dict(own or {})
     for name in outputs:
-        counted = quantity(units[name]).dimension in SCORE_UNIT
-        require(counted, "outputs", f"{name} in {units[name]}", "units a score counts: rad/s, m/s, and multiples of these")
-    return np.array([SCORE_UNIT_OF.get(name, SCORE_UNIT[quantity(units[name]).dimension]) for name in outputs])
+        counted = name in known or quantity(units[name]).dimension in SCORE_UNIT
+        require(counted, "outputs", f"{name} in {units[name]}", "rad/s or m/s, or a unit of the score for this output")
+    return np.array([known[name] if name in known else SCORE_UNIT[quantity(units[name]).dimension] for name in outputs])
 
 
 def score(rms: FloatArray, unit: FloatArray) -> FloatArray:

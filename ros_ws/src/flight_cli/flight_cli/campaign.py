@@ -5,6 +5,7 @@
 import math
 import shlex
 import time
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from aircraft_sim.uncertainty import WindEffect
+from aircraft_sim.uncertainty import Distribution, WindEffect
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_analysis.report.tables import Table
@@ -36,7 +37,9 @@ from flight_core.files import display_path, writing
 from flight_core.installation import require_package
 from flight_core.parameters import require
 
-OF_DEFINITION = ("aircraft", "uncertainty", "wind", "seed", "sweep", "duration", "chunk", "runs")  # options of a new campaign
+OF_DEFINITION = (
+    *("aircraft", "uncertainty", "entry", "distribution", "score", "wind", "seed", "sweep", "duration", "chunk", "runs"),
+)  # options of a new campaign
 
 
 class EngineName(StrEnum):
@@ -56,6 +59,18 @@ def campaign(
     wind: Annotated[
         WindEffect | None,
         typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
+    ] = None,
+    entry: Annotated[
+        list[str] | None,
+        typer.Option(help="An entry of A or B with a deviation of its own, as 'A[q,alpha]=0.6'; once for each entry."),
+    ] = None,
+    distribution: Annotated[
+        Distribution | None,
+        typer.Option(help="Of the deviations: uniform, normal with three standard deviations at the limit, or its two limits."),
+    ] = None,
+    score: Annotated[
+        list[str] | None,
+        typer.Option(help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
@@ -97,8 +112,14 @@ def campaign(
     else:
         chosen = find_scenario(str(scenario), duration)
         swept = None if sweep is None else _parse_sweep(sweep)
-        with options("sweep"):
-            definition = define(chosen, aircraft, uncertainty, seed, chunk or CHUNK, swept, wind)
+        spread = chosen.aircraft.uncertainty.spread()
+        if entry is not None:
+            spread = spread._replace(entries=_named_numbers("--entry", entry, "A[q,alpha]=0.6"))
+        if distribution is not None:
+            spread = spread._replace(distribution=distribution)
+        units = None if score is None else _named_numbers("--score", score, "q=0.02")
+        with options("sweep", "score"):
+            definition = define(chosen, aircraft, uncertainty, seed, chunk or CHUNK, swept, wind, spread, units)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
@@ -118,6 +139,17 @@ def campaign(
     if speed is not None:
         print(f"flown:   {speed:,.0f} aircraft-seconds per second")
     print(f"folder:  {display_path(monte_carlo.folder)}\nreport:  {display_path(monte_carlo.folder / REPORT)}")
+
+
+def _named_numbers(option: str, texts: Sequence[str], example: str) -> dict[str, float]:
+    """Numbers by name from texts as NAME=NUMBER."""
+    numbers = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        parsed = parse_numbers(value)
+        require(bool(name) and len(parsed) == 1 and name not in numbers, option, repr(text), f"a name and a number: {example}")
+        numbers[name] = parsed[0]
+    return numbers
 
 
 def _parse_sweep(text: str) -> Sweep:

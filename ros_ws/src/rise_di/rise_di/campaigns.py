@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from aircraft_sim.uncertainty import WindEffect
+from aircraft_sim.uncertainty import Distribution, WindEffect
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_bringup.scenarios import find_scenario
@@ -45,6 +45,9 @@ def fly_campaign(
     aircraft: int = 1000,
     *,
     uncertainty: float = 0.3,
+    entries: Mapping[str, float] | None = None,
+    distribution: Distribution | None = None,
+    score: Mapping[str, float] | None = None,
     wind: WindEffect | None = None,
     seed: int = 1,
     sweep: Mapping[str, ArrayLike] | None = None,
@@ -60,6 +63,9 @@ def fly_campaign(
         scenario: Name, path of a scenario file (.yaml), or a Scenario.
         aircraft: How many uncertain aircraft.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        entries: Entries with a deviation of their own: {"A[q,alpha]": 0.6}.
+        distribution: Of the deviations: "uniform", "normal" with three standard deviations at the limit, or "corners".
+        score: Units of the rms errors in the score by output, SI: {"q": 0.02}.
         wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the airframe; None: the scenario's.
         seed: Seed of the aircraft.
         sweep: A parameter of the controller, or its value in a channel, and its factors: {"beta[V]": [0.5, 1.0, 2.0]}.
@@ -72,7 +78,12 @@ def fly_campaign(
     Raises ParameterError with one sentence for what a campaign cannot fly. After Ctrl-C `resume_campaign` continues.
     """
     chosen = find_scenario(scenario, duration)
-    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind)
+    spread = chosen.aircraft.uncertainty.spread()
+    if entries is not None:
+        spread = spread._replace(entries=dict(entries))
+    if distribution is not None:
+        spread = spread._replace(distribution=distribution)
+    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, score)
     flies, report = _threads(workers), _progress(progress)
     folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
     return _fly(Campaign.begin(folder, definition), flies, report)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.uncertainty import nominal_and_sampled
+from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
 from flight_core.arguments import as_count, as_number
 from flight_core.parameters import ParameterError
@@ -57,17 +57,20 @@ class LoopMargins(NamedTuple):
     stable: int = 0  # number of those that are stable
 
 
-def margins(scenario: Scenario, aircraft: int = 0, uncertainty: float = 0.3, seed: int = 1) -> LoopMargins:
+def margins(
+    scenario: Scenario, aircraft: int = 0, uncertainty: float = 0.3, seed: int = 1, spread: Spread = UNIFORM
+) -> LoopMargins:
     """Margins of a scenario's loop: of the nominal aircraft, and the worst of uncertain aircraft.
 
-    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, the rows of angles excepted. The controller
+    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread` says, the rows of angles
+    excepted. The controller
     gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError for the literal sign, and
     for an aircraft of JSBSim under a controller without a model.
     """
     flown = as_scenario(scenario)
     count, numbered = as_count(aircraft, "aircraft", 0), as_count(seed, "seed", 0)
     deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
-    return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered))
+    return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
 
 
 def loop_assessment(of: LinearLoop) -> LoopMargins:
@@ -102,11 +105,16 @@ def _least_delay(of: LinearLoop, nominal: float) -> float:
 
 
 def scenario_loop(
-    scenario: Scenario, controller: ControllerConfig, aircraft: int = 0, uncertainty: float = 0.3, seed: int = 1
+    scenario: Scenario,
+    controller: ControllerConfig,
+    aircraft: int = 0,
+    uncertainty: float = 0.3,
+    seed: int = 1,
+    spread: Spread = UNIFORM,
 ) -> LinearLoop:
     """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as `margins`."""
     airframe = _model(scenario, controller)
-    A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed)
+    A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
     return linear_loop(controller, airframe, A, B)
 
 
