@@ -15,7 +15,7 @@ from launch.events.process import ProcessExited
 from launch_ros.substitutions import ExecutableInPackage
 
 from flight_bringup.fleet import read_fleet
-from flight_bringup.launch.stages import argument, end_with_launch, runs_argument
+from flight_bringup.launch.stages import argument, end_with_launch, runs_argument, watch_argument
 from launch import LaunchContext, LaunchDescription
 
 
@@ -27,6 +27,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "duration", default_value="", description="flight time of each aircraft, s; empty: that of the file"
             ),
+            watch_argument(),
             runs_argument(),
             OpaqueFunction(function=_fly),
         ]
@@ -45,4 +46,5 @@ def _fly(context: LaunchContext) -> list[Action]:
 
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
     options = ["--runs", argument(context, "runs"), *(["--duration", duration] if duration else [])]
+    options += ["--watch"] if argument(context, "watch") == "true" else []
     return [ExecuteProcess(cmd=[rise_di, "fleet", file, *options], name="fleet", output="screen", on_exit=end)]
