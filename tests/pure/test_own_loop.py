@@ -230,7 +230,7 @@ def test_vector_environment_flies_as_environments_one_by_one() -> None:
     assert flights.t == pytest.approx(alone.t)
 
 
-def test_vector_environment_starts_diverged_aircraft_and_ended_flight_anew() -> None:
+def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() -> None:
     flights = rise_di.FlightVectorEnv(rise_di.find_scenario("osprey_gust", 3.0), 2)  # without end stops
     first, _ = flights.reset(seed=3)
     u, terminations, still = np.zeros((2, M)), 0, None

@@ -468,7 +468,7 @@ class Stepper:
         self._k += 1
 
     def restart(self, which: NDArray[np.bool_]) -> None:
-        """Set some aircraft, (N,), into trim at the present tick. Their figures begin anew."""
+        """Set some aircraft, (N,), into trim at the present tick. Their figures begin again."""
         self._state = jax.tree.map(partial(jnp.where, which), self._begin, self._state)
 
     def result(self) -> FleetResult:

@@ -199,7 +199,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._observed(y, y_m), reward, self._ended, truncated, {}
 
     def _begin(self) -> FloatArray:
-        """All aircraft anew."""
+        """Draw N aircraft."""
         aircraft, part = self.scenario.aircraft, self._uncertainty
         airframe, seed = load_airframe(aircraft.airframe), int(self.np_random.integers(0, 2**31))
         A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs)
