@@ -18,6 +18,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -70,6 +71,9 @@ EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level
 MODERATE = 0.5  # SIM_WIND_TURB up to which one experiment has to show every sign
 GUIDED, EACH, SETTLED = 300.0, 60.0, 45.0  # s: engaged under guidance, each turn, and from its command until it counts as held
 OBSERVER_MARGIN, OBSERVED_TURBULENCE, OBSERVED_PAIRS = 0.025, 0.5, 2  # s beyond the identified delay; SIM_WIND_TURB; flights
+FASTER, FASTER_THROTTLE = 25.3, (30.0, 85.0)  # m/s, equivalent, 15 % above the kit's AIRSPEED_CRUISE of 22; % of the throttle
+TRUE = 1.049  # of true over equivalent airspeed at the kit's place
+WINDS = {"calm": (0.0, 0.0), "SIM_WIND_SPD 8, SIM_WIND_TURB 0.5": (8.0, 0.5)}
 HELD = {"heading": "rad", "altitude": "m", "V": "m/s"}
 END = "the end of the flight"
 DELAYS = np.arange(0.0, 1.0, 0.01)  # s by which y may be behind y_m
@@ -163,13 +167,7 @@ def identified(
     if log is None:
         with flying() as autopilot:
             autopilot.patient_map(map_name)
-            autopilot.level()
-            excited = autopilot.start(*command)
-            excited.wait_for("DISENGAGED")
-            autopilot.hand_over()
-            autopilot.engage().succeed()
-            excited.wait_for("log: ", 120.0)
-            autopilot.level()
+            autopilot.experiment(*command)
     read = _on_the_ground(*command, "--log", str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
     if read.returncode:
         return {"refused": read.stderr}
@@ -207,6 +205,54 @@ def behind(tape: Tape, name: str, engaged: Engagement) -> float:
     measured = np.interp(t, y.stamp_ns, y[name])
     errors = [float(np.var(measured - np.interp(t - delay * NANOSECONDS, y_m.stamp_ns, y_m[name]))) for delay in DELAYS]
     return float(DELAYS[int(np.argmin(errors))])
+
+
+def own_log() -> dict[str, Any]:
+    """ArduPlane at a cruise 15 % faster, over DDS and over MAVLink, calm and in wind: errors by its own log, and Omega by it.
+
+    Each with gains of its own experiment. The autopilot's DataFlash log of the experiment is imported and identified too.
+    """
+    from tests.sitl.kit import BRIDGE, ArduPlane  # noqa: PLC0415 - after the kit's place is known
+
+    results: dict[str, Any] = {}
+    for name in ("ardupilot", "ardupilot_mavlink"):
+        plane = ArduPlane(FOLDER / f"own_log_{name}")
+        plane.throttle = FASTER_THROTTLE
+        with _flying(plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, MAV_GCS_SYSID=BRIDGE):
+            channel_map = plane.patient_map(name) if name == "ardupilot" else plane.mavlink_map()
+            found = plane.folder / "found"
+            command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
+            plane.experiment(*command, "--write", str(found)).succeed(300.0)
+            run, log = (REPOSITORY / "runs" / "latest").resolve(), plane.folder / "experiment.BIN"
+            shutil.copy(plane.dataflash(), log)
+            results[name] = {"experiment": run.name, "flights": {}}
+            for wind, (speed, turbulence) in WINDS.items():
+                plane.say("param", "SIM_WIND_SPD", f"{speed:g}")
+                plane.say("param", "SIM_WIND_TURB", f"{turbulence:g}")
+                with plane.engaged(found / "scenario.yaml", str(found / "map.yaml"), 90.0) as flight:
+                    flight.end(150.0)
+                own = plane.own_errors(TRUE if name == "ardupilot" else 1.0)
+                results[name]["flights"][wind] = tracking(plane) | {"own": {channel: rms for channel, (rms, _) in own.items()}}
+        results[name] |= imported_beside(command, log, run, plane.folder)
+    return results
+
+
+def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -> dict[str, Any]:
+    """Omega by channel from the autopilot's own log of an experiment, beside that from the log of the stack."""
+    bag = place / "imported"
+    shutil.rmtree(bag, ignore_errors=True)
+    done = _on_the_ground("import", str(log), "--map", command[2], "--output", str(bag))
+    if done.returncode:
+        return {"refused": done.stderr}
+    omega: dict[str, dict[str, float]] = {}
+    for name, source in (("stack", run), ("imported", bag)):
+        read = _on_the_ground(*command, "--log", str(source), "--write", str(place / f"of_{name}"), "--accept", "--json")
+        if read.returncode:
+            return {"refused": f"{name}: {read.stderr}"}
+        result = json.loads(read.stdout)
+        Omega = np.array(result["channels"]["Omega"])
+        omega[name] = dict(zip(result["inputs"], (np.diag(Omega) if Omega.ndim > 1 else Omega).tolist(), strict=True))
+    return {"Omega": omega}
 
 
 def guided() -> dict[str, Any]:
@@ -418,6 +464,7 @@ MEASUREMENTS: dict[str, Callable[..., dict[str, Any]]] = {
     "engagements": bumpless,
     "signs": signs,
     "pose": pose,
+    "own_log": own_log,
     "releases": releases,
 }
 
@@ -442,6 +489,7 @@ RELEASE_GOALS = {
     "PX4, bridge killed, short timeout": 0.4,
     "PX4, agent killed": 1.1,
 }
+OMEGA_GOAL = 15.0  # %, of elevator and aileron by the autopilot's log over that of the stack
 # Of the rms of e: rad/s, and m/s for V. PX4: half of what the first flight had.
 ERROR_GOALS = {
     "arduplane": {"q": 0.010, "p": 0.020, "r": 0.015, "V": 0.05},
@@ -571,6 +619,26 @@ def rows_of_pose(result: Mapping[str, Any]) -> Iterator[Row]:
     yield row("slopes of the rates, largest difference from 1", 100.0 * largest, "%", at_most=1.0)
 
 
+def rows_of_own_log(result: Mapping[str, Any]) -> Iterator[Row]:
+    """Errors by the log of the autopilot and by that of the stack, and Omega by the log of the autopilot."""
+    for name, of_map in result.items():
+        for wind, flown in of_map["flights"].items():
+            for channel, value in flown["own"].items():
+                about, (rms, unit) = f"{name}, {wind}: {channel}", rate(channel, value)
+                yield row(f"{about}: rms of e while commanded, by the autopilot's log", rms, unit)
+                yield row(f"{about}: rms of e while commanded, by the log of the stack", *rate(channel, flown["rms"][channel]))
+            (engaged,) = flown["engaged"]
+            yield row(f"{name}, {wind}: engaged until", END if engaged["stop"] is None else engaged["reason"])
+            yield row(f"{name}, {wind}: replay", "every bit" if flown["replayed"] else "different")
+        if "refused" in of_map:
+            yield row(f"{name}: Omega by the autopilot's log", f"refused: {of_map['refused'].splitlines()[-1]}")
+            continue
+        for channel, value in of_map["Omega"]["imported"].items():
+            goal = OMEGA_GOAL if channel in {"elevator", "aileron"} else None
+            differs = 100.0 * abs(value / of_map["Omega"]["stack"][channel] - 1.0)
+            yield row(f"{name}: Omega of {channel} by the autopilot's log, difference", differs, "%", at_most=goal)
+
+
 def rows_of_releases(result: Mapping[str, Any]) -> Iterator[Row]:
     """Tests that failed, and the times until the sticks or PX4's own law act; a time without a goal has no limit."""
     times = dict.fromkeys(RELEASE_GOALS) | result["times"]
@@ -592,6 +660,7 @@ ROWS: dict[str, Callable[[Mapping[str, Any]], Iterable[Row]]] = {
     "engagements": rows_of_engagements,
     "signs": rows_of_signs,
     "pose": rows_of_pose,
+    "own_log": rows_of_own_log,
     "releases": rows_of_releases,
 }
 

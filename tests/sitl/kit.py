@@ -29,6 +29,8 @@ from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 
 from autopilot_bridge.params import find_map
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.metrics import in_spans
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
@@ -40,6 +42,13 @@ OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_S
 POLL = 0.1  # s, between two questions to the autopilot
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
+BRIDGE = 254  # system of the bridge over MAVLink, and MAV_GCS_SYSID: the ground station of the kit is 255
+OWN_SIGNALS = {
+    **{name: ("ATTITUDE", f"{axis}speed") for name, axis in (("q", "pitch"), ("p", "roll"), ("r", "yaw"))},
+    "V": ("VFR_HUD", "airspeed"),
+}
+"""Message and field of the autopilot's log for each channel of y."""
+
 SAFE_STICKS = (1500, 1500, 1000, 1500, 1800, 1500, 1500)  # us, as the kit begins; the throttle is closed
 CRUISE = (25.0, 65.0)  # %, of the throttle: with the limits of the map around it, -20 and 30 %, within its range
 Program = Mapping[str, tuple[Sequence[float], Sequence[float]]]
@@ -200,6 +209,17 @@ class Autopilot:
                 flight.end()
             self.level()
 
+    def experiment(self, *command: str) -> Process:
+        """Fly the experiment of `identify --bridge`, with the arguments of the command, to its end in the air."""
+        self.level()
+        excited = self.start(*command)
+        excited.wait_for("DISENGAGED")
+        self.hand_over()
+        self.engage().succeed()
+        excited.wait_for("log: ", 150.0)
+        self.level()
+        return excited
+
     @property
     def run(self) -> Path:
         """The folder of the last flight."""
@@ -273,6 +293,7 @@ class ArduPlane(Autopilot):
     script = KIT / "sitl"
     namespace = "rise_di_sitl"
     home = 584.0  # m, where the kit puts the aircraft
+    throttle = CRUISE  # %, of level flight
 
     def up(self, **parameters: float) -> None:
         """Start agent, autopilot and transmitter, with parameters of the autopilot."""
@@ -305,7 +326,7 @@ class ArduPlane(Autopilot):
         self.until(
             lambda state: (
                 max(abs(state["roll"]), abs(state["climb"]) / 20.0, abs(state["pitchspeed"])) < 0.05
-                and CRUISE[0] < state["throttle"] < CRUISE[1]
+                and self.throttle[0] < state["throttle"] < self.throttle[1]
             )
         )
 
@@ -329,6 +350,39 @@ class ArduPlane(Autopilot):
         with (self.folder / "mavlink.csv").open(encoding="utf-8", newline="") as file:
             rows = [(float(row[0]), json.loads(row[2])) for row in csv.reader(file) if len(row) == 3 and row[1] == kind]
         return np.array([t for t, _ in rows]), np.array([[row[field] for field in fields] for _, row in rows])
+
+    def mavlink_map(self, *changes: tuple[str, str]) -> str:
+        """The map `ardupilot_mavlink` with longer ages, on the second serial port, beside the ground station of the kit."""
+        link = ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), ("source_system: 255", f"source_system: {BRIDGE}")
+        return self.patient_map("ardupilot_mavlink", *link, *changes)
+
+    def dataflash(self) -> Path:
+        """The newest log that the autopilot wrote itself."""
+        return max((self.folder / "logs").glob("*.BIN"), key=lambda path: path.stat().st_mtime)
+
+    def own_errors(self, ratio: float = 1.0) -> dict[str, tuple[float, float]]:
+        """The rms of the autopilot's own log less y_m, and of y_m, by channel, in the engaged time in which it is commanded.
+
+        V is the sensor's, as a deviation from its value at the engagement, times `ratio`, of true over equivalent airspeed.
+        """
+        log = read_run(self.run)
+        (span,) = log.engagements or []
+        y_m, pulses = log.tape["y_m"], load_scenario(self.run / "parameters.yaml").reference_model.pulses
+        stop_ns = span.stop_ns or int(y_m.stamp_ns[-1])
+        errors = {}
+        for name, (kind, field) in OWN_SIGNALS.items():
+            t, values = self.log(kind, field)
+            own = values[:, 0]
+            if name == "V":
+                own = ratio * (own - np.interp(span.start_ns / 1e9, t, own))
+            edges = zip(pulses[name].start, pulses[name].stop, strict=True) if name in pulses else ()
+            begin = log.tape.start_ns / 1e9
+            commanded = in_spans(t, [(begin + start, begin + stop + 1.0) for start, stop in edges])
+            commanded &= (t > span.start_ns / 1e9) & (t < stop_ns / 1e9)
+            reference = np.interp(t[commanded], y_m.stamp_ns / 1e9, y_m[name])
+            if commanded.any():
+                errors[name] = float(np.sqrt(np.mean((own[commanded] - reference) ** 2))), float(np.sqrt(np.mean(reference**2)))
+        return errors
 
     def turns(
         self, starts: Sequence[float], altitude: float, speed: float

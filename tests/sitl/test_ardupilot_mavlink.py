@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The map `ardupilot_mavlink` against ArduPlane's MAVLink: what the bridge releases, refuses and flies through."""
+
+import re
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from typing import NamedTuple
+
+import pytest
+from tests.conftest import REPOSITORY
+from tests.ros.conftest import Process
+from tests.sitl.kit import BRIDGE, ArduPlane
+
+from flight_bringup.scenarios import find_scenario
+from flight_log.tape_reader import read_run
+
+SCENARIO = find_scenario(str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml"))
+LATE = 0.5  # s, for a busy host: a parameter passes through several processes
+SERVOS = {"aileron": 1, "elevator": 2, "thrust": 3, "rudder": 4}
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
+    """An ArduPlane in flight, with servos of 0.03 s, that takes overrides of the bridge."""
+    autopilot = ArduPlane(tmp_path_factory.mktemp("run"))
+    try:
+        autopilot.up(SIM_SERVO_SPEED=0.03, MAV_GCS_SYSID=BRIDGE)
+        autopilot.take_off()
+        yield autopilot
+    finally:
+        autopilot.down()
+
+
+def engaged(plane: ArduPlane, duration: float, *changes: tuple[str, str]) -> AbstractContextManager[Process]:
+    """A flight of the stack, engaged from level flight with the sticks in trim."""
+    return plane.engaged(SCENARIO.path, plane.mavlink_map(*changes), duration)
+
+
+def test_engaged_flight_over_mavlink_tracks_its_commands(plane: ArduPlane) -> None:
+    """As over DDS: while they are commanded the errors of q and p stay below y_m, by the autopilot's log, and ticks replay."""
+    with engaged(plane, SCENARIO.flight.duration) as flight:
+        flight.succeed(SCENARIO.flight.duration + 30.0)
+    (engagement,) = plane.summary()["engagements"]
+    assert engagement["stop"] is None, engagement["reason"]
+    errors = plane.own_errors()
+    assert max(errors[name][0] / errors[name][1] for name in "qp") < 0.75  # an aircraft that does not follow has 1 or more
+    plane.start("replay", str(plane.run)).succeed(60.0)
+
+
+class Trouble(NamedTuple):
+    """What fails, by parameters, a pattern of the reason, empty where the bridge flies on, and the time for it, s."""
+
+    parameters: Sequence[tuple[str, float]]
+    reason: str
+    within: float
+
+
+def stuck(surface: str, pulse: float) -> tuple[tuple[str, float], ...]:
+    """A servo that stays at a pulse, us: its ends are 2 us apart."""
+    number = SERVOS[surface]
+    return tuple((f"SERVO{number}_{end}", pulse + shift) for end, shift in (("MIN", -1), ("MAX", 1), ("TRIM", 0)))
+
+
+TROUBLE = {
+    "elevator stuck in trim": Trouble(stuck("elevator", 1480), "^(climb|theta|elevator)", 45.0),
+    "elevator stuck 60 us up": Trouble(stuck("elevator", 1540), "^(climb|theta|elevator|V)", 20.0),
+    "aileron stuck in trim": Trouble(stuck("aileron", 1500), "^(phi|aileron)", 60.0),
+    "aileron stuck 100 us away": Trouble(stuck("aileron", 1600), "^phi", 5.0),
+    "rudder stuck 100 us away": Trouble(stuck("rudder", 1600), "^(phi|rudder|aileron)", 30.0),
+    "engine failed": Trouble((("SIM_ENGINE_FAIL", 4),), "^(V|climb|theta)", 20.0),
+    "airspeed sensor at 40 m/s": Trouble((("SIM_ARSPD_FAIL", 40),), "^V", 3.0),
+    "airspeed sensor at 5 m/s": Trouble((("SIM_ARSPD_FAIL", 5),), "^V", 3.0),
+    "GPS lost": Trouble((("SIM_GPS1_ENABLE", 0),), "", 15.0),
+    "first gyro failed": Trouble((("SIM_GYR_FAIL_MSK", 1),), "", 15.0),
+    "first accelerometer failed": Trouble((("SIM_ACC_FAIL_MSK", 1),), "", 15.0),
+}
+HEALTHY = {
+    **{f"SERVO{n}_{end}": pulse for n in SERVOS.values() for end, pulse in (("MIN", 1100), ("MAX", 1900), ("TRIM", 1500))},
+    **dict.fromkeys(("SIM_ENGINE_FAIL", "SIM_ARSPD_FAIL", "SIM_GYR_FAIL_MSK", "SIM_ACC_FAIL_MSK"), 0),
+    "SIM_GPS1_ENABLE": 1,
+}
+
+
+@pytest.mark.parametrize("name", TROUBLE)
+def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
+    plane: ArduPlane, name: str, record_testsuite_property: Callable[[str, object], None]
+) -> None:
+    """A surface that does not move, an engine or an airspeed sensor that fails end it; a spare sensor takes over."""
+    trouble = TROUBLE[name]
+    with ExitStack() as afterwards, engaged(plane, 100.0) as flight:
+        began = time.time()
+        for parameter, value in trouble.parameters:
+            plane.say("param", parameter, f"{value:g}")
+            afterwards.callback(plane.say, "param", parameter, f"{HEALTHY[parameter]:g}")
+        deadline = began + trouble.within + 5.0
+        while time.time() < deadline and "RELEASE" not in flight.output:
+            time.sleep(0.2)
+        afterwards.close()
+        flight.interrupt()
+        flight.end()
+    (engagement,) = read_run(plane.run).engagements or []
+    took = (engagement.stop_ns or 0) / 1e9 - began
+    record_testsuite_property(f"ArduPlane over MAVLink, {name}", f"{took:.2f} s: {engagement.reason}")
+    if trouble.reason:
+        assert re.search(trouble.reason, engagement.reason), engagement.reason
+        assert took < trouble.within + LATE
+    else:
+        assert took > trouble.within, engagement.reason
+
+
+def test_engagement_in_a_climb_is_refused(plane: ArduPlane) -> None:
+    plane.level()
+    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
+    try:
+        flight.wait_for("DISENGAGED")
+        plane.say("goto", f"{plane.state()['alt'] - plane.home + 200.0:.0f}")
+        plane.until(lambda state: state["climb"] > 3.0)
+        plane.hand_over()
+        refused = plane.engage()
+        assert refused.end() != 0
+        assert "climb" in refused.output
+    finally:
+        flight.interrupt()
+        flight.end()
+        plane.level()
+    assert plane.summary()["engagements"] == []
+
+
+def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: ArduPlane) -> None:
+    """ArduPilot's own failsafe leaves MANUAL, and says so in HEARTBEAT."""
+    plane.level()
+    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
+    try:
+        flight.wait_for("DISENGAGED")
+        plane.hand_over()
+        plane.say("param", "SIM_RC_FAIL", "1")
+        plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
+        refused = plane.engage()
+        assert refused.end() != 0
+        assert "the mode is not MANUAL" in refused.output
+    finally:
+        plane.say("param", "SIM_RC_FAIL", "0")
+        flight.interrupt()
+        flight.end()
+        plane.level()
+
+
+def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPlane) -> None:
+    """No field tells the loss, and the override keeps the autopilot's own failsafe off: it acts after the release."""
+    bound = 20.0
+    with engaged(plane, 60.0, ("max_engaged: 120.0", f"max_engaged: {bound}")) as flight:
+        assert "the loss of the transmitter cannot be seen over this link" in flight.output
+        plane.say("param", "SIM_RC_FAIL", "1")
+        try:
+            flight.wait_for("RELEASE")
+            plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
+        finally:
+            plane.say("param", "SIM_RC_FAIL", "0")
+        flight.interrupt()
+        flight.end()
+    (engagement,) = plane.summary()["engagements"]
+    assert engagement["reason"] == f"engaged for {bound:g} s, max_engaged of the map"
