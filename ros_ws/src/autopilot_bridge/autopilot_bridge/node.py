@@ -50,6 +50,7 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import ENGAGEMENT, POSE, PUBLISH, Topic, U, Y
 
 WOULD_SEND = Topic("bridge/would_send", JointState)
+LEFT = "no publisher any more. Where the autopilot flies on, its client may not come back by itself: start its agent again"
 RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
 
 ACTIVATION_TIMEOUT_NS = NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
@@ -313,7 +314,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         for subscription, rows in self._readers:
             is_stale = any(name in stale for name, row in rows if isinstance(row, MeasuredRow))
             if is_stale and isinstance(subscription, PolledSubscription):
-                self.warn_no_publisher(subscription)
+                self.warn_no_publisher(subscription, LEFT if self._first_y else "no publisher")
         if self._link is not None:
             if problem := self._link.problem():
                 self.get_logger().warning(f"link: {problem}", throttle_duration_sec=10.0)

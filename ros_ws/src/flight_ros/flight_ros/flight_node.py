@@ -206,8 +206,11 @@ class FlightNode(Node, Generic[P]):
         """The end of a sentence on the stamp of a node whose clock differs; else empty."""
         return "" if self.clocks is None else self.clocks.told_of(sender)
 
-    def warn_no_publisher(self, subscription: PolledSubscription) -> None:
-        """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s."""
+    def warn_no_publisher(self, subscription: PolledSubscription, without: str = "no publisher") -> None:
+        """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s.
+
+        `without` is the cause where the topic has no publisher.
+        """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
         if now_ns - last_ns > NANOSECONDS:  # the first call after a sample
@@ -215,7 +218,7 @@ class FlightNode(Node, Generic[P]):
         self._waiting[subscription.name] = now_ns, log_ns if now_ns < log_ns else now_ns + WAITING_PERIOD_NS
         if now_ns < log_ns:
             return
-        cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else "no publisher"
+        cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else without
         if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
             cause = refused
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
