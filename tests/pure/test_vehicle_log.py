@@ -4,6 +4,7 @@
 
 import json
 import re
+import struct
 from pathlib import Path
 from typing import NamedTuple
 
@@ -237,6 +238,11 @@ def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path:
     both, alone = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
     assert both.kind == "a DataFlash log of ArduPilot, the longest of 2 parts: its clock goes back"
     np.testing.assert_array_equal(both.tables["IMU"].stamp_ns, alone.tables["IMU"].stamp_ns)
+    stamp = struct.pack("<Q", flight.stamp_us[500])  # that of IMU, the first message of the instant
+    (tmp_path / "damaged.bin").write_bytes(whole.read_bytes().replace(stamp, struct.pack("<Q", 2**50), 1))
+    damaged = read_vehicle_log(tmp_path / "damaged.bin")
+    assert damaged.kind == alone.kind
+    assert len(damaged.tables["IMU"].stamp_ns) == len(alone.tables["IMU"].stamp_ns) - 1
 
 
 def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:

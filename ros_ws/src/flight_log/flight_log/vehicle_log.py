@@ -28,6 +28,7 @@ from flight_log.file_kinds import file_kind
 DEGREE = math.pi / 180.0
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
 STICKS, SERVOS = 16, 16  # channels that are read
+LARGEST = 2**62  # ns, of a damaged stamp
 ULOG_HEAD = 16  # bytes: magic, version and time
 
 
@@ -158,7 +159,7 @@ MAV_TYPES: Mapping[int, str] = MappingProxyType(
 """Kinds of vehicles by MAV_TYPE, common.xml."""
 
 PX4, PX4_MANUAL = 12, 1 << 16  # MAV_AUTOPILOT_PX4, and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
-BACK_NS = NANOSECONDS  # a clock that goes back by more has started again
+BACK_NS, AHEAD_NS = NANOSECONDS, 60 * NANOSECONDS  # a clock that goes back by more has started again; ahead, the link was lost
 
 
 class VehicleLog(NamedTuple):
@@ -231,7 +232,7 @@ def _read_dataflash(path: Path, kind: str) -> VehicleLog:
                 elif not (getattr(message, "I", 0) or getattr(message, "C", 0)):  # of the first sensor and of the first core
                     # Logs of 2014 and before have ms, and MODE has no time: that of the message before.
                     stamp_us = getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us))
-                    yield name, round(1e3 * stamp_us), message
+                    yield name, min(round(1e3 * stamp_us), LARGEST), message
 
     tables, parts = _tables(samples(), wanted)
     _true_airspeed(tables)
@@ -274,7 +275,7 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
                 if name == "PARAM_VALUE":
                     parameters[message.param_id] = float(message.param_value)
                 else:
-                    yield name, round(NANOSECONDS * message._timestamp), message
+                    yield name, min(round(NANOSECONDS * message._timestamp), LARGEST), message
 
     tables, parts = _tables(samples(), wanted)
     first, *others = map(str, autopilots) if autopilots else ("none",)
@@ -302,7 +303,9 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
     for data in log.data_list:
         if data.multi_id == 0:
             columns = {name: np.asarray(values, dtype=np.float64) for name, values in data.data.items()}
-            tables[data.name] = _table(1000 * data.data["timestamp"].astype(np.int64), columns)
+            stamps = 1000 * data.data["timestamp"].astype(np.int64)
+            keep = _near(stamps)
+            tables[data.name] = _table(stamps[keep], {name: values[keep] for name, values in columns.items()})
     attitude = tables.get("vehicle_attitude")
     if attitude is not None:
         w, x, y, z = (attitude.fields[f"q[{k}]"] for k in range(4))
@@ -329,14 +332,23 @@ def _wanted(of: Format) -> dict[str, set[str]]:
 def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> tuple[dict[str, Table], str]:
     """Tables of messages: name, stamp in ns, message; and a note. A field that its first message lacks is absent.
 
-    Where the clock goes back by more than BACK_NS, as of an autopilot that started again, the longest part counts alone.
+    Where the clock goes back by more than BACK_NS, as of an autopilot that started again, the longest part counts alone. A
+    stamp that no neighbour is near is damaged, and its sample is left out.
     """
     parts, newest_ns = [list[tuple[str, int, Any]]()], 0
+    apart: tuple[str, int, Any] | None = None  # the sample before, whose stamp is not near those before it
     for sample in samples:
-        if sample[1] < newest_ns - BACK_NS:
-            parts.append([])
-            newest_ns = 0
-        newest_ns = max(newest_ns, sample[1])
+        near = [-BACK_NS <= sample[1] - other <= AHEAD_NS for other in (newest_ns, apart[1] if apart else sample[1])]
+        if parts[-1] and not near[0]:
+            if apart is None or not near[1]:
+                apart = sample
+                continue
+            if apart[1] < newest_ns:
+                parts.append([])
+            parts[-1].append(apart)
+            newest_ns = apart[1]
+        apart = None
+        newest_ns = max(newest_ns, sample[1]) if parts[-1] else sample[1]
         parts[-1].append(sample)
     note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
     longest = max(parts, key=len)
@@ -360,6 +372,14 @@ def _columns(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[s
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float)
+
+
+def _near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which stamps are near the median of the five around them: a damaged stamp is not."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5) if len(stamp_ns) > 2 else None
+    if around is None:
+        return np.ones(len(stamp_ns), dtype=bool)
+    return np.abs(stamp_ns - np.median(around, axis=1)) <= AHEAD_NS
 
 
 def _table(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:
