@@ -31,7 +31,7 @@ from tests.ros.conftest import Process
 from autopilot_bridge.params import find_map
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.metrics import in_spans
-from flight_core.tape import Signal
+from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
 
@@ -243,6 +243,18 @@ def guided_scenario(scenario: Path, program: Program, speed: float) -> str:
     steps = {name: {"start": list(start), "value": list(value)} for name, (start, value) in program.items()}
     content["/**/guidance"] = {"ros__parameters": {"max_age": MAX_AGE, "program": steps}}
     return str(yaml.safe_dump(content))
+
+
+def followed(tape: Tape, name: str, start: float, stop: float) -> float:
+    """The part of y that goes along with y_m from start to stop, s, over y_m: the largest at a delay below 0.6 s."""
+    y, y_m = tape["y"], tape["y_m"]
+    t, t_m = tape.time("y"), tape.time("y_m")
+    inside, parts = (t > start) & (t < stop), []
+    for delay in np.arange(0.0, 0.6, 0.05):
+        reference = np.interp(t[inside] - delay, t_m, y_m[name])
+        moved = reference - reference.mean()
+        parts.append(float(y[name][inside] @ moved / (moved @ moved)))
+    return max(parts)
 
 
 class Agreement(NamedTuple):
@@ -525,6 +537,40 @@ class Px4(Autopilot):
         """When nav_state changed last, s of the monotonic clock."""
         status = self.listen("vehicle_status", "timestamp", "nav_state_timestamp")
         return time.monotonic() - status["ago"] - 1e-6 * (status["timestamp"] - status["nav_state_timestamp"])
+
+
+class Quadrotor(Px4):
+    """PX4's quadrotor and its agent, started by a copy of the kit's script with another model."""
+
+    hover = 60.0  # m above home
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.script = folder / "sitl"
+        text = Px4.script.read_text(encoding="utf-8")
+        for pattern, value in ((r"^KIT=.*$", f"KIT={Px4.script.parent}"), (r"PX4_SIM_MODEL=\S+", "PX4_SIM_MODEL=sihsim_quadx")):
+            text, count = re.subn(pattern, value, text, flags=re.MULTILINE)
+            assert count == 1, f"{Px4.script}: {pattern}"
+        self.script.write_text(text, encoding="utf-8")
+        self.script.chmod(0o755)
+
+    def take_off(self) -> None:
+        """Take off to hover in Hold."""
+        deadline = time.monotonic() + 60.0
+        while self.state().get("arming_state") != ARMED:
+            assert time.monotonic() < deadline, "PX4 does not arm"
+            time.sleep(1.0)
+            with suppress(AssertionError):  # not running yet, or refused until its estimator is ready
+                self.say("commander", "takeoff")
+        self.until(lambda state: state["alt"] > self.hover - 5.0, timeout=120.0)
+        self.level()
+
+    def level(self) -> None:
+        """Hover in Hold."""
+        self.say("commander", "mode", "auto:loiter")
+        self.until(
+            lambda state: state["nav_state"] == HOLD and abs(state["climb"]) < 0.3 and state["alt"] > 15.0, timeout=120.0
+        )
 
 
 HOLD, OFFBOARD, ARMED = 4, 14, 2  # nav_state of PX4: AUTO_LOITER, OFFBOARD; its arming_state

@@ -8,11 +8,10 @@ from contextlib import AbstractContextManager, ExitStack
 from types import MappingProxyType
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import HOLD, MAX_AGE, OFFBOARD, OWN_MAP, OWN_SCENARIO, Px4, burn
+from tests.sitl.kit import HOLD, MAX_AGE, OFFBOARD, OWN_MAP, OWN_SCENARIO, Px4, burn, followed
 
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
@@ -43,18 +42,10 @@ def test_engaged_flight_tracks_commands_in_offboard(px4: Px4) -> None:
     summary = px4.summary()
     (one,) = summary["engagements"]  # to the end of the flight
     tape = read_run(px4.run).tape
-    y, y_m = tape["y"], tape["y_m"]
-    t = (y.stamp_ns - tape.start_ns) / 1e9
     first = min(pulse.start[0] for pulse in SCENARIO.reference_model.pulses.values())
     assert one["start"] < first, "engaged after the first command"
     for name, pulse in SCENARIO.reference_model.pulses.items():
-        inside = (t > pulse.start[0]) & (t < pulse.stop[-1] + 1.0)
-        parts = []
-        for delay in np.arange(0.0, 0.6, 0.05):
-            reference = np.interp(t[inside] - delay, (y_m.stamp_ns - tape.start_ns) / 1e9, y_m[name])
-            moved = reference - reference.mean()
-            parts.append(float(y[name][inside] @ moved / (moved @ moved)))
-        assert 0.5 < max(parts) < 1.5, name
+        assert 0.5 < followed(tape, name, pulse.start[0], pulse.stop[-1] + 1.0) < 1.5, name
     assert summary["inputs"]["thrust"]["limited"]["magnitude"] < 0.05  # of the time at its limits
     px4.start("replay", str(px4.run)).succeed()
 
