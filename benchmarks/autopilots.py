@@ -219,7 +219,8 @@ def own_log() -> dict[str, Any]:
         plane = ArduPlane(FOLDER / f"own_log_{name}")
         plane.throttle = FASTER_THROTTLE
         with _flying(plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, MAV_GCS_SYSID=BRIDGE):
-            channel_map = plane.patient_map(name) if name == "ardupilot" else plane.mavlink_map()
+            narrower = ("    upper: 0.3\n", "    upper: 0.2\n")  # of the thrust, whose trim is 0.63 to 0.75 there
+            channel_map = plane.patient_map(name, narrower) if name == "ardupilot" else plane.mavlink_map(narrower)
             found = plane.folder / "found"
             command = ("identify", "--bridge", channel_map, "--speed", f"{FASTER * TRUE:g}")
             plane.experiment(*command, "--write", str(found)).succeed(300.0)

@@ -674,6 +674,27 @@ def test_surface_that_stays_at_its_limit_ends_the_engagement_and_thrust_does_not
     assert bridge.reason == "aileron is at its limit for 0.1 s, p does not answer"
 
 
+def test_large_u_that_rests_is_at_a_limit_of_the_law_narrower_than_that_of_the_map() -> None:
+    content = CHANNEL_MAP.model_dump()
+    limit = content["inputs"]["rudder"]["upper"]
+    content["inputs"]["rudder"]["at_limit"] = 0.1
+    for name in set(content["inputs"]) - {"rudder"}:
+        content["inputs"][name]["at_limit"] = None
+    bridge = ready_bridge(channel_map=ChannelMap.validate_mapping(content, "map"))
+    assert bridge.engage(at(0.0)) == ""
+
+    def fly(t: float, part: float) -> Phase:
+        receive_outputs(bridge, t)
+        receive_u(bridge, t, part * limit)
+        return bridge.step(at(t))
+
+    steps = np.arange(0.02, 0.2, 0.02)
+    assert {fly(t, 0.4) for t in steps} == {Phase.ENGAGED}  # as the doublets of an experiment
+    assert {fly(0.2 + t, 0.6 + t) for t in steps} == {Phase.ENGAGED}  # it moves
+    assert [fly(0.4 + t, 0.9) for t in steps][-1] is Phase.RELEASE
+    assert bridge.reason == "rudder is at its limit for 0.1 s, r does not answer"
+
+
 def test_envelope_whose_channel_is_stale_releases_channels() -> None:
     bridge = enveloped_bridge()
     receive_outputs(bridge, 0.15)

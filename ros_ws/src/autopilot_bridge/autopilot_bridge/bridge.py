@@ -25,6 +25,7 @@ from flight_core.vectors import (
 )
 
 UNBOUNDED = "the loss of the transmitter cannot be seen over this link: set max_engaged in the map, or engage with --blind"
+LARGE = 0.5  # of the limits: beyond, a u that rests is at a limit of the law. The amplitudes of experiments are below
 END_WARNING_NS = 10 * NANOSECONDS  # before the end of an engagement by `max_engaged`
 
 
@@ -68,6 +69,7 @@ class Bridge:
         self._last_y_ns = -1  # stamp of the last y
         self._last_pose_ns = -1  # stamp of the last pose
         self._u: FloatArray = np.zeros(len(self.inputs))
+        self._moves = np.ones(len(self.inputs), dtype=bool)  # whether the newest u differs from the one before
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self._conditions: dict[str, Reading] = {}
         self._overrides: dict[str, Reading] = {}
@@ -116,6 +118,7 @@ class Bridge:
 
     def take_u(self, sample: StampedVector, now_ns: int) -> None:
         """Take u, shape (m,) in the map's order, of the publisher of `u_lock`."""
+        self._moves = sample.value != self._u
         self._u = sample.value
 
     def take_condition(self, name: str, raw: float, now_ns: int) -> None:
@@ -153,11 +156,15 @@ class Bridge:
         )
 
     def _does_not_answer(self, now_ns: int) -> str:
-        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the aircraft does not follow."""
+        """The inputs that stay at a limit for longer than their rows allow, as a sentence: the aircraft does not follow.
+
+        The limits of the law may be narrower than those of the map: a large u that does not change is at one.
+        """
         sentences = []
-        for name, u, lower, upper in zip(self.inputs, self._u, self._lower, self._upper, strict=True):
+        inside, small = ((factor * self._lower < self._u) & (self._u < factor * self._upper) for factor in (1.0, LARGE))
+        for name, answers in zip(self.inputs, inside & (small | self._moves), strict=True):
             row = self.channel_map.inputs[name]
-            if row.at_limit is None or lower < u < upper:
+            if row.at_limit is None or answers:
                 self._limit_ns.pop(name, None)
             elif now_ns - self._limit_ns.setdefault(name, now_ns) >= nanoseconds(row.at_limit):
                 sentences.append(f"{name} is at its limit for {row.at_limit:g} s, {row.motion[0]} does not answer")

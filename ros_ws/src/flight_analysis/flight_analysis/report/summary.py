@@ -239,9 +239,13 @@ BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 
 
 def _with_late_ticks(of: Account, ticks: TickMetrics | None, scenario: Scenario) -> Account:
-    """The account with the ticks that found no new y although the log has every y: the host is too busy."""
+    """The account with the ticks that found no new y although the log has every y: the host is too busy.
+
+    The rate of y is that of the scenario: that of an autopilot is not known.
+    """
     whole = not (of.over("y", "internals") and not of.busy) and not of.lacks and not scenario.aircraft.sensors.dropout
-    if ticks is None or not whole or ticks.without_new_y <= BUSY * ticks.ticks:
+    rated = "y" in of.topics and of.topics["y"].expected is not None
+    if ticks is None or not whole or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
         return of
     late = f"{ticks.without_new_y} ticks without a new y"
     return of._replace(busy=f"{late}: this host is too busy; see docs/faults.md" if not of.busy else f"{late}; {of.busy}")
