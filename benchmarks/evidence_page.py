@@ -112,6 +112,7 @@ TOPICS = (
             "autopilots-engagements": "engagements without a jump",
             "autopilots-signs": "signs, in short experiments in wind of 5 m/s",
             "autopilots-pose": "rates and pose over the autopilot's own log",
+            "autopilots-own_log": "ArduPlane 15 % faster, over DDS and MAVLink, calm and in wind, by its own logs",
             "autopilots-releases": "tests, and the times of a release",
         },
         "ArduPlane 4.8.0-dev and PX4 1.16.0 in software. "

@@ -387,7 +387,8 @@ class ArduPlane(Autopilot):
             own = values[:, 0]
             if name == "V":
                 own = ratio * (own - np.interp(span.start_ns / 1e9, t, own))
-            edges = zip(pulses[name].start, pulses[name].stop, strict=True) if name in pulses else ()
+            pulse = pulses.get(name, pulses["p"]) if name == "r" else pulses[name]  # r follows p in coordinated turns
+            edges = zip(pulse.start, pulse.stop, strict=True)
             begin = log.tape.start_ns / 1e9
             commanded = in_spans(t, [(begin + start, begin + stop + 1.0) for start, stop in edges])
             commanded &= (t > span.start_ns / 1e9) & (t < stop_ns / 1e9)
