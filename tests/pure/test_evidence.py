@@ -134,7 +134,7 @@ def test_page_is_function_of_data() -> None:
 def test_page_stays_short() -> None:
     """The sections have a line for each measurement. The goals that are missed stand above: no test limits their number."""
     lines = page(read()).splitlines()
-    assert len(lines) - lines.index("## Faults") <= 100
+    assert len(lines) - lines.index("## Faults") <= 120
 
 
 def test_data_is_stable_and_complete(tmp_path: Path) -> None:
