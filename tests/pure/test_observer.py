@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flight_core.vectors import FloatArray
-from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.observer import ObserverParams, PastTick, estimates_after, with_observer
+from flight_core.vectors import FloatArray, StampedVector
+from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
+from rise_di_controller.guard import initial_state, retune
+from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, estimates_after, with_observer
 from rise_di_controller.saturation import Limits
 
 pytestmark = pytest.mark.package("rise_di_controller")
@@ -92,3 +93,17 @@ def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> Non
     # without y: z+ = 0.5 0.88 + 2 0.1 = 0.64. e = 2: z = 0.64 + 0.25 1.36 = 0.98, z+ = 0.49 + 2 (0.3 - 0.1) = 0.89
     record = (PastTick(None, vector(0.2), vector(7.0), DT), PastTick(vector(2.0), vector(0.3), vector(7.0), DT))
     assert estimates_after(record, vector(0.1), params()) == pytest.approx([0.89], abs=1e-14)
+
+
+def test_new_observer_without_record_starts_from_error_and_trim_keeps_contribution() -> None:
+    """As after the first tick: u stays 10.7, the estimate begins as at engagement, z = H'e = 0.5."""
+    law, old = with_observer(TRIM_LAW), params()
+    state = initial_state(1)._replace(
+        law=ObserverState((), vector(0.4), vector(0.7), vector(1.0)),
+        y=StampedVector(0, vector(7.5)),
+        y_m=vector(7.0),
+        u=vector(TRIM + 0.7),
+        u_trim=vector(TRIM),
+    )
+    after = retune(state, TunedLaw(law, old), TunedLaw(law, old._replace(L=np.array([[0.5]]))))
+    assert (after.u_trim.item(), after.law.u_o.item(), after.law.z.item()) == pytest.approx((TRIM + 0.7, 0.0, 0.5))
