@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from benchmarks import fence, routes
 from benchmarks import guidance as benchmark
-from benchmarks import routes
-from benchmarks.evidence_data import Row
+from benchmarks.evidence_data import Row, used
 from benchmarks.guidance_grid import Point
 
 from flight_core.tape import Signal, Tape
@@ -61,6 +61,23 @@ def test_rows_of_evidence() -> None:
         Row("altitude 300 m, airspeed 30 m/s", "ok"),
         Row("altitude 300 m, airspeed 36 m/s", "lost: diverged at t = 3.00 s"),
     ]
+
+
+def test_rows_of_routes_and_fences_as_evidence() -> None:
+    """A refusal has no goal; a missed leg misses the goal of the cross-track error."""
+    flown, missed, refused = (
+        routes.Row("f16", "eight", result, 0.2, 0.35, 1.0).figure for result in ("flown", "missed leg 2 by 90 m", "refused: V")
+    )
+    assert flown == Row("eight: cross-track", "0.2", "s", goal="<= 0.35")
+    assert (missed.value, used(missed, {})) == ("missed leg 2 by 90 m", math.inf)
+    assert (refused.value, refused.goal) == ("refused: V", "")
+    beyond = fence.row_of("f16", "ell", "calm", [0.0, 3.5], [0.5, 0.5], 0, 0.52)
+    assert {figure.name: (figure.value, figure.goal) for figure in beyond.figures()} == {
+        "ell, calm: flights": ("2", ""),
+        "ell, calm: flights outside": ("1", "<= 0"),
+        "ell, calm: flights lost": ("0", "<= 0"),
+        "ell, calm: farthest outside": ("3.5", ""),
+    }
 
 
 def test_route_that_wind_forbids_is_refused_and_helix_is_flown_longer() -> None:
