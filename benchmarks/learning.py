@@ -96,6 +96,9 @@ CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbule
 }
 
 
+OSPREY = Cell("learn", "calm", 0.3)  # any cell with the airframe, the actuators and the noise of the library
+
+
 class Row(NamedTuple):
     """One aircraft. Scores in the flight with gusts, or after damage; NaN for what was not flown."""
 
@@ -176,6 +179,13 @@ def score(tape: Tape, first: float = 0.0, without: Sequence[str] = ()) -> float:
     return float(np.sum(np.sqrt(np.mean(e**2, axis=0)) / score_units(outputs, load_airframe("osprey").units_of_outputs())))
 
 
+@lru_cache(maxsize=4)
+def file_design(cell: Cell) -> RiseDiConfig | None:
+    """The start of a cell with feedforward and observer of the file."""
+    chosen = learning(cell, 0, LEARNED)
+    return designed(start_of(chosen), chosen, load_airframe("osprey"), uncertain=True)
+
+
 def designed(start: RiseDiConfig, scenario: Scenario, model: Airframe, *, uncertain: bool = False) -> RiseDiConfig | None:
     """The start with feedforward and observer of a model; None where no relaxation has the margins."""
     try:
@@ -247,7 +257,7 @@ def beside(uncertainty: float, number: int) -> dict[str, tuple[float, int]]:
     flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
     controllers = {
         "alone": start,
-        "file": designed(start, chosen, load_airframe("osprey"), uncertain=True),
+        "file": file_design(OSPREY),
         "true": designed(start, chosen, aircraft),
     }
     return {key: frozen(controller, flight, aircraft) for key, controller in controllers.items()}
@@ -331,7 +341,7 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     flown, start, aircraft = fly(name, number, chosen), start_of(chosen), chosen.aircraft.sampled_airframe()
     B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
-    controllers = {"alone": start, "file": designed(start, chosen, load_airframe("osprey"), uncertain=True)}
+    controllers = {"alone": start, "file": file_design(OSPREY)}
     controllers |= {} if dead else {"true": designed(start, chosen, damaged)}
     tapes = {key: simulate(chosen.vary(controller=value)) for key, value in controllers.items() if value is not None}
     without = {"elevator": "q", "aileron": "p", "rudder": "r"}.get(dead, "")
@@ -348,9 +358,9 @@ def alarms(name: str, cell: Cell, number: int) -> Row:
 FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
 
 
-def flown_row(name: str, number: int) -> Row:
-    """The row of an aircraft."""
-    return FLIGHTS[CELLS[name].kind](name, CELLS[name], number)
+def flown_rows(names: Sequence[str], number: int) -> list[Row]:
+    """The rows of an aircraft in some cells."""
+    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
 
 
 # The results
@@ -486,11 +496,17 @@ def main(
     rows, begun = read(results), evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
     known = {(each.cell, each.number) for each in rows}
     # aircraft by aircraft, so that a run that ends early has some of each cell
-    cases = [(n, name) for n in range(aircraft) for name in cell if n < math.ceil(CELLS[name].share * aircraft)]
+    cases: dict[tuple[int, float, str], list[str]] = {}
+    for n in range(aircraft):
+        for name in cell:
+            if n < math.ceil(CELLS[name].share * aircraft) and (name, n) not in known:
+                # what flies beside is the same in all cells of an uncertainty
+                shared = "" if CELLS[name].kind == "learn" else name
+                cases.setdefault((n, CELLS[name].uncertainty, shared), []).append(name)
     with ProcessPoolExecutor(jobs) as pool:
-        pending = [pool.submit(flown_row, name, n) for n, name in cases if (name, n) not in known]
+        pending = [pool.submit(flown_rows, names, n) for (n, _, _), names in cases.items()]
         for future in track(as_completed(pending), "aircraft", total=len(pending)):
-            rows.append(future.result())
+            rows += future.result()
             write(results, rows)
     found = list(figures(rows))
     for each in found:

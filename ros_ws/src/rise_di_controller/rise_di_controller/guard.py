@@ -25,7 +25,7 @@ from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
 from rise_di_controller.saturation import Limits, saturate
-from rise_di_controller.schedule import OverSpeed, nominal_at
+from rise_di_controller.schedule import OverSpeed
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of the difference more than 20 times.
@@ -225,7 +225,10 @@ def tick(
 
 def _nominal(nominal: Nominal, guard: GuardParams, law: Any) -> Nominal:
     """The nominal model of the feedforward, at the speed of a schedule if there is one."""
-    return nominal if guard.over_speed is None else nominal_at(nominal, guard.over_speed, law.scale)
+    if guard.over_speed is None:
+        return nominal
+    there: Nominal = guard.over_speed.of(law.scale)
+    return there
 
 
 def _vanes(

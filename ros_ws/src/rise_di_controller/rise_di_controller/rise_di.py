@@ -3,6 +3,7 @@
 """Parameters of RISE-DI: validation, and conversion to the arrays of the law."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
@@ -12,15 +13,16 @@ from flight_core.fields import Field
 from flight_core.parameters import Config, Numbers, ParameterError, Positive, Positives, require, require_length
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, TunedLaw
+from rise_di_controller.feedforward import Nominal
 from rise_di_controller.guard import GuardParams
 from rise_di_controller.law import CONTROL_LAWS, LawParams, Sign, gain, total_lag
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.schedule import (
     OverSpeed,
     ScheduleParams,
-    nominal_at,
+    nominal_of,
     nominal_side_by_side,
-    observer_at,
+    observer_of,
     over_speed,
     side_by_side,
     with_schedule,
@@ -167,13 +169,13 @@ class RiseDiConfig(ControllerConfig):
 
     def at_speed(self, ratio: float) -> Self:
         """The parameters that fly at a part of the trim speed in steady flight, with the models of there and no schedule."""
-        params, guard = self.tuned_law().params, self.guard()
-        assert guard.nominal is not None and guard.over_speed is not None  # noqa: S101, PT018 - the schedule has models
+        params, over = self.tuned_law().params, self.guard().over_speed
+        assert over is not None  # noqa: S101 - the schedule has models
         scale = params.airspeed + (1.0 - params.airspeed) / ratio**2
         sections: dict[str, Any] = {}
         for key, matrices, names in (
-            ("feedforward", nominal_at(guard.nominal, guard.over_speed, scale), ("A", "B", "gravity")),
-            ("observer", observer_at(params, scale), ("Phi", "Gamma", "L", "F")),
+            ("feedforward", over.of(scale), ("A", "B", "gravity")),
+            ("observer", params.observer.of(scale), ("Phi", "Gamma", "L", "F")),
         ):
             values = {name: tuple(getattr(matrices, name).ravel().tolist()) for name in names}
             sections[key] = getattr(self, key).model_copy(update=values)
@@ -183,40 +185,51 @@ class RiseDiConfig(ControllerConfig):
     def _airspeed(self) -> FloatArray:
         return np.array([float(name == "V") for name in self.outputs])
 
-    def _over_speed(self, matrices: Callable[["RiseDiConfig", FloatArray], FloatArray]) -> OverSpeed | None:
-        """Matrices of these parameters, and with the models at the other speeds, with the factors of input_scale there."""
+    def _over_speed(
+        self,
+        matrices: Callable[["RiseDiConfig", FloatArray], FloatArray],
+        model: Callable[[FloatArray, FloatArray], Any],
+    ) -> OverSpeed | None:
+        """A model of the matrices of these parameters, and of those with the sections of the other speeds."""
         if self.schedule is None or not self.schedule.models:
             return None
         airspeed, values = self._airspeed(), []
-        for model in (None, *self.schedule.models):
+        for there in (None, *self.schedule.models):
             ratio, changed = 1.0, dict[str, Any]()
-            if model is not None:
-                ratio, keys = model.ratio, {"feedforward": ("A", "B", "gravity"), "observer": ("Phi", "Gamma", "L", "F")}
+            if there is not None:
+                ratio, keys = there.ratio, {"feedforward": ("A", "B", "gravity"), "observer": ("Phi", "Gamma", "L", "F")}
                 for section, names in keys.items():
-                    own = {name: getattr(model, name) for name in names}
+                    own = {name: getattr(there, name) for name in names}
                     changed[section] = getattr(self, section).model_copy(update=own)
-            values.append(
-                matrices(self.model_copy(update=changed | {"schedule": None}), airspeed + (1.0 - airspeed) / ratio**2)
-            )
-        slow, fast = (model.ratio for model in self.schedule.models)
-        return over_speed((slow, fast), (values[0], values[1], values[2]), airspeed)
+            config = self.model_copy(update=changed | {"schedule": None})
+            values.append(matrices(config, airspeed + (1.0 - airspeed) / ratio**2))
+        slow, fast = (there.ratio for there in self.schedule.models)
+        return over_speed((slow, fast), (values[0], values[1], values[2]), airspeed, model)
 
     def guard(self) -> GuardParams:
         """Also the models of the feedforward over the airspeed."""
+        guard = super().guard()
+        if self.schedule is None or not self.schedule.models:
+            return guard
 
         def of_feedforward(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
-            nominal = config.nominal()
-            assert nominal is not None  # noqa: S101 - beside an observer
-            return nominal_side_by_side(nominal, scale)
+            return nominal_side_by_side(config.known_nominal(), scale)
 
-        return super().guard()._replace(over_speed=self._over_speed(of_feedforward))
+        return guard._replace(over_speed=self._over_speed(of_feedforward, partial(nominal_of, self.known_nominal())))
+
+    def known_nominal(self) -> Nominal:
+        """The arrays of the feedforward, where there is one."""
+        nominal = self.nominal()
+        assert nominal is not None  # noqa: S101 - beside an observer
+        return nominal
 
     def tuned_law(self) -> TunedLaw:
         """The law with parameters, extended by the observer or the schedule, if any."""
         law = super().tuned_law()
         if self.schedule is None:
             return law
-        over = self._over_speed(lambda config, scale: side_by_side(config.tuned_law().params, scale))
+        model = partial(observer_of, law.params)
+        over = self._over_speed(lambda config, scale: side_by_side(config.tuned_law().params, scale), model)
         speed, time = np.float64(self.schedule.speed), np.float64(self.schedule.time)
         return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
 

@@ -8,6 +8,7 @@ law's own equations do not change. The models of a feedforward and of an observe
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -24,35 +25,44 @@ SCALE_RANGE = (0.3, 3.0)
 """Least and largest factor of input_scale: from 1.83 to 0.58 of the trim speed."""
 
 
+STEPS = 128  # a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so that most ticks find theirs made
+
+
 class OverSpeed(NamedTuple):
-    """Matrices side by side over the airspeed: at + d (slope + d curvature), with d = V / V0 - 1 from `least` to `most`.
+    """A model over the airspeed, from `least` to `most` of d = V / V0 - 1."""
 
-    What turns y_dot into u, as F of an observer and the inverse of Omega, is over the factor of input_scale.
-    """
-
-    at: Array  # (k, l)
-    slope: Array
-    curvature: Array
+    at: Callable[[float], Any]  # of d, in whole STEPS
     least: float
     most: float
-    airspeed: Array  # (m,) 1 for the output V, else 0
+    airspeed: FloatArray  # (m,) 1 for the output V, else 0
 
-    def matrices(self, scale: Array) -> Array:
-        """The matrices where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
-        xp = array_namespace(scale)
-        d = 1.0 / xp.sqrt(xp.max((1.0 - self.airspeed) * scale, axis=0)) - 1.0
-        d = xp.minimum(xp.maximum(d, self.least + 0.0 * d), self.most + 0.0 * d)
-        return self.at + d * (self.slope + d * self.curvature)
+    def of(self, scale: FloatArray) -> Any:
+        """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
+        d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
+        return self.at(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
 
 def over_speed(
-    ratios: tuple[float, float], values: tuple[FloatArray, FloatArray, FloatArray], airspeed: FloatArray
+    ratios: tuple[float, float],
+    values: tuple[FloatArray, FloatArray, FloatArray],
+    airspeed: FloatArray,
+    model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """Through `values` at the trim speed and at two ratios to it, the first below 1 and the second above."""
+    """The model of matrices at + d (slope + d curvature), through `values` at the trim speed and at two ratios to it.
+
+    The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and the inverse of Omega, is over
+    the factor of input_scale in `values`: `model` takes the matrices and these factors, (m,).
+    """
     at, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
     curvature = ((fast - at) / most - (slow - at) / least) / (most - least)
-    return OverSpeed(at, (slow - at) / least - least * curvature, curvature, least, most, airspeed)
+    slope = (slow - at) / least - least * curvature
+
+    @lru_cache(maxsize=512)
+    def of(d: float) -> Any:
+        return model(at + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2)
+
+    return OverSpeed(of, least, most, airspeed)
 
 
 class ScheduleParams(NamedTuple):
@@ -62,7 +72,7 @@ class ScheduleParams(NamedTuple):
     speed: Array  # () trim speed V0, m/s
     airspeed: Array  # (m,) 1 for the output V, else 0
     time: Array  # () time constant, s
-    observer: OverSpeed | None = None  # [Phi, Gamma, L, F'], the law being one with an observer
+    observer: OverSpeed | None = None  # the law's parameters over the airspeed, of a law with an observer
 
 
 class ScheduleState(NamedTuple):
@@ -95,13 +105,10 @@ def side_by_side(params: ObserverParams, scale: FloatArray) -> FloatArray:
     return np.hstack([params.Phi, params.Gamma, params.L, (params.F / scale[:, None]).T])
 
 
-def observer_at(params: ScheduleParams, scale: Array) -> ObserverParams:
-    """The observer's parameters at a speed."""
-    observer: ObserverParams = params.law
-    if params.observer is None:
-        return observer
-    matrices, (s, m) = params.observer.matrices(scale), np.shape(observer.Gamma)
-    F = matrices[:, s + 2 * m :].T * scale[:, None]
+def observer_of(observer: ObserverParams, matrices: FloatArray, scale: FloatArray) -> ObserverParams:
+    """An observer with other matrices, the inverse of `side_by_side`."""
+    s, m = observer.Gamma.shape
+    F = np.ascontiguousarray(matrices[:, s + 2 * m :].T) * scale[:, None]
     return observer._replace(Phi=matrices[:, :s], Gamma=matrices[:, s : s + m], L=matrices[:, s + m : s + 2 * m], F=F)
 
 
@@ -113,10 +120,9 @@ def nominal_side_by_side(nominal: Nominal, scale: FloatArray) -> FloatArray:
     return np.hstack([nominal.A, nominal.gravity, nominal.B, nominal.path_A, nominal.path_gravity, inverse])
 
 
-def nominal_at(nominal: Nominal, over: OverSpeed, scale: Array) -> Nominal:
-    """The nominal model of the feedforward at a speed."""
+def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nominal:
+    """A nominal model of other matrices, the inverse of `nominal_side_by_side`."""
     n, m = nominal.B.shape
-    matrices = over.matrices(scale)
     ends = (0, n, 2 * n, 2 * n + m, 3 * n + m, 4 * n + m, 4 * n + 2 * m)
     A, gravity, B, path_A, path_gravity, inverse = (matrices[:, first:last] for first, last in pairwise(ends))
     inverse = inverse[:m].T * scale[:, None]
@@ -141,7 +147,7 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         return params.law._replace(input_scale=params.law.input_scale * scale)
 
     def at(params: ScheduleParams, scale: Array) -> Any:
-        known = params if params.observer is None else params._replace(law=observer_at(params, scale))
+        known = params if params.observer is None else params._replace(law=params.observer.of(scale))
         return scaled(known, scale)
 
     def followed(state: ScheduleState, y: Array, dt: Array, params: ScheduleParams) -> ScheduleState:
