@@ -241,7 +241,8 @@ class Search:
             models, before = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)])), levels
             levels = self.levels(models) if follows else levels
             settled = follows and np.array_equal(levels, before)
-            counted = used & self._quiet(levels) if gusts else used
+            quiet = used & self._quiet(levels) if gusts else used
+            counted = quiet if quiet.any() else used  # a gust in every span
             costs, e, half_log_det = self._costs(models, levels, counted, theta[None])
             rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
             J = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(size, -1)
