@@ -87,6 +87,11 @@ TOPICS = (
         "All laws have the same aircraft, winds and tuning.",
     ),
     Topic(
+        "Learning in the air",
+        {"learning": "uncertain aircraft that learn in flight, in every air and with damage"},
+        "[Learning](learning.md#what-it-reaches) says what the figures mean.",
+    ),
+    Topic(
         "Live view",
         {"view": "the page beside a flight, and a log of one hour on it"},
     ),
