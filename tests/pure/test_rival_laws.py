@@ -353,16 +353,16 @@ def test_every_law_keeps_limits_and_recovers_from_saturation(name: str) -> None:
 def test_rival_law_is_same_under_jax(name: str, osprey: NominalModel) -> None:
     """A law gives the same under NumPy and JAX, and over a fleet."""
     generator, (control_law, params) = np.random.default_rng(1), law_of(name, osprey)
-    shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))
+    shapes = ((4, 3), (4, 1), (4, 1), (4, 1), (4, 3), (4, 3), (8, 3), (8, 3), (4, 3))  # all but the vanes
     looks = [Measurements(*(0.1 * generator.standard_normal(shape) for shape in shapes)) for _ in range(4)]
-    state, single = control_law.engage(looks[0], params), [np.asarray(signal)[..., :1] for signal in looks[0]]
+    state, single = control_law.engage(looks[0], params), [np.asarray(signal)[..., :1] for signal in looks[0][:9]]
     compiled, alone = jax.tree.map(jax.numpy.asarray, state), control_law.engage(Measurements(*single), params)
     step = jax.jit(control_law.step)
     for measured in looks:
         state, u = control_law.step(state, measured, np.array(DT), params)
         compiled, by_jax = step(compiled, measured, DT, params)
         alone, first = control_law.step(
-            alone, Measurements(*(np.asarray(signal)[..., :1] for signal in measured)), np.array(DT), params
+            alone, Measurements(*(np.asarray(signal)[..., :1] for signal in measured[:9])), np.array(DT), params
         )
         # nothing but the order of additions differs
         np.testing.assert_allclose(by_jax, u, rtol=1e-9, atol=1e-12)
