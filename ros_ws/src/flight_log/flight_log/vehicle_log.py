@@ -338,7 +338,7 @@ def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[st
     parts, newest_ns = [list[tuple[str, int, Any]]()], 0
     apart: tuple[str, int, Any] | None = None  # the sample before, whose stamp is not near those before it
     for sample in samples:
-        near = [-BACK_NS <= sample[1] - other <= AHEAD_NS for other in (newest_ns, apart[1] if apart else sample[1])]
+        near = [-BACK_NS <= sample[1] - earlier_ns <= AHEAD_NS for earlier_ns in (newest_ns, apart[1] if apart else sample[1])]
         if parts[-1] and not near[0]:
             if apart is None or not near[1]:
                 apart = sample
