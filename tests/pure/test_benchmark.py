@@ -140,6 +140,7 @@ def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path)
         (lambda task: 3, "own: found 3, expected a section"),
         (lambda task: lambda t, y, y_m: [0.0], r"u in gusts at t = 0 s: found \[0.0\], expected 4 finite numbers: elevator"),
         (lambda task: lambda t, y, y_m: y + np.nan, "u in gusts at t = 0 s: .* expected 4 finite numbers"),
+        (lambda task: lambda t, y, y_m: 1 / 0, "u in gusts at t = 0 s: found ZeroDivisionError: division by zero"),
         (lambda task: None, "own: found the entry has no law for osprey"),
     ],
 )

@@ -79,12 +79,18 @@ def entered(entry: Entry, task: Task) -> ControllerConfig | Step | None:
     return controller
 
 
-def checked(u: ArrayLike, task: Task, t: float) -> FloatArray:
-    """The u of a function, (m,). Raises ParameterError for a wrong shape and for numbers that are not finite."""
-    expected = f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
-    vector = as_array(u, f"u in {task.set} at t = {t:g} s", expected)
-    fits = vector.shape == (len(task.inputs),) and bool(np.isfinite(vector).all())
-    require(fits, f"u in {task.set} at t = {t:g} s", u, expected)
+def stepped(step: Step, t: float, y: FloatArray, y_m: FloatArray, task: Task) -> FloatArray:
+    """The u of a function, (m,).
+
+    Raises ParameterError for a function that raises, for a wrong shape, and for numbers that are not finite.
+    """
+    where, expected = f"u in {task.set} at t = {t:g} s", f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
+    try:
+        u = step(t, y.copy(), y_m.copy())
+    except Exception as error:
+        raise ParameterError(f"{where}: found {type(error).__name__}: {error}, expected {expected}") from error
+    vector = as_array(u, where, expected)
+    require(vector.shape == (len(task.inputs),) and bool(np.isfinite(vector).all()), where, u, expected)
     return vector
 
 

@@ -17,7 +17,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
 from flight_campaign import fleet, missions
 from flight_campaign.benchmark_course import Course, build_course
-from flight_campaign.benchmark_entry import Entry, Step, Task, checked, entered, task_of
+from flight_campaign.benchmark_entry import Entry, Step, Task, entered, stepped, task_of
 from flight_campaign.benchmark_sets import AFTER, BEFORE, SETS, UNCERTAINTY, VERSION, Sets, seed_of
 from flight_campaign.engines import Engine, Job
 from flight_campaign.fleet import FleetResult, Stepper
@@ -218,7 +218,7 @@ def _stepped(flights: Stepper, entry: Entry, of: _Prepared, size: int) -> FleetR
         bounded, t = flights.bounded, flights.t
         for k, step in enumerate(steps):
             if bounded[k] and callable(step):
-                u[:, k] = checked(step(t, y[:, k].copy(), y_m[:, k].copy()), of.task, t)
+                u[:, k] = stepped(step, t, y[:, k], y_m[:, k], of.task)
         flights.advance(u)
     return flights.result()
 
@@ -250,7 +250,7 @@ class _FunctionController(Controller):
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
         """The u of the function."""
         y, y_m, t = self._y[-1], self._y_m[-1], seconds(now_ns)
-        u = checked(self._step(t, y.value.copy(), y_m.value.copy()), self._task, t)
+        u = stepped(self._step, t, y.value, y_m.value, self._task)
         inputs = TickInputs(y.stamp_ns, y.value, y_m.value, seconds(y_m.stamp_ns - y.stamp_ns), seconds(self.period_ns))
         return ControlOutput(y.stamp_ns, u, inputs, lambda: np.zeros(0))
 
