@@ -146,7 +146,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"A": 1.0}, r"\.A: found 1.0, expected less than 1"),
         ({"B": -0.1}, r"\.B: found -0.1, expected greater than or equal to 0"),
         ({"seed": -1}, r"\.seed: found -1, expected greater than or equal to 0"),
-        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, number, seed, wind"),
+        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, distribution, entries, number, parts, seed, wind"),
         ({"wind": "none"}, r"\.wind: found 'none', expected"),
     ],
     "turbulence": [
@@ -286,8 +286,10 @@ def test_output_that_cannot_be_written_is_one_sentence() -> None:
 ENDLESS = {
     "ActuatorConfig": {"lower", "upper", "rate", "stuck_at", "lost_at", "weak_at", "slow_at", "loose_at"},
     "DriftConfig": {"start"},
+    "Gust": {"every"},
     "InputRow": {"release"},
     "MessageRow": {"values"},
+    "VaneSensorsConfig": {"frozen_at"},
 }
 RESULTS = {"flight_campaign.statistics"}  # modules with sets that only the stack writes
 

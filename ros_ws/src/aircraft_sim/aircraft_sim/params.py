@@ -195,7 +195,7 @@ class SensorConfig(Config):
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
-class VanesConfig(Config):
+class VaneSensorsConfig(Config):
     """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors` too."""
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(default=(), description="the angles that have a vane; none if empty")
@@ -275,7 +275,7 @@ class AircraftConfig(NodeConfig):
     drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
-    vanes: VanesConfig = Field(default=VanesConfig(), description="vanes beside the outputs, none where left out")
+    vanes: VaneSensorsConfig = Field(default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out")
     pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
 
     control_rate: float = Field(

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
 from flight_core.files import replacing, write_file, writing
-from flight_core.parameters import Config, ParameterError, Positives, require
+from flight_core.parameters import Config, ParameterError, Positive, Positives, require
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig
 
@@ -81,9 +81,13 @@ class Definition(Config):
     seed: int = Field(ge=0, lt=2**63, description="the seed of the aircraft")
     chunk: int = Field(ge=1, le=1_000_000, description="how many of them fly at once")
     sweep: Sweep | None = None
-    entries: dict[str, float] = Field(default={}, description="the largest part of entries with one of their own, by name")
+    entries: dict[str, Annotated[float, Field(ge=0, lt=1)]] = Field(
+        default={}, description="the largest part of entries with one of their own, by name"
+    )
     distribution: Distribution = Field(default="uniform", description="of the parts, within the largest")
-    score_units: dict[str, float] = Field(default={}, description="unit of an rms error in the score by output, SI, if its own")
+    score_units: dict[str, Positive] = Field(
+        default={}, description="unit of an rms error in the score by output, SI, if its own"
+    )
 
     @property
     def spread(self) -> Spread:
