@@ -447,6 +447,22 @@ def test_delay_margin_lasts_up_to_speed_at_which_loop_with_responses_turns_unsta
     assert selection.stable_speed_ratio(osprey, selected.literal) == 0.0
 
 
+def test_theorem_that_asks_for_gains_beyond_controller_keeps_engineering_gains(
+    osprey: Study, selected: selection.Selection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the f16 of JSBSim, whose bounds lead to k_d of 2e17."""
+    theorem = gain_conditions.theorem_gains
+
+    def beyond(*arguments: Any) -> GainSet:
+        gains = theorem(*arguments)
+        return gains._replace(k_d=1e12 * gains.k_d)
+
+    monkeypatch.setattr(gain_conditions, "theorem_gains", beyond)
+    answer = selection.select_gains(osprey, SERVOS)
+    assert answer.chosen == selected.chosen
+    assert answer.literal.k_d == pytest.approx(1e12 * np.array(selected.literal.k_d))
+
+
 def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
     literal = find_scenario("osprey_servo").vary(controller={"sign": "literal"})
     answer: GainAssessment[Any] = selection.check_gains(literal, osprey)

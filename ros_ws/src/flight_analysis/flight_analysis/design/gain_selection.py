@@ -47,7 +47,7 @@ from flight_analysis.design.requirement import (
 )
 from flight_core.arguments import as_instance
 from flight_core.integrators import rk4
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import LARGEST, ParameterError, require
 from flight_core.vectors import Array, FloatArray
 from reference_model import model
 from reference_model.command import command
@@ -433,8 +433,16 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
-    literal = controller(gain_conditions.theorem_gains(bounds, ones), ones, ones)
-    first = engineering(ones, ones)
+    sufficient, first = gain_conditions.theorem_gains(bounds, ones), engineering(ones, ones)
+    # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the f16 of JSBSim.
+    within = GainSet(
+        min(sufficient.k_g, LARGEST),
+        *(np.minimum(values, LARGEST) for values in (sufficient.k_d, sufficient.Lambda, sufficient.beta)),
+    )
+    literal = controller(within, ones, ones).model_copy(
+        update={"k_g": float(sufficient.k_g)}
+        | {name: tuple(getattr(sufficient, name).tolist()) for name in ("k_d", "Lambda", "beta")}
+    )
     behind_servos = first.controller.sampled_sign()[0] is Sign.SOFT
     chosen = (within_requirement(engineering, setting.requirement) if behind_servos else first).controller
     chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
