@@ -208,11 +208,15 @@ def test_vanes_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: st
     assert str(error.value).startswith(sentence), str(error.value)
 
 
+HIDDEN = "expected states of the feedforward that are no outputs: alpha, theta, beta, phi"
+
+
 def test_observer_with_wrong_vanes_is_refused() -> None:
     values = SHIPPED.controller.model_dump()
     for key, wrong, sentence in (
         ("H", [0.0], "controller.observer.vanes.H: found 1 values"),
         ("channels", ["alpha", "q"], "controller.observer.vanes.channels: found alpha, q, expected states"),
+        ("channels", ["alpha", "bta"], f"controller.observer.vanes.channels: found alpha, bta, {HIDDEN}"),
         ("L", [1.0] * len(values["observer"]["vanes"]["L"]), "controller.observer.vanes.L: found a spectral radius of"),
     ):
         observer = values["observer"] | {"vanes": values["observer"]["vanes"] | {key: wrong}}

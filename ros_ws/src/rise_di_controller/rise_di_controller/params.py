@@ -104,8 +104,9 @@ class VanesConfig(Config):
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
         """The arrays. Raises ParameterError for channels without a state, and for wrong sizes."""
         k, s, m = len(self.channels), estimates, len(outputs)
-        expected = f"states of the feedforward that are no outputs: {', '.join(set(states) - set(outputs))}"
-        known = set(self.channels) <= set(states) - set(outputs) and len(set(self.channels)) == k
+        others = [name for name in states if name not in outputs]
+        expected = f"states of the feedforward that are no outputs: {', '.join(others)}"
+        known = set(self.channels) <= set(others) and len(set(self.channels)) == k
         require(known, "observer.vanes.channels", ", ".join(self.channels), expected)
         for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
             found = len(getattr(self, key))
@@ -304,6 +305,8 @@ class ControllerConfig(NodeConfig):
             ", ".join(observer.states[: len(expected)]),
             f"first the states of the feedforward: {', '.join(expected)}",
         )
+        if observer.vanes is not None:
+            observer.vanes.params(self.outputs, self._model_states(), len(observer.states))
         require(observer.rate == self.rate, "observer.rate", f"{observer.rate:g} Hz", f"controller.rate, {self.rate:g} Hz")
         Phi, Gamma, H, L, F = observer.matrices(nominal)
         matrices = {"L": Phi @ (np.eye(len(Phi)) - L @ H)}
