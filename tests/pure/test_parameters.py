@@ -148,6 +148,7 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"seed": -1}, r"\.seed: found -1, expected greater than or equal to 0"),
         ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, distribution, entries, number, parts, seed, wind"),
         ({"wind": "none"}, r"\.wind: found 'none', expected"),
+        ({"entries": ["A[q,q]"] * 2, "parts": [0.1, 0.6]}, r"\.entries: found A\[q,q\], A\[q,q\], expected different ones"),
     ],
     "turbulence": [
         ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),

@@ -115,6 +115,7 @@ class UncertaintyConfig(Config):
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
 
     def _check(self) -> None:
+        require(len(set(self.entries)) == len(self.entries), "entries", ", ".join(self.entries), "different ones")
         require_length("parts", self.parts, self.entries)
 
     def spread(self) -> Spread:
