@@ -159,7 +159,14 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
         ({"altitude": 100.0, "wind": -1.0}, r"\.wind: found -1\.0, expected greater than or equal to 0"),
         ({"altitude": 100.0, "winds": 1.0}, r"\.winds: unknown key, expected wind perhaps"),
     ],
-    "gusts": [({"up": GUST}, ": found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal")],
+    "gusts": [
+        ({"up": GUST}, ": found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal"),
+        # 2 H / V0 at 25 m/s
+        (
+            {"vertical": GUST | {"length": 30.0, "every": 2.3}},
+            r"\.vertical\.every: found 2\.3 s, expected at least 2\.4 s, which the gust takes at 25 m/s",
+        ),
+    ],
     "bias": [
         ({"h": STEP}, r"\.h: found 'h', expected a state of osprey: V, alpha"),
         ({"q": {"start": 0.0, "value": 1.0}}, r"\.q\.rise: missing, expected the rise time, s"),

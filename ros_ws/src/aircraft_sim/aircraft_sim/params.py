@@ -309,6 +309,9 @@ class AircraftConfig(NodeConfig):
         else:
             self._check_airframe()
         channels = self.channels()
+        for axis, gust in self.gusts.items():
+            least = f"at least {2.0 * gust.length / channels.speed:.6g} s, which the gust takes at {channels.speed:g} m/s"
+            require(gust.every * channels.speed >= 2.0 * gust.length, f"gusts.{axis}.every", f"{gust.every:g} s", least)
         for key, values in self.actuators.model_dump().items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
