@@ -142,6 +142,17 @@ def test_model_of_trim_beside_schedule_refused(name: str) -> None:
         find_scenario(name).vary(controller={"schedule": {"speed": 25.0}})
 
 
+def test_schedule_of_airspeed_alone_refused() -> None:
+    """The factor of channel V is 1: nothing would follow the schedule."""
+    values, alone = flight(schedule=True, delay=0.0, duration=1.0).controller.model_dump(), C172P.controller.outputs.index("V")
+    for key in ("outputs", "inputs", "D", "input_scale", "lag", "Lambda", "beta", "omega", "lower", "upper"):
+        values[key] = values[key][alone : alone + 1]
+    for key in ("k_d", "slew", "allocation"):
+        values[key] = () if key == "k_d" else None
+    with pytest.raises(ParameterError, match=r"schedule: found the outputs V, expected V among them, and one that follows V"):
+        C172P.rise_di().validate_mapping(values, "controller")
+
+
 def test_many_aircraft_have_each_their_scale() -> None:
     control_law, params = law()
     many, V = fleet.shared(params), np.array([[-10.0, 0.0, FASTER]])

@@ -110,6 +110,9 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(schedule
     [
         ({"slow": None}, "schedule: found a feedforward or an observer that holds at the trim speed alone"),
         ({"slow": {"ratio": 1.1}}, "schedule: found ratios of 1.1 and 1.4, expected one below 1 and one above"),
+        ({"fast": {"gravity": [1.0]}}, r"^controller\.schedule\.fast\.gravity: found 1 values, expected 64: 8 rows of 8"),
+        ({"slow": {"B": [0.0] * 32}}, r"^controller\.schedule\.slow\.B: found a C B without a D"),
+        ({"fast": {"Phi": [1.0]}}, r"^controller\.schedule\.fast\.Phi: found 1 values, expected"),
         ({"fast": {"F": -1.0}}, r"schedule, at 1.4 of the trim speed: observer.F: found a spectral radius"),
     ],
 )
@@ -118,7 +121,7 @@ def test_wrong_models_at_other_speeds_refused(scheduled: RiseDiConfig, changes: 
     for name, change in changes.items():
         if change is None:
             values["schedule"][name] = None
-        elif "F" in change:
+        elif "F" in change:  # a factor
             values["schedule"][name]["F"] = [change["F"] * value for value in values["schedule"][name]["F"]]
         else:
             values["schedule"][name] |= change

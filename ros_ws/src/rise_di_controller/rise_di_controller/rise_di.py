@@ -135,8 +135,9 @@ class RiseDiConfig(ControllerConfig):
             require(self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least)
 
     def _check_schedule(self, schedule: ScheduleConfig) -> None:
-        """V is an output, and a feedforward and an observer beside it have models below and above the trim speed."""
-        require("V" in self.outputs, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them")
+        """V is an output beside others, and a feedforward and an observer have models below and above the trim speed."""
+        followed = "V" in self.outputs and len(self.outputs) > 1
+        require(followed, "schedule", f"the outputs {', '.join(self.outputs)}", "V among them, and one that follows V")
         if self.feedforward is None and self.observer is None:
             require(
                 schedule.slow is None and schedule.fast is None,
@@ -150,6 +151,12 @@ class RiseDiConfig(ControllerConfig):
         require(both, "schedule", "a feedforward or an observer that holds at the trim speed alone", expected)
         slow, fast = (model.ratio for model in schedule.models)
         require(slow < 1.0 < fast, "schedule", f"ratios of {slow:g} and {fast:g}", "one below 1 and one above")
+        for name, model in zip(("slow", "fast"), schedule.models, strict=True):
+            there = self._with_models(model)
+            try:
+                there.tuned_law()
+            except ParameterError as error:  # of feedforward.KEY or observer.KEY
+                raise ParameterError(f"schedule.{name}.{str(error).partition('.')[2]}") from None
         require(self.learn is None, "learn", "a schedule beside it", "none: a model is learned at one speed")
         require(not self.vanes, "observer.vanes", "a schedule beside them", "none: they read the model of the trim speed")
 
@@ -182,6 +189,13 @@ class RiseDiConfig(ControllerConfig):
         input_scale = tuple((np.array(self.input_scale) * scale).tolist())
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
+    def _with_models(self, there: SpeedConfig) -> Self:
+        """The parameters with the models of another speed in place of those of the trim speed, and no schedule."""
+        sections: dict[str, Any] = {"schedule": None}
+        for key, names in (("feedforward", ("A", "B", "gravity")), ("observer", ("Phi", "Gamma", "L", "F"))):
+            sections[key] = getattr(self, key).model_copy(update={name: getattr(there, name) for name in names})
+        return self.model_copy(update=sections)
+
     def _airspeed(self) -> FloatArray:
         return np.array([float(name == "V") for name in self.outputs])
 
@@ -193,18 +207,12 @@ class RiseDiConfig(ControllerConfig):
         """A model of the matrices of these parameters, and of those with the sections of the other speeds."""
         if self.schedule is None or not self.schedule.models:
             return None
-        airspeed, values = self._airspeed(), []
-        for there in (None, *self.schedule.models):
-            ratio, changed = 1.0, dict[str, Any]()
-            if there is not None:
-                ratio, keys = there.ratio, {"feedforward": ("A", "B", "gravity"), "observer": ("Phi", "Gamma", "L", "F")}
-                for section, names in keys.items():
-                    own = {name: getattr(there, name) for name in names}
-                    changed[section] = getattr(self, section).model_copy(update=own)
-            config = self.model_copy(update=changed | {"schedule": None})
-            values.append(matrices(config, airspeed + (1.0 - airspeed) / ratio**2))
-        slow, fast = (there.ratio for there in self.schedule.models)
-        return over_speed((slow, fast), (values[0], values[1], values[2]), airspeed, model)
+        airspeed, (slow, fast) = self._airspeed(), self.schedule.models
+        at_trim = matrices(self.model_copy(update={"schedule": None}), np.ones(len(self.outputs)))
+        at_slow, at_fast = (
+            matrices(self._with_models(there), airspeed + (1.0 - airspeed) / there.ratio**2) for there in (slow, fast)
+        )
+        return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def guard(self) -> GuardParams:
         """Also the models of the feedforward over the airspeed."""
