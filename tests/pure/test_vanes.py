@@ -25,8 +25,9 @@ from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.control_law import Measurements
+from rise_di_controller.controller import Controller
 from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.observer import VaneObserverState, correct, without_frozen
 from rise_di_controller.rise_di import RiseDiConfig
@@ -168,13 +169,39 @@ def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
 
 
 def test_frozen_vane_is_left_out_and_told() -> None:
-    _, tape = frozen()
+    scenario, tape = frozen()
     measures, t = tape["internals"].group("vane_measures"), tape.time("internals")
     assert measures["alpha"][t > 9.0].max() == 0.0  # five time constants later
     assert measures["beta"][t > 3.0].min() == 1.0
-    assert "vane alpha stands still: left out" in [event.name for event in events(tape, {})]
+    (event,) = (event for event in events(tape, {}, scenario) if event.name.startswith("vane"))
+    assert event.name == "vane alpha stands still: left out"
+    assert event.start > 4.0
     assert vane_notes(tape)[0].startswith("vane alpha stands still from t = ")
     assert replay(tape).equal()
+
+
+def test_vane_of_fresh_engagement_is_not_told_to_stand_still() -> None:
+    tape = simulate(SHORT.vary(flight={"duration": 2.0}))
+    assert tape["internals"]["vane_measures.alpha"][0] == 0.0  # its motion is measured from 0
+    assert not [event for event in events(tape, {}, SHORT) if event.name.startswith("vane")]
+
+
+def test_controller_tells_still_vane_after_the_time_of_its_average() -> None:
+    """Alpha turns, beta is frozen from the start; after a re-engagement nothing is told again."""
+    controller = Controller(SHORT.controller)
+    told = [controller.still_vanes()]
+    for number in range(400):
+        now_ns = 10_000_000 * number
+        y = np.append(np.zeros(4), [0.05 * np.sin(0.05 * number), 0.0])
+        controller.take_y(StampedVector(now_ns, y), now_ns)
+        controller.take_y_m(StampedVector(now_ns, np.zeros(4)), now_ns)
+        if number == 200:
+            controller.restart()
+        controller.tick(now_ns)
+        if controller.still_vanes() != told[-1]:
+            told.append(controller.still_vanes())
+            assert number == 100  # 1 s
+    assert told == [(), ("beta",)]
 
 
 def test_log_without_first_half_replays() -> None:

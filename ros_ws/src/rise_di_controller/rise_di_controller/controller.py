@@ -62,6 +62,8 @@ class Controller:
         self._first_law, self._learned = True, _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
+        self._engaged_ns = 0
+        self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
         self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
@@ -114,9 +116,22 @@ class Controller:
         self._first_law, self._learned = self._has_first_model(new.parameters), _with_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
-        """The vanes left out by the observer: still vanes."""
-        measures = getattr(self._state.law, "vane_measures", ())
-        return tuple(name for name, value in zip(self._parameters.vanes, measures, strict=False) if not value)
+        """The vanes left out by the observer: still vanes.
+
+        Each engagement measures their motion from 0. Until a vane has moved, or the time of the average has passed, it counts
+        as before.
+        """
+        return tuple(name for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True) if still)
+
+    def _measure_vanes(self, inputs: guard.TickInputs) -> None:
+        measures, observer = getattr(self._state.law, "vane_measures", None), self._parameters.observer
+        if measures is None or observer is None or observer.vanes is None:
+            return
+        if self.mode is Mode.ENGAGED and inputs.dt == 0.0:
+            self._engaged_ns, self._vanes_moved = inputs.stamp_ns, np.zeros_like(self._vanes_moved)
+        self._vanes_moved = self._vanes_moved | (measures > 0.0)
+        known = self._vanes_moved | (seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time)
+        self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
 
     def fallback(self) -> ControllerConfig | None:
         """The parameters of the start where a law with a model that was learned in flight diverges; else None."""
@@ -150,6 +165,7 @@ class Controller:
         self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if inputs is None:
             return None
+        self._measure_vanes(inputs)
         self._number += self.has_internals
         self._errors = divergence.step(self._errors, inputs.y - inputs.y_m, inputs.dt, first_law=self._first_law)
         age = seconds(now_ns - inputs.stamp_ns)

@@ -126,7 +126,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
 def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     units, gusts = flight.units, flight.gusts
     context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(scenario)
-    of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts))
+    of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts, scenario))
     return Page(
         f"Flight {flight.name}",
         [

@@ -6,6 +6,10 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby, product
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import MIN_BAND_NOISE_FLOORS, SETTLING_BAND, SETTLING_DWELL, Windows
 from flight_analysis.report import figures
 from flight_analysis.report.account import account_of_json
@@ -28,7 +32,9 @@ from flight_analysis.report.summary import (
     table_rows,
     taken_over,
 )
+from flight_core.modes import Mode
 from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
 ERROR_LEGEND = (
@@ -77,7 +83,17 @@ class Event(NamedTuple):
     extent: str
 
 
-def events(tape: Tape, gusts: Windows) -> list[Event]:
+def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
+    """Ticks in which a vane stands still, shape (N,); of `Controller.still_vanes`, from an engagement on as of no vane."""
+    internals, t, tick = tape["internals"], tape.time("internals"), np.arange(len(measures))
+    engages = (internals["mode"] == Mode.ENGAGED) & (internals["dt"] == 0.0)
+    engaged = np.maximum.accumulate(np.where(engages, tick, 0))
+    has_moved = np.maximum.accumulate(np.where(measures > 0.0, tick, -1)) >= engaged
+    still: NDArray[np.bool_] = (measures == 0.0) & (has_moved | (t - t[engaged] >= time))
+    return still
+
+
+def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Event]:
     """Gusts, modes other than ENGAGED, saturations of the inputs, and still vanes, in order of the start."""
     listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
@@ -94,8 +110,10 @@ def events(tape: Tape, gusts: Windows) -> list[Event]:
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
                 listed.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
         measures = tape["internals"].group("vane_measures")
+        observer = None if scenario is None else scenario.controller.observer
+        time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
         for name in measures.names:
-            if (still := measures[name] == 0.0).any():
+            if (still := _stands_still(measures[name], tape, time)).any():
                 first, last = t[still][[0, -1]]
                 listed.append(Event(f"vane {name} stands still: left out", first, last, f"{still.sum()} of {len(still)} ticks"))
     return sorted(listed, key=lambda event: event.start)
