@@ -60,6 +60,14 @@ def test_short_period_is_as_fast_as_the_aircraft_and_a_turn_as_wide() -> None:
     assert moved.gust_direction("longitudinal") == pytest.approx(-moved.matrix_a()[:, 0])
 
 
+@pytest.mark.parametrize("ratio", [0.7, 1.4])
+def test_lift_balances_weight_at_each_speed(ratio: float) -> None:
+    """A[alpha,V] is -2 g / V^2 in level flight; the file of the osprey has it 4 % smaller."""
+    moved = at_speed(OSPREY, ratio, "thrust")
+    found = moved.matrix_a()[OSPREY.index("alpha"), OSPREY.index("V")]
+    assert found == pytest.approx(-2.0 * 9.81 / (ratio * 25.0) ** 2, rel=0.05)
+
+
 def test_margin_holds_from_slow_to_fast(scheduled: RiseDiConfig) -> None:
     # that of the shipped observer falls to 17 ms at 1.32 of the trim speed
     assert margin(SHIPPED.rise_di(), FASTER) < LATE

@@ -22,11 +22,15 @@ STATES: Mapping[str, str] = {
 
 EXPONENTS: Mapping[str, Mapping[str, float]] = {
     SPEED: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
-    INCIDENCE: {SPEED: -1.0, INCIDENCE: 1.0, RATE: 0.0, ANGLE: -1.0},
+    INCIDENCE: {SPEED: -2.0, INCIDENCE: 1.0, RATE: 0.0, ANGLE: -1.0},
     RATE: {SPEED: 1.0, INCIDENCE: 2.0, RATE: 1.0, ANGLE: 0.0},
     ANGLE: {SPEED: 0.0, INCIDENCE: 0.0, RATE: 0.0, ANGLE: 0.0},
 }
-"""Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column."""
+"""Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
+
+In level flight lift is weight at each speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about the trim, so A[alpha,V] is
+-2 g / V^2.
+"""
 
 OF_SURFACE = {SPEED: 2.0, INCIDENCE: 1.0, RATE: 2.0, ANGLE: 0.0}
 OF_THRUST = {SPEED: 0.0, INCIDENCE: -1.0, RATE: 0.0, ANGLE: 0.0}
@@ -37,10 +41,10 @@ def at_speed(airframe: Airframe, ratio: float, thrust: str) -> Airframe:
     """The airframe trimmed at `ratio` times its speed V0, shape and units as before.
 
     Moments by an angle of incidence or by a surface grow with V^2, dampings with V, what a force does to an angle of incidence
-    with the force over V; thrust, gravity and kinematics stay. So every entry is scaled by a power of the ratio: EXPONENTS,
-    OF_SURFACE and OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of the trim: no Mach number,
-    no change of C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation", 2.6, dimensional derivatives.
-    Raises ParameterError for a state whose exponents are not known.
+    with the force over V; thrust, gravity and kinematics stay, and so does lift, the weight. Every entry is scaled by a power
+    of the ratio: EXPONENTS, OF_SURFACE and OF_THRUST for the input `thrust`. Wind acts by the new A. Derivatives are those of
+    the trim: no Mach number, none changes with C_L. Source: B. L. Stevens, F. L. Lewis, "Aircraft Control and Simulation",
+    2.6, dimensional derivatives. Raises ParameterError for a state whose exponents are not known.
     """
     unknown = [name for name in airframe.states if name not in STATES]
     require(not unknown, f"airframe {airframe.name}", f"the states {', '.join(unknown)}", f"some of {', '.join(STATES)}")
