@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the aircraft."""
 
+import gc
 import json
 import re
 import struct
@@ -319,3 +320,15 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
     ):
         result = CliRunner().invoke(app, ["import", str(tmp_path / name), "--map", map_name, "--output", str(tmp_path / "no")])
         assert sentence in str(result.exception)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves the file open
+def test_dataflash_log_with_damaged_format_is_one_sentence(
+    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight)
+    path.write_bytes(path.read_bytes().replace(b"Qffff" + bytes(11), b"Q?fff" + bytes(11), 1))
+    with pytest.raises(ParameterError, match=r"ArduPilot that cannot be decoded \(Unsupported format char"):
+        read_vehicle_log(path)
+    gc.collect()
+    assert capsys.readouterr().out == ""

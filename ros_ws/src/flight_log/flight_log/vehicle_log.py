@@ -8,7 +8,6 @@ and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 
 import math
 import re
-import struct
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, redirect_stdout
 from io import StringIO
@@ -203,8 +202,9 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     if read is None:
         raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
     try:
-        log = read(path, kind)
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, struct.error) as error:
+        with redirect_stdout(StringIO()):  # pymavlink and pyulog print that a file is damaged
+            log = read(path, kind)
+    except Exception as error:  # pymavlink raises Exception itself for a damaged format
         raise ParameterError(f"{path}: found {kind} that cannot be decoded ({error}), expected {EXPECTED}") from None
     require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
     return log
@@ -293,8 +293,7 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
     if path.stat().st_size < ULOG_HEAD:
         raise ValueError("its head is cut")
     try:
-        with redirect_stdout(StringIO()):  # pyulog prints that a file is damaged
-            log = ULog(str(path))
+        log = ULog(str(path))
     except ULogException as error:
         raise ValueError(error) from None
     if log.file_corruption:
