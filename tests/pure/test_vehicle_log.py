@@ -239,11 +239,21 @@ def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path:
     both, alone = (read_vehicle_log(tmp_path / name) for name in ("both.bin", "whole.bin"))
     assert both.kind == "a DataFlash log of ArduPilot, the longest of 2 parts: its clock goes back"
     np.testing.assert_array_equal(both.tables["IMU"].stamp_ns, alone.tables["IMU"].stamp_ns)
-    stamp = struct.pack("<Q", flight.stamp_us[500])  # that of IMU, the first message of the instant
-    (tmp_path / "damaged.bin").write_bytes(whole.read_bytes().replace(stamp, struct.pack("<Q", 2**50), 1))
-    damaged = read_vehicle_log(tmp_path / "damaged.bin")
+
+
+@pytest.mark.parametrize("places", [[(500, 2**50)], [(500, 0), (501, 0)], [(0, 0)]], ids=["ahead", "two back", "at the begin"])
+def test_samples_with_damaged_stamps_are_left_out(places: list[tuple[int, int]], flight: Flight, tmp_path: Path) -> None:
+    flown = flight._replace(stamp_us=[stamp + 1_000_000_000 for stamp in flight.stamp_us])
+    rows = list(zip(flown.stamp_us, flown.y[:, [2, 0, 3]], strict=True))
+    write_dataflash(tmp_path / "whole.bin", {"IMU": (("GyrX", "GyrY", "GyrZ"), rows)}, {}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    whole = (tmp_path / "whole.bin").read_bytes()
+    for place, stamp in places:
+        whole = whole.replace(struct.pack("<Q", flown.stamp_us[place]), struct.pack("<Q", stamp), 1)
+    (tmp_path / "damaged.bin").write_bytes(whole)
+    damaged, alone = (read_vehicle_log(tmp_path / f"{name}.bin") for name in ("damaged", "whole"))
     assert damaged.kind == alone.kind
-    assert len(damaged.tables["IMU"].stamp_ns) == len(alone.tables["IMU"].stamp_ns) - 1
+    kept = np.delete(alone.tables["IMU"].stamp_ns, [place for place, _ in places])
+    np.testing.assert_array_equal(damaged.tables["IMU"].stamp_ns, kept)
 
 
 def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:

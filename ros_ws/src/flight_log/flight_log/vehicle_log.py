@@ -159,6 +159,7 @@ MAV_TYPES: Mapping[int, str] = MappingProxyType(
 
 PX4, PX4_MANUAL = 12, 1 << 16  # MAV_AUTOPILOT_PX4, and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
 BACK_NS, AHEAD_NS = NANOSECONDS, 60 * NANOSECONDS  # a clock that goes back by more has started again; ahead, the link was lost
+AGREEING = 5  # samples, after which another time is that of the clock
 
 
 class VehicleLog(NamedTuple):
@@ -332,26 +333,28 @@ def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[st
     """Tables of messages: name, stamp in ns, message; and a note. A field that its first message lacks is absent.
 
     Where the clock goes back by more than BACK_NS, as of an autopilot that started again, the longest part counts alone. A
-    stamp that no neighbour is near is damaged, and its sample is left out.
+    stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it.
     """
     parts, newest_ns = [list[tuple[str, int, Any]]()], 0
-    apart: tuple[str, int, Any] | None = None  # the sample before, whose stamp is not near those before it
+    apart: list[tuple[str, int, Any]] = []  # the samples before, near each other and not near those of the part
     for sample in samples:
-        near = [-BACK_NS <= sample[1] - earlier_ns <= AHEAD_NS for earlier_ns in (newest_ns, apart[1] if apart else sample[1])]
-        if parts[-1] and not near[0]:
-            if apart is None or not near[1]:
-                apart = sample
-                continue
-            if apart[1] < newest_ns:
+        if parts[-1] and _follows(sample[1], newest_ns):
+            parts[-1].append(sample)
+            newest_ns, apart = max(newest_ns, sample[1]), []
+            continue
+        apart = [*apart, sample] if apart and _follows(sample[1], apart[-1][1]) else [sample]
+        if len(apart) == AGREEING:
+            if parts[-1] and apart[0][1] < newest_ns:
                 parts.append([])
-            parts[-1].append(apart)
-            newest_ns = apart[1]
-        apart = None
-        newest_ns = max(newest_ns, sample[1]) if parts[-1] else sample[1]
-        parts[-1].append(sample)
+            parts[-1] += apart
+            newest_ns, apart = max(stamp_ns for _, stamp_ns, _ in apart), []
     note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
-    longest = max(parts, key=len)
+    longest = max(parts, key=len) or apart
     return _columns(longest, wanted), note
+
+
+def _follows(stamp_ns: int, earlier_ns: int) -> bool:
+    return -BACK_NS <= stamp_ns - earlier_ns <= AHEAD_NS
 
 
 def _columns(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
