@@ -82,6 +82,7 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
             ["fly", "--in-process", "--lockstep"],
             "error: --in-process: found a flight over topics, in lockstep, expected one of",
         ),
+        (["flightgear", "--origin", "47,8", "--to", "no.invalid:5500"], "error: --to: found 'no.invalid:5500' ("),  # RFC 6761
         (["report", "nowhere"], "error: nowhere: found no such file or folder"),
     ],
 )

@@ -4,6 +4,7 @@
 
 import math
 import re
+import socket
 from typing import Annotated
 
 import typer
@@ -11,7 +12,7 @@ import typer
 from flight_cli.route_options import parse_origin
 from flight_core.environment import require_ros_environment
 from flight_core.installation import require_package
-from flight_core.parameters import require
+from flight_core.parameters import ParameterError, require
 
 
 def flightgear(
@@ -32,12 +33,24 @@ def flightgear(
     host, _, port = to.rpartition(":")
     fits = bool(host) and re.fullmatch(r"[0-9]{1,5}", port) is not None and 0 < int(port) < 1 << 16
     require(fits, "--to", repr(to), "an address and a port, as in 127.0.0.1:5500")
+    address = _reached(to, host, int(port))
     require_package("rclpy", "")
     require_ros_environment()
     from flight_bringup.client import FlightGearClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
-    if place is not None:
-        with FlightGearClient(namespace) as client:
-            client.wait()
-            print(f"sending to {to}; start FlightGear: fgfs --fdm=null --native-fdm=socket,in,{rate:g},,{port},udp", flush=True)
-            client.send((host, int(port)), place, altitude, rate)
+    with FlightGearClient(namespace) as client:
+        client.wait()
+        print(f"sending to {to}; start FlightGear: fgfs --fdm=null --native-fdm=socket,in,{rate:g},,{port},udp", flush=True)
+        client.send(address, place, altitude, rate)
+
+
+def _reached(to: str, host: str, port: int) -> tuple[str, int]:
+    """The address of a host, to which this one has a route. Raises ParameterError."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+            trial.connect((host, port))  # sends nothing
+            address, _ = trial.getpeername()
+    except (OSError, UnicodeError) as error:  # UnicodeError for a name that no host can have
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ParameterError(f"--to: found {to!r} ({reason}), expected a host that this one reaches") from None
+    return address, port

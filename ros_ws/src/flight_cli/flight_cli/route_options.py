@@ -5,7 +5,7 @@
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, overload
 
 import typer
 
@@ -33,6 +33,10 @@ def read_waypoints(
     return route.waypoints
 
 
+@overload
+def parse_origin(text: str) -> Origin: ...
+@overload
+def parse_origin(text: None) -> None: ...
 def parse_origin(text: str | None) -> Origin | None:
     """The origin of a route, from "47.38,8.54"."""
     if text is None:
