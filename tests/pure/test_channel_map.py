@@ -39,6 +39,7 @@ from autopilot_bridge.channel_map import (
 )
 from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_cli.cli import application
+from flight_core import installation
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
 
@@ -229,6 +230,12 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
     assert "1: 24 of 24 rows hold" in alone.output
     refused = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", "--definitions", str(tmp_path / "1" / "msg")])
     assert "expected a folder with the sources of a message package" in str(refused.exception)
+
+
+def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
+    result = CliRunner().invoke(application(["check-map"]), ["check-map", "ardupilot_mavlink"])
+    assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
 
 
 def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:

@@ -18,6 +18,7 @@ from autopilot_bridge import mavlink_link
 from autopilot_bridge.channel_map import STEP, versioned_topic
 from autopilot_bridge.params import MAVLINK, ChannelMap
 from flight_core.files import read_file
+from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_log.message_definitions import definition
 from flight_log.named_vectors import typestore
@@ -62,9 +63,14 @@ def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
 
 
 def installed_definitions(kinds: Iterable[str]) -> Types:
-    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is absent."""
+    """The message types of the installed packages, and those of MAVLink in pymavlink; the rest is absent.
+
+    Raises ParameterError for one of MAVLink without pymavlink.
+    """
     types: dict[str, tuple[Any, Any]] = {}
     for kind in kinds:
+        if kind.startswith(f"{MAVLINK}/"):
+            require_package("pymavlink")
         try:
             if kind.startswith(f"{MAVLINK}/"):
                 fields = mavlink_link.message_type(kind.rpartition("/")[2]).fields
