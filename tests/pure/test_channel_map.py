@@ -238,6 +238,21 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pyt
     assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
 
 
+@pytest.mark.parametrize(
+    ("key", "change", "fault"),
+    [
+        ("v_north", {"turned_by": "pose.pose.orientatoin"}, "no orientatoin"),
+    ],
+)
+def test_check_map_finds_field_that_row_cannot_use(key: str, change: dict[str, str], fault: str, tmp_path: Path) -> None:
+    content = yaml.safe_load(MAP_FILES["odometry"].read_text(encoding="utf-8"))
+    content["pose"][key] |= change
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    result = CliRunner().invoke(application(["check-map"]), ["check-map", str(tmp_path / "changed.yaml"), "--json"])
+    found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
+    assert found == {f"pose.{key}": [fault]}
+
+
 def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:
     types = {kind for _, _, kind in named_map("ardupilot_2024").used_topics()}
     stamped = {f"geometry_msgs/msg/{kind}Stamped" for kind in ("Pose", "Twist", "Vector3")}

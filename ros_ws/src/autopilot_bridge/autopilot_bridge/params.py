@@ -398,6 +398,8 @@ class ChannelMap(Config):
         for kind, named in self._readers().items():
             for name, row in named.items():
                 fields.append((f"{kind}.{name}", row.topic, row.type, row.field))
+                if (turned_by := getattr(row, "turned_by", None)) is not None:
+                    fields.append((f"{kind}.{name}", row.topic, row.type, turned_by))
                 if getattr(row, "stamp", "") == "header":
                     fields.append((f"{kind}.{name}", row.topic, row.type, "header.stamp"))
         set_fields = [("inputs", name, row.message, row.field) for name, row in self.inputs.items()]
