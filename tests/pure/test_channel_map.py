@@ -242,6 +242,12 @@ def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pyt
     ("key", "change", "fault"),
     [
         ("v_north", {"turned_by": "pose.pose.orientatoin"}, "no orientatoin"),
+        ("v_north", {"turned_by": "pose.pose.position"}, "pose.pose.position: no w, x, y, z"),
+        ("phi", {"field": "pose.pose.position"}, "pose.pose.position: no w, x, y, z"),
+        ("phi", {"field": "pose.covariance"}, "pose.covariance: no w, x, y, z"),  # of 36
+        ("phi", {"field": "pose.covariance[0]", "function": "norm"}, "pose.covariance[0]: no x, y, z"),
+        ("north", {"field": "pose.pose.position"}, "pose.pose.position: no number"),
+        ("north", {"field": "child_frame_id"}, "child_frame_id: no number"),
     ],
 )
 def test_check_map_finds_field_that_row_cannot_use(key: str, change: dict[str, str], fault: str, tmp_path: Path) -> None:

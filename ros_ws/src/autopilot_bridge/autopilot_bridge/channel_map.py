@@ -135,6 +135,12 @@ The number itself, the length of a vector, the airspeed of a dynamic pressure, t
 angles of body FLU in ENU are roll, -pitch and pi/2 - yaw of body FRD in NED: the row states it by its sign and offset.
 """
 
+QUATERNION = "wxyz"
+COMPONENTS: Mapping[str, str] = MappingProxyType(
+    {name: "xyz" if name == "norm" else QUATERNION if name.endswith("quaternion") else "" for name in DERIVED}
+)
+"""The members that the field of a function has; none for a number."""
+
 
 def _turned(message: Any, path: str, by: str) -> float:
     """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the world.

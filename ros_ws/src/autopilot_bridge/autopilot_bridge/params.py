@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
 
-from autopilot_bridge.channel_map import PATH, Line, to_raw
+from autopilot_bridge.channel_map import COMPONENTS, PATH, QUATERNION, Line, to_raw
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
@@ -392,21 +392,25 @@ class ChannelMap(Config):
         rows = self._readers() | {"messages": self.messages}
         return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
 
-    def used_fields(self) -> list[tuple[str, str, str, str]]:
-        """(key of the row, topic, type, path of the field) of each field that is read or set."""
-        fields = []
+    def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
+        """(key of the row, topic, type, path of the field, its components) of each field that is read or set.
+
+        The components are those of `COMPONENTS` for a field that a function reads, None for another one.
+        """
+        fields: list[tuple[str, str, str, str, str | None]] = []
         for kind, named in self._readers().items():
             for name, row in named.items():
-                fields.append((f"{kind}.{name}", row.topic, row.type, row.field))
+                components = COMPONENTS[getattr(row, "function", "value")]
+                fields.append((f"{kind}.{name}", row.topic, row.type, row.field, components))
                 if (turned_by := getattr(row, "turned_by", None)) is not None:
-                    fields.append((f"{kind}.{name}", row.topic, row.type, turned_by))
+                    fields.append((f"{kind}.{name}", row.topic, row.type, turned_by, QUATERNION))
                 if getattr(row, "stamp", "") == "header":
-                    fields.append((f"{kind}.{name}", row.topic, row.type, "header.stamp"))
+                    fields.append((f"{kind}.{name}", row.topic, row.type, "header.stamp", None))
         set_fields = [("inputs", name, row.message, row.field) for name, row in self.inputs.items()]
         for name, row in self.messages.items():
             set_fields += [("messages", name, name, path) for path in (*row.values, *(["header.stamp"] if row.stamped else []))]
         for kind, name, message, path in set_fields:
-            fields.append((f"{kind}.{name}", self.messages[message].topic, self.messages[message].type, path))
+            fields.append((f"{kind}.{name}", self.messages[message].topic, self.messages[message].type, path, None))
         return fields
 
 

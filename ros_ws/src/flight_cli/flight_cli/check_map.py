@@ -32,7 +32,7 @@ def check_map(
     Exit status: 0 every row holds, 1 a row does not, 2 bad input.
     """
     channel_map = load_map(map_name)
-    kinds = list(dict.fromkeys(kind for _, _, kind, _ in channel_map.used_fields()))
+    kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)
     of_mavlink = {kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")}
     names = ["installed"] if not definitions else [folder.resolve().name for folder in definitions]

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which rows of a channel map hold for a release of an autopilot, by its message definitions.
 
-A row holds where the definition has its field, where its topic has the version of the definition (PX4), and where a constant
-that the source of a condition names is one of the values.
+A row holds where the definition has its field, with the components that its function takes, where its topic has the version of
+the definition (PX4), and where a constant that the source of a condition names is one of the values.
 """
 
 import re
@@ -15,7 +15,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import TypesysError, get_types_from_msg
 
 from autopilot_bridge import mavlink_link
-from autopilot_bridge.channel_map import STEP, versioned_topic
+from autopilot_bridge.channel_map import QUATERNION, STEP, versioned_topic
 from autopilot_bridge.params import MAVLINK, ChannelMap
 from flight_core.files import read_file
 from flight_core.installation import require_package
@@ -86,8 +86,8 @@ def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[Checke
     """Each field that a map uses, against the definitions of some releases. A definition without a version has version 0."""
     types = list(releases)
     rows = []
-    for key, topic, kind, path in channel_map.used_fields():
-        faults = tuple(_fault(of, topic, kind, path) or _constant_fault(of, channel_map, key, kind) for of in types)
+    for key, topic, kind, path, components in channel_map.used_fields():
+        faults = tuple(_fault(of, topic, kind, path, components) or _constant_fault(of, channel_map, key, kind) for of in types)
         rows.append(CheckedRow(key, topic, path, faults))
     return rows
 
@@ -110,14 +110,14 @@ def _element(field: Any) -> tuple[Nodetype, Any]:
     return content[0] if node in {Nodetype.ARRAY, Nodetype.SEQUENCE} else (node, content)
 
 
-def _fault(types: Types, topic: str, kind: str, path: str) -> str:
+def _fault(types: Types, topic: str, kind: str, path: str, components: str | None) -> str:
     known = {**typestore().fielddefs, **types}
     if not is_known(types, kind):
         return f"no {kind}"
     version = next((value for name, _, value in known[kind][0] if name == VERSION), 0)
     if (expected := versioned_topic(topic, version)) != topic:
         return f"{topic}: version {version}, whose topic is {expected}"
-    at = kind
+    at, field = kind, (Nodetype.NAME, kind)
     for step in path.split("."):
         match = STEP.fullmatch(step)
         fields = dict(known[at][1]) if at in known else {}
@@ -127,8 +127,19 @@ def _fault(types: Types, topic: str, kind: str, path: str) -> str:
         if match[2] is not None and node is Nodetype.ARRAY and int(match[2]) >= content[1]:
             return f"{match[1]} of {content[1]}"
         element = _element((node, content))
+        field = (node, content) if match[2] is None else element
         at = element[1] if element[0] is Nodetype.NAME else ""
-    return ""
+    return "" if components is None or _has(known, field, components) else f"{path}: no {', '.join(components) or 'number'}"
+
+
+def _has(known: Types, field: Any, components: str) -> bool:
+    """Whether a field has components, as members or in an array; without components, whether it is a number."""
+    node, content = field
+    if node is Nodetype.NAME:
+        return bool(components) and content in known and {*components} <= {name for name, _ in known[content][1]}
+    if node is Nodetype.BASE:
+        return not components and content[0] != "string"
+    return bool(components) and (node is Nodetype.SEQUENCE or components != QUATERNION or content[1] == len(QUATERNION))
 
 
 def _constant_fault(types: Types, channel_map: ChannelMap, key: str, kind: str) -> str:
