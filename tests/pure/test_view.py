@@ -905,6 +905,7 @@ def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
         ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
         ((recorded,) * 3, "error: RUN: found 3 runs, expected a run and a ghost, or --fleet\n"),
         (("--fleet",), "error: --fleet: runs: found no run in recording, expected each RUN by its name\n"),
+        (("--fleet", "--namespace", "/a"), "error: --fleet: found --namespace beside it, expected one of the two\n"),
         ((recorded, "--namespace", "n"), f"error: {recorded}: found aircraft in the namespaces /, expected one in 'n'\n"),
     ):
         ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)

@@ -77,6 +77,7 @@ def watch(
     require(
         not (fleet and (text or foxglove or controlled)), "--fleet", "--text, --foxglove or --control beside it", "the page"
     )
+    require(not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two")
     given = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
     chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
     for folder in chosen:
