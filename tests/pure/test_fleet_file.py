@@ -3,11 +3,13 @@
 """Files of fleets: what each aircraft flies, and what is refused."""
 
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
 
 from flight_bringup.fleet import read_fleet
+from flight_cli.fleet import foreign_samples
 from flight_core.environment import MAX_PARTICIPANTS
 from flight_core.parameters import ParameterError
 from flight_ros.transport import LOOPBACK_PROFILE
@@ -63,6 +65,17 @@ def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Pat
 def test_bad_fleet_is_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=f"^{sentence}"):
         read_fleet(fleet_file(tmp_path, text))
+
+
+@pytest.mark.package("flight_cli")
+@pytest.mark.parametrize("node", ["/blue/controller#2", "/stray#2", "/green/stray#2"])
+def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
+    def of(*nodes: str) -> dict[str, Any]:
+        return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
+
+    own, blue = "/red/controller#1", of("/blue/controller#2")
+    assert foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
+    assert foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
 
 
 def test_profile_takes_as_many_participants_as_fleet_may_have() -> None:

@@ -102,15 +102,18 @@ def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> 
         if sentence := (summary["account"] or {}).get("busy"):
             lines.append(f"  {sentence}")
     Console().print(table)
-    print(*lines, *_foreign({name: result.summary for name, result in results.items()}), sep="\n")
+    print(*lines, *foreign_samples({name: result.summary for name, result in results.items()}), sep="\n")
 
 
-def _foreign(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The samples on the topics of an aircraft from nodes of further aircraft; empty without an account of processes."""
+def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Sentences on the samples on the topics of an aircraft from nodes outside of its namespace.
+
+    Empty without an account of processes.
+    """
     sentences, total = [], 0
     for name, summary in summaries.items():
         processes = (summary["account"] or {}).get("processes", {})
         total += sum(process["samples"] for process in processes.values())
-        foreign = sum(process["samples"] for node, process in processes.items() if node.split("/")[1] in {*summaries} - {name})
-        sentences += [f"{name}: {foreign} samples of another aircraft"] if foreign else []
-    return sentences or ([f"samples of another aircraft: 0 of {total}"] if total else [])
+        foreign = sum(process["samples"] for node, process in processes.items() if node.rpartition("/")[0] != f"/{name}")
+        sentences += [f"{name}: {foreign} samples from outside of /{name}"] if foreign else []
+    return sentences or ([f"samples from outside of the aircraft: 0 of {total}"] if total else [])
