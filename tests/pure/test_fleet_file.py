@@ -3,13 +3,15 @@
 """Files of fleets: what each aircraft flies, and what is refused."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 from xml.etree import ElementTree
 
 import pytest
+from typer.testing import CliRunner
 
 from flight_bringup.fleet import read_fleet
-from flight_cli.fleet import foreign_samples
+from flight_cli import fleet
+from flight_cli.cli import application
 from flight_core.environment import MAX_PARTICIPANTS
 from flight_core.parameters import ParameterError
 from flight_ros.transport import LOOPBACK_PROFILE
@@ -24,6 +26,7 @@ aircraft:
   uav2: {start: {north: 50.0, heading: 0.5}, delay: 1.5, set: {controller: {k_g: 2.5}}}
   uav3: {route: there.yaml}
 """
+FLEET_OF_TWO = "aircraft: {one: {}, two: {}}"
 
 
 def fleet_file(folder: Path, text: str) -> Path:
@@ -74,9 +77,30 @@ def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
         return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
 
     own, blue = "/red/controller#1", of("/blue/controller#2")
-    assert foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
-    assert foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
+    assert fleet.foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
+    assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
 
 
 def test_profile_takes_as_many_participants_as_fleet_may_have() -> None:
     assert ElementTree.parse(LOOPBACK_PROFILE).findtext(".//{*}maxInitialPeersRange") == str(MAX_PARTICIPANTS)
+
+
+@pytest.fixture
+def without_ros(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    for name in ("require_package", "require_ros_environment"):
+        monkeypatch.setattr(fleet, name, lambda *words: None)
+    return monkeypatch
+
+
+@pytest.mark.package("flight_cli")
+@pytest.mark.parametrize("words", [["fleet"], ["fly", "osprey_gust", "--in-process"]])
+def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def interrupted(*runs: Path, **options: Any) -> NoReturn:
+        assert all(run.is_dir() for run in runs)
+        raise KeyboardInterrupt
+
+    without_ros.setattr("flight_cli.watch.watched", interrupted)
+    file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fleet"] else []
+    arguments = [*words, *file, "--watch", "--runs", str(tmp_path / "runs")]
+    assert CliRunner().invoke(application([words[0]]), arguments).exit_code == 130
+    assert list((tmp_path / "runs").iterdir()) == []

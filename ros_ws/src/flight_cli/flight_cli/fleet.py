@@ -4,6 +4,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from flight_analysis.report.run_folder import write_empty_summary, write_report
+from flight_analysis.report.run_folder import remove_empty, write_empty_summary, write_report
 from flight_bringup.fleet import Flown, fly_fleet, new_runs, read_fleet
 from flight_cli.output import CLOCK_COLUMNS, NAME_COLUMN, clock, new_table, print_json, progress_bar
 from flight_core.environment import require_ros_environment
@@ -43,6 +44,7 @@ def fleet(
     require_ros_environment()
     chosen = read_fleet(file, duration)
     chosen_runs = new_runs(chosen, runs)
+    context.call_on_close(partial(remove_empty, *chosen_runs))
     if watch:
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need
 

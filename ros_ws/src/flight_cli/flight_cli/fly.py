@@ -3,6 +3,7 @@
 """`rise-di fly`: fly a scenario over topics or in one process, then show its figures."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
-from flight_analysis.report.run_folder import new_run, write_empty_summary, write_report
+from flight_analysis.report.run_folder import new_run, remove_empty, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits, second_stage
 from flight_bringup.scenarios import find_scenario, with_route, written
@@ -100,6 +101,7 @@ def fly(
         print(f"warning: {sentence}", file=sys.stderr)
     learn = _learner(chosen)
     run = new_run(chosen, runs)
+    context.call_on_close(partial(remove_empty, run))
     if files is not None:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:

@@ -53,6 +53,13 @@ def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     raise ParameterError(f"runs: found a hundred runs of this second in {runs}, expected fewer")
 
 
+def remove_empty(*runs: Path) -> None:
+    """Remove the folders of runs without a file: those of flights that were interrupted before they began."""
+    for run in runs:
+        with suppress(OSError):
+            run.rmdir()
+
+
 def attachments_for(
     scenario: Scenario, run: Path, overrides: Mapping[str, ParameterOverrides] | None = None, further: Sequence[Path] = ()
 ) -> LogAttachments:
