@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of fleets: what each aircraft flies, and what is refused."""
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 from xml.etree import ElementTree
@@ -9,7 +11,7 @@ from xml.etree import ElementTree
 import pytest
 from typer.testing import CliRunner
 
-from flight_bringup.fleet import read_fleet
+from flight_bringup.fleet import Fleet, Flown, read_fleet
 from flight_cli import fleet
 from flight_cli.cli import application
 from flight_core.environment import MAX_PARTICIPANTS
@@ -104,3 +106,21 @@ def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros:
     arguments = [*words, *file, "--watch", "--runs", str(tmp_path / "runs")]
     assert CliRunner().invoke(application([words[0]]), arguments).exit_code == 130
     assert list((tmp_path / "runs").iterdir()) == []
+
+
+@pytest.mark.package("flight_cli")
+def test_interrupt_of_reports_shows_what_was_flown(without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[Flown]:
+        return [Flown(member, run, "completed") for member, run in zip(of.members, runs, strict=True)]
+
+    def reported(run: Path, outcome: str) -> NoReturn:
+        raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt
+
+    without_ros.setattr(fleet, "fly_fleet", flown)
+    without_ros.setattr(fleet, "write_report", reported)
+    arguments = ["fleet", str(fleet_file(tmp_path, FLEET_OF_TWO)), "--runs", str(tmp_path / "runs"), "--json"]
+    result = CliRunner().invoke(application(["fleet"]), arguments)
+    assert result.exit_code == 130
+    outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}
+    assert outcomes["one"] == "never flew: no sample"
+    assert outcomes["two"] == "completed, no report: rise-di report writes it"

@@ -4,6 +4,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -59,12 +60,17 @@ def fleet(
         flown = fly_fleet(chosen, chosen_runs, progress)
         for each in flown:
             bar.update(tasks[each.member.name], shown=f"{each.outcome}, report to write")
-        results = {each.member.name: _report(each) for each in flown}
+        reported: dict[str, _Result] = {}
+        with suppress(KeyboardInterrupt):
+            for each in flown:
+                reported[each.member.name] = _report(each)
+    results = {each.member.name: _unreported(each) for each in flown} | reported
     if as_json:
         print_json({name: result.summary for name, result in results.items()})
     else:
         _show(chosen.name, flown, results)
-    statuses = [exit_status(result.summary["outcome"]) for result in results.values()]
+    statuses = [exit_status(result.summary["outcome"]) for result in reported.values()]
+    statuses += [STATUS_INTERRUPTED] if len(reported) < len(flown) else []
     raise typer.Exit(max(statuses, key=SEVEREST.index))
 
 
@@ -73,6 +79,12 @@ class _Result(NamedTuple):
 
     summary: dict[str, Any]
     engaged: float | None
+
+
+def _unreported(flown: Flown) -> _Result:
+    """What is known of an aircraft before its report is written."""
+    outcome = f"{flown.outcome}, no report: rise-di report writes it"
+    return _Result({"outcome": outcome, "duration": None, "ticks": None, "account": None}, None)
 
 
 def _report(flown: Flown) -> _Result:
