@@ -507,6 +507,17 @@ def test_replay_checks_log_of_earlier_version() -> None:
     assert replay_guidance(without(tape, "joining"), scenario.guidance).checked == 0  # a step takes it
 
 
+def test_replay_of_log_without_estimated_heading_leaves_out_steps_that_hold_a_heading() -> None:
+    scenario = calm(2.0, program=program(course=0.5))
+    earlier = without(simulate(scenario), "state.psi")
+    result = replay_guidance(earlier, scenario.guidance)
+    assert (result.steps, result.checked, result.differing) == (101, 51, 0)  # without those before the command at 1 s
+    earlier["guidance"].values[80, -1] += 1.0
+    changed = replay_guidance(earlier, scenario.guidance).first
+    assert changed is not None
+    assert (changed.number, changed.channel) == (81, "u_m.r")
+
+
 def test_replay_leaves_route_that_arrived_in_flight_unchecked() -> None:
     scenario = calm(2.0, route={"north": [0.0, 900.0], "east": [0.0, 0.0], "altitude": [0.0, 0.0]})
     section = calm(2.0).guidance

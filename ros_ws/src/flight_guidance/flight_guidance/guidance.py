@@ -36,8 +36,9 @@ LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
-ADDED = (LINK_AGE,)
-"""Channels of the log that logs of earlier versions lack, and that no step takes."""
+HEADING = "state.psi"
+ADDED = (LINK_AGE, HEADING)
+"""Channels of the log that logs of earlier versions lack, and that no step takes; `Lateral.HEADING` alone takes HEADING."""
 
 
 class GuidanceOutput(NamedTuple):
@@ -98,7 +99,8 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
 
 
 def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> tuple[Inputs, GuidanceState]:
-    """The inputs of a step and the state after the step, from a sample of the log."""
+    """The inputs of a step and the state after the step, from a sample of the log. Without HEADING it is that of the pose."""
+    logged = {HEADING: logged["pose.psi"]} | dict(logged)
 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)

@@ -12,7 +12,7 @@ from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance import guidance, modes
-from flight_guidance.modes import Begin, GuidanceState
+from flight_guidance.modes import Begin, GuidanceState, Lateral
 from flight_guidance.notices import LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route
@@ -51,7 +51,8 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     """Compute every step of the topic `guidance` again, and the published u_m of the instant.
 
     Steps on a route outside the log are not checked, nor steps with the channels of a different version; a log may lack
-    `guidance.ADDED`. Raises ParameterError for a log without the scenario's section of guidance.
+    `guidance.ADDED`; without `guidance.HEADING` the steps that hold a heading are not checked. Raises ParameterError for a log
+    without the scenario's section of guidance.
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
@@ -69,7 +70,8 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     for k, (stamp_ns, row) in enumerate(zip(signal.stamp_ns.tolist(), signal.values, strict=True)):
         inputs, recorded = guidance.restored(stamp_ns, dict(zip(names, row.tolist(), strict=True)), outputs)
         flown = int(row[names.index("route")])
-        if flown in legs and (previous is not None or inputs.begin is Begin.HOLD):
+        without_heading = recorded.lateral is Lateral.HEADING and guidance.HEADING not in names
+        if flown in legs and not without_heading and (previous is not None or inputs.begin is Begin.HOLD):
             checked += 1
             link_age = row[names.index(LINK_AGE)] if LINK_AGE in names else 0.0
             state, commands = modes.step(previous, inputs, legs[flown], params)
