@@ -28,7 +28,7 @@ CAMERA_DISTANCE, GRID_SIZE = 3000.0, 10_000.0  # m
 CHASE_DISTANCE = 15.0  # m, of the camera of RViz behind the aircraft
 
 SPAN = 3.0  # m, of the drawn aircraft
-BOXES = {  # (size, centre) of its parts in spans: forward, left, up. Those of report/scene/scene.js
+BOXES = {  # (size, centre) of its parts in spans: forward, left, up
     "body": ((0.8, 0.08, 0.09), (-0.1, 0.0, 0.0)),
     "wing": ((0.2, 1.0, 0.02), (-0.03, 0.0, 0.01)),
     "tail": ((0.11, 0.36, 0.01), (-0.465, 0.0, 0.01)),
