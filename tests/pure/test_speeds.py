@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rise_di
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.c_export.constants import exportable
@@ -111,6 +112,21 @@ def test_flight_over_speeds_has_no_jump_of_u_and_is_replayed_to_the_bit(schedule
     step = np.abs(np.diff(tape["u"].values, axis=0)).max(axis=0)
     fixed = np.abs(np.diff(simulate(flown.vary(controller=SHIPPED.rise_di()))["u"].values, axis=0)).max(axis=0)
     assert (step < 1.2 * fixed).all()  # noise of the sensors moves u of both
+
+
+@pytest.mark.parametrize("key", ["B", "F"])
+def test_other_models_at_another_speed_leave_u_as_it_is(scheduled: RiseDiConfig, key: str) -> None:
+    """At 1.2 of the trim speed; with B the feedforward starts again, with F the observer."""
+    values, loop, u = scheduled.model_dump(), rise_di.Loop(scheduled), []
+    values["schedule"]["fast"][key] = [0.8 * value for value in values["schedule"]["fast"][key]]
+    for number in range(301):
+        t = 0.01 * number
+        y_m = np.array([0.05 * np.sin(2.0 * t), 0.0, 0.0, 5.0])
+        if number == 300:
+            loop.retune(RiseDiConfig.validate_mapping(values, "controller"))
+        u.append(loop.step(t, y_m + 0.01 * np.sin(3.0 * t + np.arange(4)), y_m))
+    step = np.abs(np.diff(u, axis=0))
+    assert (step[-1] < 1.2 * step[200:-1].max(axis=0)).all()
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ class Controller:
             new.parameters.law,
             "the law and the observer that fly: these change at a restart",
         )
-        self._state = guard.retune(self._state, self._law, new.law, (self._guard.nominal, new.guard.nominal))
+        self._state = guard.retune(self._state, self._law, new.law, (self._guard, new.guard))
         self._law, self._guard, self._digest, self._parameters = new.law, new.guard, new.digest, new.parameters
         self._first_law, self._learned = self._has_first_model(new.parameters), _with_feedforward(new.parameters)
 

@@ -25,7 +25,7 @@ from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
 from rise_di_controller.saturation import Limits, saturate
-from rise_di_controller.schedule import OverSpeed
+from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of the difference more than 20 times.
@@ -198,8 +198,9 @@ def tick(
         held = Measurements(state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u)
         for _ in range(missed):
             law_state = control_law.missed(law_state, held, params)
-    if guard.nominal is not None and ff_state is not None:
-        ff_state, u_ff = feedforward.step(ff_state, reference, dt, _nominal(guard.nominal, guard, law_state))
+    model = _nominal(guard, law_state)
+    if model is not None and ff_state is not None:
+        ff_state, u_ff = feedforward.step(ff_state, reference, dt, model)
         u_trim = u_trim + u_ff
     elif u_ff_recorded is not None:
         u_ff = u_ff_recorded
@@ -223,10 +224,10 @@ def tick(
     return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
 
 
-def _nominal(nominal: Nominal, guard: GuardParams, law: Any) -> Nominal:
-    """The nominal model of the feedforward, at the speed of a schedule if there is one."""
-    if guard.over_speed is None:
-        return nominal
+def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
+    """The nominal model of the feedforward, at the speed of a schedule if there is one; None without a feedforward."""
+    if guard.nominal is None or guard.over_speed is None:
+        return guard.nominal
     there: Nominal = guard.over_speed.of(law.scale)
     return there
 
@@ -254,22 +255,25 @@ def retune(
     state: ControllerState,
     old: TunedLaw,
     new: TunedLaw,
-    nominal: tuple[Nominal | None, Nominal | None] = (None, None),
+    guards: tuple[GuardParams, GuardParams] | None = None,
 ) -> ControllerState:
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
     An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
     the same motion: z is that of the new filter over these ticks, and u_o goes on where an observer acts.
-    Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Arguments:
-    `nominal`, the models of the old and the new feedforward.
+    Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Under a schedule
+    the models are those of its present speed. Arguments: `guards`, old and new, with the models of the feedforward.
     """
     y, y_m = state.y, state.y_m
     if state.law is None or y is None or y_m is None:
         return state
     law = new.control_law.retune(state.law, old.params, new.params)
-    before, after = nominal
+    before, after = (None, None) if guards is None else (_nominal(guard, law) for guard in guards)
     other_nominal = not _same_arrays(before, after)
-    other_model = isinstance(law, (ObserverState, VaneObserverState)) and _is_replaced(old.params, new.params)
+    observing, observers = law, (old.params, new.params)
+    if isinstance(law, ScheduleState):
+        observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
+    other_model = isinstance(observing, (ObserverState, VaneObserverState)) and _is_replaced(*observers)
     if len(state.history) > 1 and isinstance(law, ObserverState) and isinstance(law.law, LawState):
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
@@ -285,10 +289,11 @@ def retune(
             z = observer.estimates_after(state.history, change, new.params)
             law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
         return state._replace(law=law)
-    if other_model and not _same_model(old.params, new.params):
-        z = observer.initial_estimates(y.value - y_m, new.params)
-        state = state._replace(u_trim=state.u_trim + law.u_o)
-        law = law._replace(z=z, u_o=np.zeros_like(law.u_o), sigma=np.zeros_like(law.sigma))
+    if other_model and not _same_model(*observers):
+        z = observer.initial_estimates(y.value - y_m, observers[1])
+        state = state._replace(u_trim=state.u_trim + observing.u_o)
+        started = observing._replace(z=z, u_o=np.zeros_like(observing.u_o), sigma=np.zeros_like(observing.sigma))
+        law = law._replace(law=started) if isinstance(law, ScheduleState) else started
     if other_nominal:
         start = None if after is None else feedforward.initial_state(y_m, after)
         state = state._replace(u_trim=state.u_trim + state.u_ff, u_ff=np.zeros_like(state.u_ff), feedforward=start)

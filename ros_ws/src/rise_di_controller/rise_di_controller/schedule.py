@@ -129,6 +129,11 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
     return nominal._replace(A=A, gravity=gravity, B=B, path_A=path_A, path_gravity=path_gravity, inverse=inverse)
 
 
+def law_at(params: ScheduleParams, scale: Array) -> Any:
+    """Parameters of the extended law with the observer of the airspeed, if there is one; input_scale as at the trim."""
+    return params.law if params.observer is None else params.observer.of(scale)
+
+
 @lru_cache(maxsize=64)
 def with_schedule(law: ControlLaw) -> ControlLaw:
     """A control law with input_scale scheduled over the dynamic pressure:
@@ -147,8 +152,7 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         return params.law._replace(input_scale=params.law.input_scale * scale)
 
     def at(params: ScheduleParams, scale: Array) -> Any:
-        known = params if params.observer is None else params._replace(law=params.observer.of(scale))
-        return scaled(known, scale)
+        return scaled(params._replace(law=law_at(params, scale)), scale)
 
     def followed(state: ScheduleState, y: Array, dt: Array, params: ScheduleParams) -> ScheduleState:
         xp = array_namespace(y)

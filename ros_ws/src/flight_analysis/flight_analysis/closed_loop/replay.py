@@ -252,10 +252,10 @@ class _ParametersInForce:
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
-            law, nominal = self.law, self.limits.nominal
+            law, limits = self.law, self.limits
             self._apply(step)
             if state is not None:
-                state = guard.retune(state, law, self.law, (nominal, self.limits.nominal))
+                state = guard.retune(state, law, self.law, (limits, self.limits))
         return state
 
 
