@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import recorded_response
 from flight_cli.cli import COMMANDS, application
+from flight_core import installation
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_log.tape_reader import read_run
@@ -342,3 +343,10 @@ def test_dataflash_log_with_damaged_format_is_one_sentence(
         read_vehicle_log(path)
     gc.collect()
     assert capsys.readouterr().out == ""
+
+
+def test_package_that_is_missing_is_named_alone(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight)
+    monkeypatch.setattr(installation, "find_spec", lambda name: None)
+    with pytest.raises(ParameterError, match=r"^found no Python package pymavlink, expected it: make autopilot$"):
+        read_vehicle_log(path)

@@ -205,6 +205,8 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     try:
         with redirect_stdout(StringIO()):  # pymavlink and pyulog print that a file is damaged
             log = read(path, kind)
+    except ParameterError:  # of a package that is missing
+        raise
     except Exception as error:  # pymavlink raises Exception itself for a damaged format
         raise ParameterError(f"{path}: found {kind} that cannot be decoded ({error}), expected {EXPECTED}") from None
     require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
