@@ -169,11 +169,11 @@ def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
 
 
 def test_frozen_vane_is_left_out_and_told() -> None:
-    scenario, tape = frozen()
+    _, tape = frozen()
     measures, t = tape["internals"].group("vane_measures"), tape.time("internals")
     assert measures["alpha"][t > 9.0].max() == 0.0  # five time constants later
     assert measures["beta"][t > 3.0].min() == 1.0
-    (event,) = (event for event in events(tape, {}, scenario) if event.name.startswith("vane"))
+    (event,) = (event for event in events(tape, {}) if event.name.startswith("vane"))
     assert event.name == "vane alpha stands still: left out"
     assert event.start > 4.0
     assert vane_notes(tape)[0].startswith("vane alpha stands still from t = ")
@@ -183,7 +183,7 @@ def test_frozen_vane_is_left_out_and_told() -> None:
 def test_vane_of_fresh_engagement_is_not_told_to_stand_still() -> None:
     tape = simulate(SHORT.vary(flight={"duration": 2.0}))
     assert tape["internals"]["vane_measures.alpha"][0] == 0.0  # its motion is measured from 0
-    assert not [event for event in events(tape, {}, SHORT) if event.name.startswith("vane")]
+    assert not [event for event in events(tape, {}) if event.name.startswith("vane")]
 
 
 def test_controller_tells_still_vane_after_the_time_of_its_average() -> None:

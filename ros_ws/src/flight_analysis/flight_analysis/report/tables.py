@@ -84,7 +84,7 @@ class Event(NamedTuple):
 
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
-    """Ticks in which a vane stands still, shape (N,); of `Controller.still_vanes`, from an engagement on as of no vane."""
+    """Ticks in which a vane stands still, shape (N,): from an engagement on once the vane has moved or `time` s have passed."""
     internals, t, tick = tape["internals"], tape.time("internals"), np.arange(len(measures))
     engages = (internals["mode"] == Mode.ENGAGED) & (internals["dt"] == 0.0)
     engaged = np.maximum.accumulate(np.where(engages, tick, 0))
@@ -94,7 +94,11 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
 
 
 def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Event]:
-    """Gusts, modes other than ENGAGED, saturations of the inputs, and still vanes, in order of the start."""
+    """Gusts, modes but ENGAGED, saturations of the inputs, and still vanes, in order of the start.
+
+    The scenario comes from the tape; the tape of a log has no scenario and needs the argument.
+    """
+    flown = scenario if scenario is not None else tape.scenario
     listed = []
     intervals = figures.gust_intervals(tape, gusts) + figures.mode_intervals(tape)
     for label, group in groupby(intervals, key=lambda interval: interval.label):
@@ -110,7 +114,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
                 listed.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
         measures = tape["internals"].group("vane_measures")
-        observer = None if scenario is None else scenario.controller.observer
+        observer = flown.controller.observer if isinstance(flown, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
         for name in measures.names:
             if (still := _stands_still(measures[name], tape, time)).any():
