@@ -118,8 +118,8 @@ class Controller:
     def still_vanes(self) -> tuple[str, ...]:
         """The vanes left out by the observer: still vanes.
 
-        Each engagement measures their motion from 0. Until a vane has moved, or the time of the average has passed, it counts
-        as before.
+        An engagement measures the motion from 0. Until a vane has moved, or the time of the average has passed, the last report
+        holds.
         """
         return tuple(name for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True) if still)
 

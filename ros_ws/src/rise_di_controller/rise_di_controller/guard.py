@@ -225,7 +225,7 @@ def tick(
 
 
 def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
-    """The nominal model of the feedforward, at the speed of a schedule if there is one; None without a feedforward."""
+    """The nominal model of the feedforward, at the speed of a schedule if any; None without a feedforward."""
     if guard.nominal is None or guard.over_speed is None:
         return guard.nominal
     there: Nominal = guard.over_speed.of(law.scale)
@@ -260,9 +260,9 @@ def retune(
     """State for new parameters of the law, without a jump of u (bumpless transfer).
 
     An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
-    the same motion: z is that of the new filter over these ticks, and u_o goes on where an observer acts.
-    Without one they start again: the observer from the present error, and u_o and u_ff become part of u_trim. Under a schedule
-    the models are those of its present speed. Arguments: `guards`, old and new, with the models of the feedforward.
+    the same motion: z comes from the new filter over these ticks, and u_o goes on where an observer acts. Without a history the
+    observer starts again from the present error, and u_o and u_ff become part of u_trim. A schedule has the models of the
+    present speed. Arguments: `guards`, old and new, with the models of the feedforward.
     """
     y, y_m = state.y, state.y_m
     if state.law is None or y is None or y_m is None:

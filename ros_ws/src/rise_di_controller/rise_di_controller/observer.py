@@ -91,8 +91,8 @@ def estimates_after(history: tuple[PastTick, ...], change: Array, params: Observ
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
-    So the filter knows what the law held, which takes longer than the record to estimate. A tick without a y has no
-    correction. The products with e and u are those of all ticks together, which takes a third of the time. Arguments: `history`
+    So the filter knows what the law held: to estimate it takes longer than the record. A tick without a y has no
+    correction. The products with e and u are taken of the whole record at once, in a third of the time. Arguments: `history`
     with a y at least; `change` of the feedforward since then, (m,).
     """
     known = np.array([tick.e is not None for tick in history])

@@ -161,7 +161,7 @@ class RiseDiConfig(ControllerConfig):
         require(not self.vanes, "observer.vanes", "a schedule beside them", "none: they read the model of the trim speed")
 
     def checks(self) -> Iterator[None]:
-        """Beside models at other speeds: of the controller at the trim speed, at these speeds, and halfway to each of them."""
+        """Beside models at two more speeds: of the controller at the trim speed, at these speeds, and halfway to either."""
         if self.schedule is None or not self.schedule.models:
             yield from super().checks()
             return
@@ -190,7 +190,7 @@ class RiseDiConfig(ControllerConfig):
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
     def _with_models(self, there: SpeedConfig) -> Self:
-        """The parameters with the models of another speed in place of those of the trim speed, and no schedule."""
+        """The parameters with the models of `there` in place of the models of the trim speed, and no schedule."""
         sections: dict[str, Any] = {"schedule": None}
         for key, names in (("feedforward", ("A", "B", "gravity")), ("observer", ("Phi", "Gamma", "L", "F"))):
             sections[key] = getattr(self, key).model_copy(update={name: getattr(there, name) for name in names})
@@ -204,7 +204,7 @@ class RiseDiConfig(ControllerConfig):
         matrices: Callable[["RiseDiConfig", FloatArray], FloatArray],
         model: Callable[[FloatArray, FloatArray], Any],
     ) -> OverSpeed | None:
-        """A model of the matrices of these parameters, and of those with the sections of the other speeds."""
+        """A model of the matrices at the trim speed and at the speeds of the schedule."""
         if self.schedule is None or not self.schedule.models:
             return None
         airspeed, (slow, fast) = self._airspeed(), self.schedule.models

@@ -141,8 +141,8 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
         scale += min(dt / time, 1) (target_scale(y) - scale)
         the law is retuned to input_scale scale (bumpless transfer), then takes the step
 
-    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An observer keeps its
-    estimates, which have the same meaning at every speed, and u_o goes on to -F z at its own rate.
+    The retuning keeps u: the schedule acts on u_dot alone. Engagement starts at target_scale(y). An observer keeps the
+    estimates, of the same meaning at every speed, and u_o goes on to -F z at its own rate.
     """  # noqa: D400, D415 - what follows is an equation
 
     def scaled(params: ScheduleParams, scale: Array) -> Any:

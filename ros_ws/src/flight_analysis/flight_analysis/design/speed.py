@@ -28,7 +28,7 @@ EXPONENTS: Mapping[str, Mapping[str, float]] = {
 }
 """Exponents of the ratio of airspeeds in the entries of A, by the kinds of row and column.
 
-In level flight lift is weight at each speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about the trim, so A[alpha,V] is
+In level flight lift is weight at any speed: alpha_dot = q - L / (m V) + g / V with L of V^2 about the trim, so A[alpha,V] is
 -2 g / V^2.
 """
 
