@@ -342,6 +342,15 @@ class ArduPlane(Autopilot):
             )
         )
 
+    @contextmanager
+    def without_transmitter(self) -> Iterator[None]:
+        """The transmitter is lost."""
+        self.say("param", "SIM_RC_FAIL", "1")
+        try:
+            yield
+        finally:
+            self.say("param", "SIM_RC_FAIL", "0")
+
     def hand_over(self) -> None:
         """Change to MANUAL with the sticks where the servos are, so that the aircraft stays in trim."""
         self.say("sticks_from_servos")

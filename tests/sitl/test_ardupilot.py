@@ -263,14 +263,11 @@ def test_max_engaged_ends_an_engagement_without_transmitter(plane: ArduPlane) ->
     channel_map = plane.patient_map("ardupilot", ("max_engaged: 120.0", f"max_engaged: {bound}"))
     with plane.engaged(SCENARIO.path, channel_map, 60.0) as flight:
         assert "the loss of the transmitter cannot be seen over this link" in flight.output
-        plane.say("param", "SIM_RC_FAIL", "1")
-        try:
+        with plane.without_transmitter():
             flight.wait_for("max_engaged releases in 10 s")
             assert plane.state()["mode"] == "MANUAL"
             flight.wait_for("RELEASE")
             plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
-        finally:
-            plane.say("param", "SIM_RC_FAIL", "0")
         flight.interrupt()
         flight.end()
     (engagement,) = plane.summary()["engagements"]

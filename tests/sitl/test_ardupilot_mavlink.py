@@ -152,13 +152,12 @@ def test_transmitter_lost_before_an_engagement_refuses_it_by_the_mode(plane: Ard
     try:
         flight.wait_for("DISENGAGED")
         plane.hand_over()
-        plane.say("param", "SIM_RC_FAIL", "1")
-        plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
-        refused = plane.engage()
-        assert refused.end() != 0
+        with plane.without_transmitter():
+            plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
+            refused = plane.engage()
+            assert refused.end() != 0
         assert "the mode is not MANUAL" in refused.output
     finally:
-        plane.say("param", "SIM_RC_FAIL", "0")
         flight.interrupt()
         flight.end()
         plane.level()
@@ -169,12 +168,9 @@ def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPla
     bound = 20.0
     with engaged(plane, 60.0, ("max_engaged: 120.0", f"max_engaged: {bound}")) as flight:
         assert "the loss of the transmitter cannot be seen over this link" in flight.output
-        plane.say("param", "SIM_RC_FAIL", "1")
-        try:
+        with plane.without_transmitter():
             flight.wait_for("RELEASE")
             plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
-        finally:
-            plane.say("param", "SIM_RC_FAIL", "0")
         flight.interrupt()
         flight.end()
     (engagement,) = plane.summary()["engagements"]
