@@ -245,6 +245,11 @@ def test_mission_that_fleet_cannot_fly_refused(sentence: str) -> None:
         define(CORNER.vary(**REFUSED_MISSIONS[sentence]), 2, 0.3, 7, 2)
 
 
+def test_score_of_missions_has_no_units() -> None:
+    with pytest.raises(ParameterError, match=r"^score: found a unit, expected none: the score of a mission"):
+        define(CORNER, 2, 0.3, 7, 2, units={"q": 0.02})
+
+
 def test_missions_need_route_and_airframe_with_matrices() -> None:
     program = ROUTE.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
     with pytest.raises(ParameterError, match=r"guidance.route: found none, expected a route"):

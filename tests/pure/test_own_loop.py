@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller in a loop of the user's own and in python-control, and the aircraft as an environment of gymnasium."""
 
+from collections.abc import Callable
 from typing import Any
 
 import control
@@ -210,6 +211,35 @@ def test_diverged_aircraft_terminates_episode(monkeypatch: pytest.MonkeyPatch) -
     assert reward == pytest.approx(-10.0 * (3.0 - 0.01))  # the score of a loss of track for the seconds from the last tick on
     with pytest.raises(rise_di.ParameterError, match="expected reset"):
         env.step(u)
+
+
+@pytest.mark.parametrize("make", [rise_di.FlightEnv, lambda scenario: rise_di.FlightVectorEnv(scenario, 2)])
+def test_environment_without_episode_and_text_refused(make: Callable[[rise_di.Scenario], Any]) -> None:
+    environment = make(SCENARIO)
+    uses: tuple[Callable[[], Any], ...] = (lambda: environment.t, lambda: environment.step(environment.action_space.sample()))
+    for use in uses:
+        with pytest.raises(rise_di.ParameterError, match=r"expected reset\(\) first"):
+            use()
+    environment.reset(seed=1)
+    with pytest.raises(rise_di.ParameterError, match="action: found 'x', expected finite numbers"):
+        environment.step("x")
+
+
+def test_environments_draw_entries_of_scenario() -> None:
+    """An entry at one of its limits: after the same thrust, V is that of 10 % or of 190 % of the effect."""
+    own = SCENARIO.vary(aircraft={"uncertainty": {"entries": ["B[V,thrust]"], "parts": [0.9], "distribution": "corners"}})
+    calm = own.vary(aircraft={"sensors": {}})
+    u, place = 0.1 * np.eye(M)[CONTROLLER.inputs.index("thrust")], CONTROLLER.outputs.index("V")
+    flights, alone = rise_di.FlightVectorEnv(calm, 8, uncertainty=0.0), rise_di.FlightEnv(calm, uncertainty=0.0)
+    flights.reset(seed=1)
+    together = [flights.step(np.tile(u, (8, 1)))[0] for _ in range(50)][-1][:, place]
+    one_by_one = []
+    for seed in range(8):
+        alone.reset(seed=seed)
+        one_by_one.append([alone.step(u)[0][place] for _ in range(50)][-1])
+    for V in (together, np.array(one_by_one)):
+        assert len(np.unique(V.round(6))) == 2
+        assert V.max() == pytest.approx(19.0 * V.min(), rel=0.1)
 
 
 def test_vector_environment_flies_as_environments_one_by_one() -> None:

@@ -388,6 +388,14 @@ SENTENCES: dict[str, tuple[Callable[..., Any], str]] = {
         lambda: api.fly_campaign(scenario, 2, sweep={"beta": 1}),
         "sweep.factors: found 1, expected a ",
     ),
+    "a text as a unit": (
+        lambda: api.fly_campaign(scenario, 2, score={"q": "x"}),
+        "score.q: found 'x', expected ",
+    ),
+    "entries as a list": (
+        lambda: api.fly_campaign(scenario, 2, entries=["A[q,q]"]),
+        "entries: found ['A[q,q]'], expected numbers by name",
+    ),
     "no threads": (lambda: api.fly_campaign(scenario, 2, workers=0), "workers: found 0, expected an integer of "),
     "missing campaign": (lambda: api.resume_campaign("nope"), "nope: found no campaign "),
     "text as matrix": (lambda: api.decompose("x"), "Omega: found 'x', expected a matrix of numbers, (m, m)"),

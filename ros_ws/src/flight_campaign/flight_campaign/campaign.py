@@ -174,6 +174,7 @@ def define(
     for name, unit in own.items():
         require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
         require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
+    require(scenario.guidance is None or not own, "score", "a unit", "none: the score of a mission is its cross-track error")
     if scenario.guidance is None:
         score_units(outputs, scenario.aircraft.channels().outputs, own)
     if not scenario.aircraft.is_jsbsim:

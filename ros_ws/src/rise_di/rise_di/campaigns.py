@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Monte Carlo campaigns, as `rise-di campaign` flies them with the threads of this process."""
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,7 +16,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNK, Campaign, Sweep, define
 from flight_campaign.campaign_report import write_results
-from flight_core.arguments import FilePath, as_count, as_path
+from flight_core.arguments import FilePath, as_count, as_number, as_path
 from flight_core.parameters import ParameterError, require
 
 if TYPE_CHECKING:
@@ -80,10 +81,11 @@ def fly_campaign(
     chosen = find_scenario(scenario, duration)
     spread = chosen.aircraft.uncertainty.spread()
     if entries is not None:
-        spread = spread._replace(entries=dict(entries))
+        spread = spread._replace(entries=_numbers(entries, "entries", '{"A[q,alpha]": 0.6}'))
     if distribution is not None:
         spread = spread._replace(distribution=distribution)
-    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, score)
+    units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
+    definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units)
     flies, report = _threads(workers), _progress(progress)
     folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
     return _fly(Campaign.begin(folder, definition), flies, report)
@@ -101,6 +103,13 @@ def _threads(workers: int | None) -> engines.Engine:
 def _progress(progress: Progress | None) -> Progress:
     require(progress is None or callable(progress), "progress", progress, "a function of the flights so far and of all flights")
     return progress or (lambda flown, total: None)
+
+
+def _numbers(values: Mapping[str, float], key: str, example: str) -> dict[str, float]:
+    """Numbers by name. Raises ParameterError for another value."""
+    if not isinstance(values, Mapping):
+        raise ParameterError(f"{key}: found {values!r}, expected numbers by name, as in {example}")
+    return {str(name): as_number(value, f"{key}.{name}", -math.inf) for name, value in values.items()}
 
 
 def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:

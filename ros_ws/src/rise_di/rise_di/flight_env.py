@@ -5,7 +5,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
@@ -18,7 +18,7 @@ from flight_core.installation import require_package
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import nanoseconds
-from flight_core.vectors import FloatArray, select
+from flight_core.vectors import FloatArray, as_array, select
 from reference_model.reference import Reference
 
 require_package("gymnasium")
@@ -50,6 +50,14 @@ def _channels(scenario: Scenario) -> _Channels:
     )
 
 
+def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Inputs of a step. Raises ParameterError for another shape, and for values that are not finite numbers."""
+    expected = f"finite numbers of shape {shape}"
+    u = as_array(values, "action", expected)
+    require(u.shape == shape and bool(np.isfinite(u).all()), "action", f"shape {u.shape}", expected)
+    return u
+
+
 class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     """Simulator and reference model of a scenario; the agent gives u.
 
@@ -61,7 +69,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     Args:
         scenario: The aircraft, the reference model, and rate, channels and limits of the controller. Guidance is left out.
-        uncertainty: Every reset draws noise, turbulence, and an aircraft whose A and B are off by up to this fraction, 0 to 1.
+        uncertainty: Every reset draws noise, turbulence, and an aircraft whose A and B are off by up to this fraction, 0 to 1,
+            with the entries and the distribution of `aircraft.uncertainty`.
             None: every episode has the aircraft, the noise and the turbulence of the scenario.
 
     Raises ParameterError without gymnasium, for an aircraft of JSBSim with an uncertainty, and for an output without a score.
@@ -77,13 +86,14 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.outputs, self.inputs = controller.outputs, controller.effectors
         self.action_space, self.observation_space, self._units = _channels(scenario)
         self._period = 1.0 / controller.rate
-        self._k = self._ticks = nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
+        self._k, self._ticks = -1, nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
         self._samples = round(scenario.aircraft.rate / controller.rate)
         self._references = round(scenario.reference_model.rate / controller.rate)
 
     @property
     def t(self) -> float:
-        """Time of the present observation, s."""
+        """Time of the present observation, s. Raises ParameterError before the first episode."""
+        require(self._k >= 0, "t", "no episode", "reset() first")
         return self._k * self._period
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
@@ -96,11 +106,12 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         return self._observed(), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """Hold u for a period. Raises ParameterError after the end, and ChannelError for an action that is not finite."""
-        require(self._k < self._ticks, "step", "a step after the end of the flight", "reset() first")
+        """Hold u for a period. Raises ParameterError outside an episode, and for an action that is not m finite numbers."""
+        require(0 <= self._k < self._ticks, "step", "a step outside an episode", "reset() first")
+        u = _actions(action, (len(self.inputs),))
         self._k += 1
         try:
-            self._advance(np.asarray(action, dtype=np.float64))
+            self._advance(u)
         except FlightEnded as error:
             left = (self._ticks - self._k + 1) * self._period
             self._k = self._ticks
@@ -115,8 +126,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             return self.scenario
         number, seed = (int(value) for value in self.np_random.integers(0, 2**31, 2))
         aircraft: dict[str, Any] = {"sensors": self.scenario.aircraft.sensors.model_dump() | {"seed": seed}}
-        if self._uncertainty:
-            aircraft["uncertainty"] = {"A": self._uncertainty, "B": self._uncertainty, "number": number}
+        if not self.scenario.aircraft.is_jsbsim:
+            drawn = {"A": self._uncertainty, "B": self._uncertainty, "number": number}
+            aircraft["uncertainty"] = self.scenario.aircraft.uncertainty.model_dump() | drawn
         if self.scenario.aircraft.turbulence is not None:
             aircraft["turbulence"] = self.scenario.aircraft.turbulence.model_dump() | {"seed": seed}
         return self.scenario.vary(aircraft=aircraft)
@@ -166,8 +178,9 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
 
     @property
     def t(self) -> float:
-        """Time of the present observations, s."""
-        return self._flights.t
+        """Time of the present observations, s. Raises ParameterError before the first episode."""
+        require(self._last > 0, "t", "no episode", "reset() first")
+        return self._k * self._course.period
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
         """N new aircraft in trim at t = 0. A seed repeats them. Raises ParameterError for a list of seeds."""
@@ -177,9 +190,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         """Hold u for a period, (N, m). Raises ParameterError for another shape, and for an action that is not finite."""
-        u = np.asarray(actions, dtype=np.float64)
-        shape = (self.num_envs, len(self._units))
-        require(u.shape == shape and bool(np.isfinite(u).all()), "actions", f"shape {u.shape}", f"finite, of shape {shape}")
+        u = _actions(actions, (self.num_envs, len(self._units)))
         require(self._last > 0, "step", "a step before an episode", "reset() first")
         none = np.zeros(self.num_envs, dtype=bool)
         if self._last == self._k:
@@ -202,7 +213,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         """Draw N aircraft."""
         aircraft, part = self.scenario.aircraft, self._uncertainty
         airframe, seed = load_airframe(aircraft.airframe), int(self.np_random.integers(0, 2**31))
-        A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs)
+        A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread())
         directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
         drawn = self._fleet.assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
         self._flights = self._fleet.Stepper(drawn, self._vehicle, self._course)
