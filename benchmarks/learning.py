@@ -123,6 +123,7 @@ class Row(NamedTuple):
     identification: float = 0.0  # s of a core, the longest
     replayed: int = 0
     events: str = ""
+    revision: str = ""  # of the code that flew
 
 
 class Timed:
@@ -358,6 +359,11 @@ def alarms(name: str, cell: Cell, number: int) -> Row:
 FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
 
 
+def count(name: str, aircraft: int) -> int:
+    """The number of aircraft in a cell."""
+    return math.ceil(CELLS[name].share * aircraft)
+
+
 def flown_rows(names: Sequence[str], number: int) -> list[Row]:
     """The rows of an aircraft in some cells."""
     return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
@@ -367,13 +373,14 @@ def flown_rows(names: Sequence[str], number: int) -> list[Row]:
 
 
 def read(path: Path) -> list[Row]:
-    """The rows of a file of results."""
+    """The rows of a file of results; none of a file with other columns, which an earlier version wrote."""
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as stream:
-        return [
-            Row(*(kind(value) for kind, value in zip(KINDS, line.values(), strict=True))) for line in csv.DictReader(stream)
-        ]
+        lines = csv.DictReader(stream)
+        if tuple(lines.fieldnames or ()) != Row._fields:
+            return []
+        return [Row(*(kind(value) for kind, value in zip(KINDS, line.values(), strict=True))) for line in lines]
 
 
 KINDS = tuple(Row.__annotations__.values())
@@ -417,13 +424,16 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
 
 
 def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
-    """Mean and largest score of each."""
+    """Lost flights, and mean and largest score of the flights to the end, of each."""
     for key, label in LABELS.items():
         values = np.array([getattr(each, key) for each in chosen])
-        values = values[np.isfinite(values)]
-        if len(values):
-            yield row(f"{name}: score, {label}", float(np.mean(values)))
-            yield row(f"{name}: largest score, {label}", float(np.max(values)))
+        flown, whole = values[~np.isnan(values)], values[np.isfinite(values)]
+        if len(flown):
+            lost = float(len(flown) - len(whole))
+            yield row(f"{name}: lost, {label}", lost, at_most=0.0 if key == "learner" else None)
+        if len(whole):
+            yield row(f"{name}: score, {label}", float(np.mean(whole)))
+            yield row(f"{name}: largest score, {label}", float(np.max(whole)))
 
 
 def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
@@ -492,22 +502,27 @@ def main(
     results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
     jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
 ) -> None:
-    """Fly the aircraft that are missing in the results, and write the figures and the picture."""
-    rows, begun = read(results), evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
+    """Fly the aircraft that are missing in the results, and write the figures and the picture.
+
+    Rows of another revision are flown again.
+    """
+    begun = evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
+    rows = [each for each in read(results) if each.revision == begun.revision]
     known = {(each.cell, each.number) for each in rows}
     # aircraft by aircraft, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
     for n in range(aircraft):
         for name in cell:
-            if n < math.ceil(CELLS[name].share * aircraft) and (name, n) not in known:
+            if n < count(name, aircraft) and (name, n) not in known:
                 # what flies beside is the same in all cells of an uncertainty
                 shared = "" if CELLS[name].kind == "learn" else name
                 cases.setdefault((n, CELLS[name].uncertainty, shared), []).append(name)
     with ProcessPoolExecutor(jobs) as pool:
         pending = [pool.submit(flown_rows, names, n) for (n, _, _), names in cases.items()]
         for future in track(as_completed(pending), "aircraft", total=len(pending)):
-            rows += future.result()
+            rows += [each._replace(revision=begun.revision) for each in future.result()]
             write(results, rows)
+    rows = [each for each in rows if each.number < count(each.cell, aircraft)]
     found = list(figures(rows))
     for each in found:
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
