@@ -480,12 +480,17 @@ class Flight:
         """The longest host scheduling delay of a process between two instants, s: it was ready, and waited for a processor.
 
         As Linux counts it (proc_pid_schedstat), for all threads of a process together. It is at least the time without a
-        sample of it, in which the probe itself waited.
+        sample of it, in which the probe itself waited. It is also at least the time without a message of any node. The nodes
+        are processes of their own: all pause at once where the host of a virtual machine withholds its processors, which Linux
+        in that machine does not count, or where the middleware of the probe waits.
         """
         end += 2.0 * DELAY_PERIOD
         samples = [(at, delay) for at, delay in list(self.probe.delays) if begin - 2.0 * DELAY_PERIOD <= at <= end]
         gaps = np.diff([at for at, _ in samples]) - 2.0 * DELAY_PERIOD
-        return float(max([0.0, *gaps, *(delay for at, delay in samples if at >= begin)]))
+        topics = {topic for published in PUBLISHED.values() for topic in published}
+        arrivals = (arrival.at for topic in topics for arrival in self.probe.since(topic, begin, end))
+        silences = np.diff(sorted([begin, *arrivals])) - 2.0 * TICK
+        return float(max([0.0, *gaps, *silences, *(delay for at, delay in samples if at >= begin)]))
 
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
         """When a node first logged a line that matches the pattern."""
