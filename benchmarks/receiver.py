@@ -20,6 +20,9 @@ from flight_ros.topics import NEWEST_SAMPLES, Y
 from rise_di_controller.controller import Controller
 
 RIGHT = "right message, taken"
+DECODED = "message under the name of the publisher, twice as long, decoded and refused"
+AT_MOST = {DECODED: 6.0}
+"""Times of a refused message over that of a right one; 2 of those that are not here, which are not decoded."""
 REPEATS, WARM_UP = 20_000, 200
 OWN, FOREIGN = "/aircraft#1", "/foreign#2"
 TAKEOVER_NS = 10**15  # no publisher times out
@@ -35,11 +38,14 @@ def measure() -> dict[str, FloatArray]:
     """Times of one message each, ns, of a right message and of refused ones."""
     parameters = find_scenario("osprey_gust").controller
     controller, encoder = Controller(parameters), Encoder(parameters.outputs, OWN)
+    right = encoder.encode(0, np.zeros(4))
     refused = {
+        DECODED: right + bytes(len(right)),
         "message of a conflicting publisher, refused": Encoder(parameters.outputs, FOREIGN).encode(0, np.zeros(4)),
         f"message of a conflicting publisher of {MAX_SIZE} bytes, refused": long_message(FOREIGN, MAX_SIZE),
         "message of a conflicting publisher of 1.2 MB, refused": long_message(FOREIGN, 1_200_000),
         "message under the name of the publisher of 1.2 MB, refused": long_message(OWN, 1_200_000),
+        f"message under the name of the publisher of {MAX_SIZE} bytes, refused": long_message(OWN, MAX_SIZE),
     }
     took = {name: np.empty(REPEATS) for name in (RIGHT, *refused)}
     with open_node("receiver") as node:

@@ -188,7 +188,8 @@ def law_rows() -> Iterator[Row]:
 def receiver_rows() -> Iterator[Row]:
     """A message of y that has arrived: a right one, and refused ones of any size."""
     for name, times in receiver.measure().items():
-        goals = () if name == receiver.RIGHT else (Goal("p50 (us)", 2.0, of_floor=True),)
+        at_most = receiver.AT_MOST.get(name, 2.0)
+        goals = () if name == receiver.RIGHT else (Goal("p50 (us)", at_most, of_floor=True),)
         yield Row(name, us(times), receiver.RIGHT, goals)
 
 

@@ -117,6 +117,21 @@ def test_long_message_is_not_decoded(size: int, sender: str) -> None:
     ]  # one line, for it is the same topic and reason
 
 
+def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
+    """The longer, the dearer: 16 kB cost 22 times a right message. A publisher that timed out may have other channels."""
+    setup = Setup()
+    right, longer = message(), message(names=(*NAMES, "alpha"))
+    too_long = longer + bytes(len(longer) + 1)
+    assert setup.poll(right, longer, right, too_long, of_size(MAX_SIZE)) == [True, True, True, False, False]
+    assert len(setup.decoded) == 3
+    assert setup.refusals.counts == {"y: size": 2}
+    assert setup.topic.lines[0][1].endswith(f"bytes, expected at most {2 * len(longer)}")
+    assert setup.poll(too_long[:-1]) == [True]
+    wide = message(names=(*NAMES, *(f"c{k}" for k in range(40))))
+    assert setup.poll(wide, now_ns=MAX_AGE) == [False]
+    assert setup.poll(wide, now_ns=MAX_AGE + 1) == [True]
+
+
 def test_size_limit_is_inclusive() -> None:
     require_size(bytes(MAX_SIZE))
     with pytest.raises(ChannelError, match=f"a message of {MAX_SIZE + 1} bytes"):

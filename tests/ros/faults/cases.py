@@ -396,14 +396,20 @@ def wrong_names(names: Names, random: Generator) -> BadSample:
 
 
 def wrong_length(names: Names, random: Generator) -> BadSample:
-    length = random.choice((0, 1, len(names) - 1, len(names) + 1, 1000))
+    length = random.choice((0, 1, len(names) - 1, len(names) + 1, 2 * len(names)))
     return 0.0, names, random.uniform(-1.0, 1.0, length)
+
+
+def too_long(names: Names, random: Generator) -> BadSample:
+    channels = (*names, *(f"c{k:05}" for k in range(random.integers(20, 800))))  # 800 have 16 kB
+    return 0.0, channels, random.uniform(-1.0, 1.0, len(channels))
 
 
 def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
     return sign * 10.0 ** random.uniform(0.0, 8.0), names, random.uniform(-1.0, 1.0, len(names))
 
 
+LONG = "long messages"
 BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line
     "NaN": (partial(not_finite, (math.nan,)), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
@@ -411,6 +417,7 @@ BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # 
     "past stamps": (partial(wrong_stamp, -1.0), "old", "stamp [^ ]+ s old"),
     "future stamps": (partial(wrong_stamp, 1.0), "future", "ahead of the clock"),
     "Inf": (partial(not_finite, (-math.inf, math.inf)), "finite", "is not finite"),
+    LONG: (too_long, "size", "a message of"),
 }
 BAD_COUNT = 20
 EVERYWHERE = ("NaN", "past stamps")  # injected on each topic in the suite, the others on y alone: nodes share the check
@@ -668,7 +675,7 @@ CASES = (
             malformed(topic, kind),
             logs(CONSUMERS[topic], refusal(topic, BAD[kind][2])),
             needs=ends_of(topic),
-            in_suite=topic == "y" or kind in EVERYWHERE,
+            in_suite=kind in EVERYWHERE or (topic == "y" and kind != LONG),
         )
         for topic in NAMES
         for kind in BAD

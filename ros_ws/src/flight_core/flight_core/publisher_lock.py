@@ -42,6 +42,10 @@ class PublisherLock:
         """Whether there is no publisher, or the last sample is older than the age limit."""
         return self.publisher is None or self.age_ns(now_ns) > max_age_ns
 
+    def holds(self, sender: str, now_ns: int) -> bool:
+        """Whether this is the locked publisher, whose last sample is within the age limit of a restart."""
+        return sender == self.publisher and not self.timed_out(now_ns, self._timeouts_ns()[0])
+
     def overran(self, duration_ns: int) -> None:
         """Leave a time out of the publisher's silence: the node itself did not run."""
         self._overrun_ns += duration_ns

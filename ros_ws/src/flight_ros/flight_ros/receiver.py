@@ -18,6 +18,9 @@ from flight_ros.throttle import Throttle
 from flight_ros.topics import Topic
 
 LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one topic and reason
+GROWTH = 2
+"""Size of a message over that of the longest valid one. A publisher may leave channels out, as a bridge those of a pose that
+are not fresh: three of seven channels have half of the bytes."""
 
 
 class Sample(Protocol):
@@ -89,7 +92,8 @@ class Receiver(Generic[S]):
     """The samples of one topic. Checks go from cheap to costly: size, publisher, content, stamp.
 
     A message that is too long, or of a conflicting publisher, is refused without decoding names and values: a flood of these
-    messages costs no more than as many right ones. `decode` returns None for a vector without channels. `take` gets a sample
+    messages costs no more than as many right ones. Under the name of the locked publisher, too long is GROWTH times its longest
+    valid message, until the publisher times out. `decode` returns None for a vector without channels. `take` gets a sample
     and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
     the lead over the clock; None is for a sender without the clock of the flight. `max_size` is in bytes. Refusals are raised
     as ChannelError.
@@ -108,6 +112,7 @@ class Receiver(Generic[S]):
     ) -> None:
         self.subscription, self.lock = subscription, lock
         self._max_size = max_size
+        self._longest = 0  # bytes, of the valid messages
         self._refusals, self._decode, self._take = refusals, decode, take
         self._max_age_ns = max_age_ns
 
@@ -128,8 +133,11 @@ class Receiver(Generic[S]):
                 if (sender := sender_of(raw)) is None:
                     raise ChannelError("malformed", "a message without a header in plain CDR")
                 self.lock.check(sender, now_ns)
+                if len(raw) > GROWTH * self._longest and self.lock.holds(sender, now_ns):
+                    require_size(raw, GROWTH * self._longest)
             if (sample := self._decode(raw)) is not None:
                 self._accept(sample, now_ns)
+                self._longest = max(self._longest, len(raw))
         except ChannelError as error:
             self._refusals.add(self.subscription, error.reason, str(error))
             return False
