@@ -145,10 +145,11 @@ def plan(items: list[dict[str, Any]], home: Any = (47.4, 8.5, 400.0), **more: An
 
 
 def wpl(*rows: tuple[float, ...]) -> str:
-    """Rows of frame, command, latitude, longitude, altitude and perhaps the first parameter, after the home at 400 m."""
-    lines = [(*row, 0.0)[:6] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
+    """Rows of frame, command, latitude, longitude, altitude, perhaps the first two parameters, after the home at 400 m."""
+    lines = [(*row, 0.0, 0.0)[:7] for row in [(0, 16, 47.4, 8.5, 400.0), *rows]]
     texts = [
-        f"{k}\t0\t{frame}\t{command}\t{p}\t0\t0\t0\t{a}\t{b}\t{c}\t1" for k, (frame, command, a, b, c, p) in enumerate(lines)
+        f"{k}\t0\t{frame}\t{command}\t{p}\t{q}\t0\t0\t{a}\t{b}\t{c}\t1"
+        for k, (frame, command, a, b, c, p, q) in enumerate(lines)
     ]
     return "\r\n".join(["QGC WPL 110", *texts, ""])
 
@@ -252,7 +253,68 @@ def test_loiters_of_mission_are_flown_and_further_items_named(tmp_path: Path) ->
         *((50.0, 50.0, 0.0), (50.0, 90.0, 0.0), (90.0, 90.0, 2.0), (90.0, 90.0, 0.0))
     ]
     # A loiter without end is the last orbit.
-    assert route.notes == ("not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)",)
+    home = "item 0 is the home, at 47.4,8.5, and no waypoint"
+    assert route.notes == (home, "not flown: NAV_TAKEOFF (item 1), DO_JUMP (item 5), NAV_WAYPOINT (item 7)")
+
+
+WPL_FENCE = [
+    *((3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))),  # of three corners
+    *((3, 5004, 47.41, 8.51, 0.0, 200.0), (3, 5100, 47.401, 8.5, 40.0)),
+]
+A, B, C, D = ((3, 16, 47.4 + 0.01 * k, 8.52, 50.0) for k in range(4))
+
+
+def jump(item: int, count: int) -> tuple[float, ...]:
+    """A row of DO_JUMP: the first parameter is the item, the second how often."""
+    return (2, 177, 0.0, 0.0, 0.0, item, count)
+
+
+@pytest.mark.parametrize(
+    ("rows", "places", "skipped"),
+    [
+        ((A, B, jump(1, 2), C), "ABABABC", ""),  # so often again (MAVLink, MAV_CMD_DO_JUMP)
+        ((A, jump(4, -1), B, C), "AC", "NAV_WAYPOINT (item 3)"),
+        ((A, B, jump(1, -1), C), "AB", "DO_JUMP (item 3), NAV_WAYPOINT (item 4)"),
+        ((A, B, (3, 20, 0.0, 0.0, 0.0), C), "AB", "NAV_RETURN_TO_LAUNCH (item 3), NAV_WAYPOINT (item 4)"),
+        ((A, B, (3, 21, 47.43, 8.52, 0.0), C), "AB", "NAV_LAND (item 3), NAV_WAYPOINT (item 4)"),
+        ((A, B, (3, 17, 0.0, 0.0, 0.0), C), "AB", "NAV_WAYPOINT (item 4)"),  # loiters where the aircraft is
+    ],
+)
+def test_mission_is_flown_in_the_order_of_an_autopilot(rows: Any, places: str, skipped: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.waypoints"
+    path.write_text(wpl(*rows), encoding="utf-8")
+    route = read_route_file(path, ZURICH)
+    names = {local(row[2], row[3], ZURICH): name for row, name in zip((A, B, C, D), "ABCD", strict=True)}
+    assert "".join(names[waypoint.point] for waypoint in route.waypoints) == places
+    assert route.notes[1:] == ((f"not flown: {skipped}",) if skipped else ())
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        ((A, B, jump(9, 1)), r"DO_JUMP \(item 3\) to 9.0, expected a jump to an item"),
+        ((A, B, jump(1, 1), jump(1, 1)), r"DO_JUMP \(item 3\), a loop inside of a loop"),
+        ((A, B, jump(1, 30000)), "more than 20000 items by the repetitions"),
+        ((A, (3, 36, 47.41, 8.52, 50.0), C), r"NAV_ARC_WAYPOINT \(item 2\), expected waypoints and loiters"),
+        (WPL_FENCE[:3], r"no position; .*not flown: NAV_FENCE_POLYGON_VERTEX_INCLUSION \(item 1\)"),
+    ],
+)
+def test_mission_that_is_no_route_is_refused_by_item(rows: Any, sentence: str, tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        flown(tmp_path / "r.waypoints", wpl(*rows))
+
+
+def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
+    """A survey takes an id for each of its items, so that positions in the list and ids differ."""
+    items = [survey([{**mission_item(47.4 + 0.01 * k, 8.52, 50.0), "doJumpId": 3 + k} for k in range(3)])]
+    items.append({**mission_item(0, 0, 0, frame=2, command=177), "params": [5, 1, 0, 0, 0, 0, 0], "doJumpId": 9})
+    places = flown(tmp_path / "r.plan", plan(items))
+    assert len(places) == 3  # the last one twice is one waypoint
+    items.append({**mission_item(47.45, 8.52, 50.0), "doJumpId": 10})
+    items[1]["params"][0] = 4
+    assert [
+        round((north - local(47.4, 8.52, ZURICH)[0]) / 1112.0) for north, _, _ in flown(tmp_path / "r.plan", plan(items))
+    ] == [*(0, 1, 2, 1, 2, 5)]
 
 
 def test_radius_of_loiter_is_named(tmp_path: Path) -> None:
@@ -271,7 +333,7 @@ def test_camera_and_landing_of_plan_are_named_once(tmp_path: Path) -> None:
     path = tmp_path / "r.plan"
     path.write_text(json.dumps(plan([survey([mission_item(47.4, 8.52, 50.0), *shots]), landing])), encoding="utf-8")
     notes = read_route_file(path).notes
-    assert notes == ("not flown: fwLandingPattern (item 2)", "not flown: DO_SET_CAM_TRIGG_DIST (item 1)")
+    assert notes == ("not flown: DO_SET_CAM_TRIGG_DIST (item 1), fwLandingPattern (item 2)",)
 
 
 def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
@@ -281,6 +343,14 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert read_route(path)[1] == Waypoint(900.0, 0.0, 0.0, None, 2.0, 0.0, 80.0)
+    path.write_text("route: [[0, 0, 0], [900, 0, 0, 26], [900, 0, 0, 27], [900, 900, 0], [0, 900, 0]]", encoding="utf-8")
+    assert [waypoint.speed for waypoint in read_route(path)] == [None, 26.0, 27.0, None]  # as on the leg before
+    circle = "{{north: 900, east: 0, altitude: 0, turns: {}}}"
+    path.write_text(f"route: [[0, 0, 0], {circle.format(2)}, {circle.format(3)}, [900, 900, 0]]", encoding="utf-8")
+    assert read_route(path)[1].turns == 5.0
+    path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: no}\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"route\[0\].turns: found False, expected a finite number"):
+        read_route(path)
     path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: -1}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=r"route\[0\].turns: found -1, expected at least 0"):
         read_route(path)
@@ -313,10 +383,6 @@ GEOJSON_FENCE = {
         },
     ],
 }
-WPL_FENCE = [
-    *((3, 5001, *corner, 0.0, 3.0) for corner in ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))),  # of three corners
-    *((3, 5004, 47.41, 8.51, 0.0, 200.0), (3, 5100, 47.401, 8.5, 40.0)),
-]
 
 
 def test_segments_of_track_are_joined(tmp_path: Path) -> None:
@@ -358,9 +424,9 @@ def test_home_is_return_point_of_fence_without_rally_points(tmp_path: Path) -> N
     ("rows", "sentence"),
     [
         (WPL_FENCE[:2], "found 2 of the 3 corners of a polygon, expected all"),
-        ([*WPL_FENCE[:2], WPL_FENCE[4]], "item 3: found the command 5100 with 0, expected corners of a polygon"),
-        ([*WPL_FENCE[:2], (3, 5002, *WPL_FENCE[2][2:])], "item 3: found the command 5002 with 3, expected corners"),
-        ([(3, 5001, 47.39, 8.49, 0.0, math.nan)], "item 1: found the command 5001 with nan, expected corners"),
+        ([*WPL_FENCE[:2], WPL_FENCE[4]], r"NAV_RALLY_POINT \(item 3\): found 0 corners, expected corners of a polygon"),
+        ([*WPL_FENCE[:2], (3, 5002, *WPL_FENCE[2][2:])], r"VERTEX_EXCLUSION \(item 3\): found 3 corners, expected corners"),
+        ([(3, 5001, 47.39, 8.49, 0.0, math.nan)], r"VERTEX_INCLUSION \(item 1\): found nan corners, expected corners"),
     ],
 )
 def test_polygon_without_all_corners_is_no_smaller_fence(rows: Any, sentence: str, tmp_path: Path) -> None:
@@ -412,6 +478,17 @@ def test_track_is_thinned_within_tolerance(tmp_path: Path) -> None:
         (1000.0, 1000.0),
     ]
     assert route.notes == ("3 of 101 positions: the others are within 5 m of the line",)
+
+
+def test_thinned_route_keeps_circles_and_airspeeds(tmp_path: Path) -> None:
+    """On a straight line no position but those of the two ends has a distance from the line."""
+    path = tmp_path / "r.yaml"
+    circle = "{north: 1000, east: 0, altitude: 0, turns: 2}"
+    path.write_text(
+        f"route: [[0, 0, 0], [500, 0, 0], {circle}, [2000, 0, 0], [3000, 0, 0, 27], [4000, 0, 0]]", encoding="utf-8"
+    )
+    kept = [(waypoint.north, waypoint.turns, waypoint.speed) for waypoint in read_route_file(path, simplify=50.0).waypoints]
+    assert kept == [(0.0, 0.0, None), (1000.0, 2.0, None), (2000.0, 0.0, None), (4000.0, 0.0, 27.0)]
 
 
 def test_archive_that_unpacks_to_much_is_refused(tmp_path: Path) -> None:

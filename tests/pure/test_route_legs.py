@@ -279,7 +279,7 @@ def circling(flown: Flown, centre: path.Point, turns: float, altitude: float = 1
     return log
 
 
-@pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0)])
+@pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
 def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west."""
     centre = (2000.0, 0.0)
@@ -291,7 +291,7 @@ def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
     end = route.legs[0].end
     assert end is not None
     assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0
-    half = circling(flown, centre, (turns or 60.0 / 36.2) - 0.5)
+    half = circling(flown, centre, max(turns, wait / 36.2) - 0.5)
     assert 0.5 < half["loitered"] < 1.0
     flown.at(*end, path.end_course(route.legs[0]))
     log = circling(flown, centre, 2.0, first=math.degrees(path.course_of(centre, end)))

@@ -549,11 +549,10 @@ def _loitering(state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str
     error, (course, ground_speed) = path.error(leg, (pose["north"], pose["east"])), _over_ground(pose)
     if not state.loitered and abs(error.e) > ground_speed:
         return state
-    share = 1.0
+    share = dt / loiter.wait if loiter.wait else 1.0
     if loiter.turns:
-        share = dt * ground_speed * math.cos(course - error.track) / (2.0 * math.pi * abs(leg.radius) * loiter.turns)
-    elif loiter.wait:
-        share = dt / loiter.wait
+        along = ground_speed * math.cos(course - error.track)
+        share = min(share, dt * along / (2.0 * math.pi * abs(leg.radius) * loiter.turns))
     return state._replace(loitered=min(state.loitered + share, 1.0))
 
 

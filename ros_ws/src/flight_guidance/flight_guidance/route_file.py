@@ -8,6 +8,7 @@ latitude and longitude, altitude, and perhaps V, turns, wait and leave of `Waypo
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -167,15 +168,21 @@ def read_route_file(
 
 
 def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
-    """The waypoints, successive ones at a place as a single waypoint that the aircraft leaves at the last altitude."""
+    """The waypoints, successive ones at a place as a single waypoint with all circles, left at the last altitude.
+
+    The airspeed that the last of them names is that of the next leg.
+    """
     merged: list[Waypoint] = []
+    speed: float | None = None
     for waypoint in waypoints:
         if merged and waypoint.point == (last := merged[-1]).point:
-            turns, wait = max(last.turns, waypoint.turns), max(last.wait, waypoint.wait)
+            turns, wait = last.turns + waypoint.turns, last.wait + waypoint.wait
             leave = None if waypoint.departure == last.altitude else waypoint.departure
             merged[-1] = last._replace(turns=turns, wait=wait, leave=leave)
+            speed = waypoint.speed or speed
         else:
-            merged.append(waypoint)
+            merged.append(waypoint if waypoint.speed else waypoint._replace(speed=speed))
+            speed = None
     return merged
 
 
@@ -238,10 +245,15 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     """The waypoints without those within a distance in m of the line between the rest.
 
+    Waypoints with circles stay, and those where the airspeed changes; each has the airspeed of its leg.
     Source: Douglas and Peucker (1973), Algorithms for the reduction of the number of points required to represent a line.
     """
-    points = np.array([waypoint[:3] for waypoint in waypoints])
-    kept, spans = {0, len(points) - 1}, [(0, len(points) - 1)]
+    speed: float | None = None
+    flown = [waypoint._replace(speed=(speed := waypoint.speed or speed)) for waypoint in waypoints]
+    points = np.array([waypoint[:3] for waypoint in flown])
+    changes = {k for k, (here, after) in enumerate(pairwise(flown)) if here.loiters or here.speed != after.speed}
+    kept = {0, len(points) - 1} | changes
+    spans = list(pairwise(sorted(kept)))
     while spans:
         first, last = spans.pop()
         if last - first < 2:
@@ -254,7 +266,7 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
         if distance.max() > tolerance:
             kept.add(farthest)
             spans += [(first, farthest), (farthest, last)]
-    return [waypoints[k] for k in sorted(kept)]
+    return [flown[k] for k in sorted(kept)]
 
 
 class _Heights:
@@ -319,7 +331,8 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
                 placed = _waypoint(name, _number(name, first, "north"), _number(name, second, "east"), altitude, speed)
             else:
                 placed = _placed(Place(name, first, second, altitude, speed), origin, _Heights())
-            placed = placed._replace(turns=_loiter(name, turns or 0.0, "turns"), wait=_loiter(name, wait or 0.0, "wait"))
+            circles = {key: _loiter(name, value, key) for key, value in (("turns", turns), ("wait", wait)) if value is not None}
+            placed = placed._replace(**circles)
             yield placed if leave is None else placed._replace(leave=_number(name, leave, "leave"))
         else:
             fits = isinstance(point, list) and 3 <= len(point) <= 4

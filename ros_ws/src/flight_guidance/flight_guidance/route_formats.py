@@ -77,7 +77,7 @@ class _Geometry(NamedTuple):
 def read(content: bytes, key: str, suffix: str) -> Places:
     """The route in the content of a file; `key` names the file in errors. Raises ParameterError."""
     route = FORMATS[suffix](content, key)
-    require(bool(route.places), key, "no position", "a route")
+    require(bool(route.places), key, "; ".join(["no position", *route.notes]), "a route")
     named = [place._replace(key=f"route[{k}]") for k, place in enumerate(route.places)]
     return route._replace(places=named)
 
@@ -384,51 +384,107 @@ def _gpx_places(parent: Element, kind: str) -> list[Place]:
 
 FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
 TERRAIN = (10, 11)
-WAYPOINT, SPLINE, CHANGE_SPEED, AIRSPEED = 16, 82, 178, 0  # MAV_CMD, and SPEED_TYPE
+WAYPOINT, LAND, SPLINE, JUMP, CHANGE_SPEED, AIRSPEED = 16, 21, 82, 177, 178, 0  # MAV_CMD, and SPEED_TYPE
 UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
 COMMANDS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
 COMMANDS |= {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
 COMMANDS |= {16: "NAV_WAYPOINT", 82: "NAV_SPLINE_WAYPOINT", 93: "NAV_DELAY", 178: "DO_CHANGE_SPEED"}
 COMMANDS |= {177: "DO_JUMP", 189: "DO_LAND_START", 206: "DO_SET_CAM_TRIGG_DIST", 201: "DO_SET_ROI", 183: "DO_SET_SERVO"}
 
+COMMANDS |= {34: "DO_ORBIT", 35: "DO_FIGURE_EIGHT", 36: "NAV_ARC_WAYPOINT", 94: "NAV_PAYLOAD_PLACE"}
+COMMANDS |= {5000: "NAV_FENCE_RETURN_POINT", 5001: "NAV_FENCE_POLYGON_VERTEX_INCLUSION", 5100: "NAV_RALLY_POINT"}
+COMMANDS |= {5002: "NAV_FENCE_POLYGON_VERTEX_EXCLUSION", 5003: "NAV_FENCE_CIRCLE_INCLUSION", 5004: "NAV_FENCE_CIRCLE_EXCLUSION"}
+LAST = (UNLIMITED, 20, LAND, 85)  # after which an autopilot flies no item: a loiter without end, the return, the landings
+OTHER_WAYS = (34, 35, 36, 94)  # to a place, no line and no loiter
+
 
 class _Item(NamedTuple):
     """An item of a mission."""
 
-    number: int
+    name: str  # "NAV_LAND (item 5)"
     frame: int
     command: int
     params: Sequence[Any]  # seven
+    number: Any  # by which a DO_JUMP names the item
+
+
+def _named(command: int, number: int) -> str:
+    return f"{COMMANDS.get(command, f'MAV_CMD {command}')} (item {number})"
+
+
+MOST_ITEMS = 20_000
+
+
+def _in_order(key: str, items: Sequence[_Item]) -> list[int]:
+    """The positions of the items in the order of flight, with the jumps that are followed, up to an item of LAST.
+
+    A DO_JUMP leads to an item as often as it says, with a negative number for good; a jump back for good ends the order. Raises
+    ParameterError for a jump to no item, for a loop inside of a loop, which PX4 begins again and ArduPilot does not, and for
+    more than MOST_ITEMS.
+    """
+    at = {items[k].number: k for k in reversed(range(len(items)))}
+    left: dict[int, float] = {}  # repetitions of a jump
+    order: list[int] = []
+    k = steps = 0
+    while k < len(items) and not (order and items[order[-1]].command in LAST):
+        (name, _, command, params, _), here = items[k], k
+        k, steps = k + 1, steps + 1
+        require(steps <= MOST_ITEMS, key, f"more than {MOST_ITEMS} items by the repetitions of {name}", "fewer")
+        if command != JUMP:
+            order.append(here)
+            continue
+        target, count = params[0], -0.5 if params[1] is None else float(params[1])
+        if not count:
+            continue
+        require(target in at and count.is_integer(), key, f"{name} to {target}", "a jump to an item, a whole number of times")
+        if count < 0.0 and at[target] <= here:
+            break
+        remaining = left.get(here, count)
+        require(count < 0.0 or remaining >= 0.0, key, f"{name}, a loop inside of a loop", "loops one after the other")
+        left[here] = remaining - 1.0 if count > 0.0 else count
+        order.append(here)
+        k = at[target] if remaining else k
+    return order
 
 
 def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequence[str] = ()) -> Places:
-    """The waypoints and loiters of a mission up to a loiter without end; the items that are not flown in notes."""
+    """The waypoints and loiters of a mission in the order of flight; the items that are not flown in notes."""
     places: list[Place] = []
-    skipped: list[str] = []
+    flown: set[int] = set()
     circles: list[str] = []  # of a radius, negative to the left
     speed: Any = None
-    ended = False
-    for item in items:
-        latitude, longitude, altitude = item.params[4:7]
-        name = COMMANDS.get(item.command, f"MAV_CMD {item.command}")
-        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (latitude or longitude) and not ended:
-            expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
-            found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
-            require(item.frame in FRAMES, f"{key}: item {item.number}", found, expected)
+    for k in _in_order(key, items):
+        item = items[k]
+        require(item.command not in OTHER_WAYS, key, item.name, "waypoints and loiters")
+        before = places[-1] if places and item.command in LOITERS else None
+        if item.command in (WAYPOINT, SPLINE, *LOITERS) and (any(item.params[4:6]) or before):
             loiter = {TURNS: {"turns": item.params[0]}, TIME: {"wait": item.params[0]}, TO_ALTITUDE: {"climbs": True}}
-            place = Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
-            places.append(place._replace(**loiter.get(item.command, {})))
-            ended = item.command == UNLIMITED
+            places.append(_mission_place(key, item, speed, before)._replace(**loiter.get(item.command, {})))
             if item.command in LOITERS and (radius := item.params[1 if item.command == TO_ALTITUDE else 2]):
-                circles.append(f"{radius:g} m of {name} (item {item.number})")
+                circles.append(f"{radius:g} m of {item.name}")
         elif item.command == CHANGE_SPEED and item.params[0] == AIRSPEED and (item.params[1] or 0) > 0:
             speed = item.params[1]
-        else:
-            skipped.append(f"{name} (item {item.number})")
+        elif item.command != JUMP:
+            continue
+        flown.add(k)
+    skipped = [item.name for k, item in enumerate(items) if k not in flown]
     told = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
     own = "circles are clockwise, of the radius of the route"
-    told += [f"{own}, in place of {', '.join(circles)}"] * bool(circles)
+    told += [f"{own}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
     return Places(places, (*notes, *told), home)
+
+
+def _mission_place(key: str, item: _Item, speed: Any, before: Place | None) -> Place:
+    """The place of an item; of a loiter without a latitude and a longitude the place before."""
+    latitude, longitude, altitude = item.params[4:7]
+    if not (latitude or longitude) and before is not None:
+        latitude, longitude = before.latitude, before.longitude
+        if not altitude:
+            return before._replace(turns=0.0, wait=0.0, climbs=False, speed=speed)
+    found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
+    expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
+    require(item.frame in FRAMES, f"{key}: {item.name}", found, expected)
+    return Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
 
 
 def _read_plan(content: bytes, key: str) -> Places:
@@ -439,11 +495,11 @@ def _read_plan_tree(tree: Any, key: str) -> Places:
     mission = _member(tree, "mission")
     listed = _member(mission, "items")
     require(isinstance(listed, list), key, "no mission with items", "a plan of QGroundControl")
-    items, landings = [], []
+    items = []
     for number, entry in _plan_items(listed or (), key):
-        kind = _member(entry, "complexItemType") or _member(entry, "type")
+        kind, jump = _member(entry, "complexItemType") or _member(entry, "type"), _member(entry, "doJumpId")
         if kind in LANDINGS:
-            landings.append(f"{kind} (item {number})")
+            items.append(_Item(f"{kind} (item {number})", 0, LAND, [None] * 7, jump))
             continue
         expected = f"waypoints, {' or '.join(TRANSECTS)} with their items, {' or '.join(LANDINGS)}"
         require(kind == "SimpleItem", f"{key}: item {number}", f"a {short_repr(kind)}", expected)
@@ -452,10 +508,9 @@ def _read_plan_tree(tree: Any, key: str) -> Places:
         numbers = isinstance(params, list) and all(value is None or isinstance(value, int | float) for value in params)
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
         require(fits, f"{key}: item {number}", short_repr(entry), "frame, command and seven params")
-        items.append(_Item(number, frame, command, params))
+        items.append(_Item(_named(command, number), frame, command, params, number if jump is None else jump))
     fence = _plan_fence(tree, key)
     notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
-    notes += [f"not flown: {', '.join(landings)}"] * bool(landings)
     return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
 
 
@@ -550,7 +605,7 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
             fits = item.command in {FENCE_IN, FENCE_OUT} and count in range(3, MOST_CORNERS + 1)
             fits = fits and (not missing or exclude == zones[-1].exclude)
             expected = "corners of a polygon, each with their number, 3 or more"
-            require(fits, f"{key}: item {item.number}", f"the command {item.command} with {count:g}", expected)
+            require(fits, f"{key}: {item.name}", f"{count:g} corners", expected)
             if not missing:
                 zones.append(Area([], None, exclude))
                 missing = int(count)
@@ -612,7 +667,9 @@ WPL_COLUMNS = 12
 
 
 def _read_wpl(content: bytes, key: str) -> Places:
-    return _mission(key, *_wpl_items(content, key))
+    items, home = _wpl_items(content, key)
+    note = "" if home is None else f"item 0 is the home, at {home.latitude:.7g},{home.longitude:.7g}, and no waypoint"
+    return _mission(key, items, home, [note] * bool(note))
 
 
 def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
@@ -633,7 +690,7 @@ def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
         if index == 0 and frame == 0 and command == WAYPOINT and not items:  # ArduPilot's item 0 is the home
             home = Home(*params[4:7]) if params[4] or params[5] else None
             continue
-        items.append(_Item(int(index), int(frame), int(command), params))
+        items.append(_Item(_named(int(command), int(index)), int(frame), int(command), params, index))
     return items, home
 
 
