@@ -187,6 +187,7 @@ RING = f"<LinearRing><coordinates>{COORDINATES}</coordinates></LinearRing>"
         ("r.kml", kml(f"<Polygon><outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>")),
         ("r.kml", kml(f"<Polygon>{ABSOLUTE}<outerBoundaryIs>{RING}</outerBoundaryIs></Polygon>", mode="")),
         ("r.kml", kml(f"<Placemark>{TRACK}</gx:Track></Placemark>{KML_POINTS}")),
+        ("r.kml", kml(f"<Placemark>{TRACK}<Model/></gx:Track></Placemark>")),  # whose sign is a model
         ("r.kml", kml(KML_LINE.replace(",", ", "))),
         ("r.kmz", zipped(doc_kml=kml(KML_LINE), other_kml="no", images_png="x")),
         ("r.kmz", zipped(route_kml=kml(KML_LINE))),
@@ -393,6 +394,30 @@ def test_segments_of_track_are_joined(tmp_path: Path) -> None:
     assert route.notes == ("2 trkseg are one track: a leg joins them over each gap, up to 334 m",)
 
 
+def named_lines(north: float, name: str) -> str:
+    points = "".join(f'<trkpt lat="{north + 0.01 * k}" lon="8.5"><ele>500</ele></trkpt>' for k in range(2))
+    return f"<trk><name>{name}</name><trkseg>{points}</trkseg></trk>"
+
+
+@pytest.mark.parametrize("line", ["2", "evening"])
+def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> None:
+    path = tmp_path / "r.gpx"
+    content = gpx(named_lines(47.4, "morning") + named_lines(47.45, "evening") + WPT)
+    path.write_text(content, encoding="utf-8")
+    route = read_route_file(path, ZURICH, line=line)
+    north = pymap3d.geodetic2enu(47.45, 8.5, 0.0, *ZURICH, 0.0)[1]
+    assert [waypoint.north for waypoint in route.waypoints] == pytest.approx([north, north + 1112.0], abs=1.0)
+    assert route.notes == ("1 further lines and 3 wpt beside the trk: no part of the route",)
+    with pytest.raises(ParameterError, match=r"found 2 trk, expected one, or --line 1 \(morning\), 2 \(evening\)"):
+        read_route_file(path, ZURICH)
+    with pytest.raises(ParameterError, match=r"--line: found '3' for 0 lines, expected --line 1 \(morning\)"):
+        read_route_file(path, ZURICH, line="3")
+    path = tmp_path / "r.plan"
+    path.write_text(json.dumps(plan([])), encoding="utf-8")
+    with pytest.raises(ParameterError, match="--line: found a mission"):
+        read_route_file(path, line=line)
+
+
 @pytest.mark.parametrize("ending", [".plan", ".geojson", ".waypoints"])
 def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"fence{ending}"
@@ -526,7 +551,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ),
         ("r.geojson", line([[47.4, 8.5, 500.0]]), "found latitude and longitude exchanged, by the origin"),
         ("r.geojson", line([[8.5, 147.4, 1.0]]), r"route\[0\]\.latitude: found 147\.4, expected .* from -90 to 90"),
-        ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or Points alone"),
+        ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or --line 1, 2"),
         ("r.geojson", {"type": "Polygon", "coordinates": [SQUARE, SQUARE]}, "found 2 rings of a Polygon, expected one"),
         (
             "r.geojson",
@@ -536,7 +561,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.geojson", {"features": [line(), {"type": "Curve"}]}, "found 1 LineString and 1 geometry of the type 'Curve'"),
         ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::2056"}}}, "the coordinate system 'urn:"),
         ("r.kml", kml("<NetworkLink/>"), "found no LineString and no Point, but 1 NetworkLink"),
-        ("r.kml", kml(KML_LINE + KML_LINE), "found 2 LineStrings, expected one, or Points alone"),
+        ("r.kml", kml(KML_LINE + KML_LINE), "found 2 LineStrings, expected one, or --line 1, 2"),
         ("r.gpx", gpx("<rte>" + RTE + "</rte><rte>" + RTE + "</rte>"), "found 2 rte, expected one"),
         ("r.gpx", gpx(f"<trk><trkseg>{TRK}</trkseg></trk>" * 2), "found 2 trk, expected one"),
         ("r.gpx", gpx(SEGMENTS.format(47.43)), r"found a gap of 3\.3 km between two trkseg, expected at most 1 km"),
@@ -578,6 +603,16 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.kml", kml("<Point><coordinates>a,b,c</coordinates></Point>"), r"route\[0\]\.latitude: found 'b'"),
         ("r.kml", kml("<Point><coordinates>1,2,3 4,5,6</coordinates></Point>"), "found a Point with 2 positions, expected one"),
         ("r.kml", kml("<Point><coordinates>&a;</coordinates></Point>", head=ENTITY), "found a document type, expected the XML"),
+        # A line that holds nothing is not replaced by marks.
+        (
+            "r.geojson",
+            {"features": [{"geometry": line([])}, point(SQUARE[0]), point(SQUARE[1])]},
+            "1 LineString without a position",
+        ),
+        ("r.gpx", gpx(f"<trk><trkseg/></trk>{WPT}"), "found 1 trk without a position, and 3 wpt"),
+        ("r.geojson", '{"type": "LineString", "type": "Point", "coordinates": [8.5, 47.4, 1]}', "the member 'type' twice"),
+        ("r.kml", kml("<Tour/>"), "no LineString and no Point, but 1 Tour"),
+        ("r.kml", kml(KML_POINTS + '<a:height xmlns:a="http://www.dji.com/wpmz/1.0.2">50</a:height>'), "a mission of DJI"),
     ],
 )
 def test_what_is_no_route_refused_with_one_sentence(name: str, content: Any, sentence: str, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from flight_cli.output import (
     print_json,
     show_flight,
 )
-from flight_cli.route_options import Altitude, Simplify, parse_origin, read_waypoints
+from flight_cli.route_options import Altitude, Line, Simplify, parse_origin, read_waypoints
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -63,6 +63,7 @@ def fly(
     ] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
+    line: Line = None,
     send: Annotated[bool, typer.Option("--send", help="Send commands to the autopilot once the bridge is engaged.")] = False,
     watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the flight while it lasts.")] = False,
     namespace: Annotated[
@@ -92,10 +93,11 @@ def fly(
     require(autopilot is None or not composed, "--composed", "a flight with a bridge", "one process a node")
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     files = route or fence
-    for option, value in (("--origin", origin), ("--altitude", altitude), ("--simplify", simplify or None)):
-        require(value is None or files is not None, option, "no --route", "the file of a route: --route FILE")
+    of_route = (("--simplify", simplify or None, route), ("--line", line, route))
+    for option, value, file in (("--origin", origin, files), ("--altitude", altitude, files), *of_route):
+        require(value is None or file is not None, option, "no --route", "the file of a route: --route FILE")
     if files is not None:
-        chosen = _with_files(chosen, route, fence, origin, altitude, simplify)
+        chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)
     _require_flyable(chosen, autopilot, in_process=in_process)
     for sentence in limits_beyond_stops(chosen) if autopilot is None else ():
         print(f"warning: {sentence}", file=sys.stderr)
@@ -143,14 +145,20 @@ def fly(
 
 
 def _with_files(
-    scenario: Scenario, route: Path | None, fence: Path | None, origin: str | None, altitude: float | None, simplify: float
+    scenario: Scenario,
+    route: Path | None,
+    fence: Path | None,
+    origin: str | None,
+    altitude: float | None,
+    simplify: float,
+    line: str | None,
 ) -> Scenario:
     """The scenario with the route and the fence of files. Raises ParameterError."""
     above_sea = scenario.aircraft.is_jsbsim
     sections = {} if fence is None else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
     require(not sections or scenario.guidance is not None, "--fence", "a scenario without guidance", "one with guidance")
     if route is not None:
-        return with_route(scenario, read_waypoints(route, origin, altitude, simplify, above_sea=above_sea), sections)
+        return with_route(scenario, read_waypoints(route, origin, altitude, simplify, line, above_sea=above_sea), sections)
     return scenario.vary(guidance=sections)
 
 

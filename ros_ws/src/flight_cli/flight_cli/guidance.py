@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flight_cli.route_options import Altitude, Simplify, read_waypoints
+from flight_cli.route_options import Altitude, Line, Simplify, read_waypoints
 from flight_core.parameters import ParameterError
 
 if TYPE_CHECKING:
@@ -64,10 +64,11 @@ def route(
     origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for FILE.")] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
+    line: Line = None,
     namespace: Namespace = "",
 ) -> None:
     """Fly a route from its first leg on. An airspeed of a waypoint is refused: the topic has none."""
-    waypoints = read_waypoints(file, origin, altitude, simplify, above_sea=None)
+    waypoints = read_waypoints(file, origin, altitude, simplify, line, above_sea=None)
     for k, waypoint in enumerate(waypoints):
         if waypoint.speed is not None:
             raise ParameterError(f"route[{k}].V: found {waypoint.speed:g} m/s, expected none in flight: rise-di target V=VALUE")

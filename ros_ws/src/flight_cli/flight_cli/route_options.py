@@ -20,14 +20,18 @@ Simplify = Annotated[
     float, typer.Option(min=0.0, help="Leave out positions of a route within this distance of the line without them, m.")
 ]
 
+Line = Annotated[
+    str | None, typer.Option("--line", metavar="LINE", help="Which line of a file with several: a number from 1 on, or a name.")
+]
+
 
 def read_waypoints(
-    file: Path, origin: str | None, altitude: float | None, simplify: float, *, above_sea: bool | None
+    file: Path, origin: str | None, altitude: float | None, simplify: float, line: str | None, *, above_sea: bool | None
 ) -> tuple[Waypoint, ...]:
     """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as `read_route_file`."""
     require(altitude is None or math.isfinite(altitude), "--altitude", altitude, "a number")
     require(math.isfinite(simplify), "--simplify", simplify, "a number")
-    route = read_route_file(file, parse_origin(origin), altitude, simplify, above_sea=above_sea)
+    route = read_route_file(file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line)
     for note in route.notes:
         print(f"note: {note}", file=sys.stderr)
     return route.waypoints

@@ -131,6 +131,7 @@ def read_route_file(
     simplify: float = 0.0,
     *,
     above_sea: bool | None = False,
+    line: str | None = None,
 ) -> RouteFile:
     """The waypoints of a route file, by the ending: one of ENDINGS.
 
@@ -138,16 +139,18 @@ def read_route_file(
     height in m to fly at where the file has none, and the height of the ground or of the home where the file counts from
     there. `above_sea`: the altitudes of `pose` count from the sea, else from the start, which is the home in the file; None
     where that is not known, nor the start. Equal successive positions are one waypoint. Waypoints within `simplify` in m of the
-    line without them are left out. Raises ParameterError for an unreadable file, a geometry that is no route, a value missing
+    line without them are left out. `line`: number from 1 on, or name, of the line to fly of a file with several.
+    Raises ParameterError for an unreadable file, a geometry that is no route, a value missing
     or out of range, and latitudes without an origin.
     """
     suffix = path.suffix.lower()
     require(suffix in ENDINGS, "route", f"the file {path}", f"one that ends in {', '.join(ENDINGS)}")
     content = read_file(path, str(path), "a route file")
     if suffix in YAML:
+        require(line is None, "--line", f"the route {path}", "a file with several lines")
         waypoints, notes = list(_read_yaml(content, str(path), origin)), list[str]()
     else:
-        route = route_formats.read(content, str(path), suffix)
+        route = route_formats.read(content, str(path), suffix, line)
         home, notes = route.home, list(route.notes)
         if origin is None and home is not None and above_sea is not None:
             origin = Origin(home.latitude, home.longitude)

@@ -72,32 +72,57 @@ class Places(NamedTuple):
 class _Geometry(NamedTuple):
     kind: str  # by the name in the format
     places: list[Place]
+    name: str = ""  # by the user
 
 
-def read(content: bytes, key: str, suffix: str) -> Places:
-    """The route in the content of a file; `key` names the file in errors. Raises ParameterError."""
-    route = FORMATS[suffix](content, key)
+def read(content: bytes, key: str, suffix: str, line: str | None = None) -> Places:
+    """The route in the content of a file; `key` names the file in errors. Raises ParameterError.
+
+    `line`: the number from 1 on, or the name, of the line that is flown of a file with several.
+    """
+    route = FORMATS[suffix](content, key, line)
     require(bool(route.places), key, "; ".join(["no position", *route.notes]), "a route")
     named = [place._replace(key=f"route[{k}]") for k, place in enumerate(route.places)]
     return route._replace(places=named)
 
 
-def _one_route(key: str, geometries: Sequence[_Geometry], others: Sequence[str] = ()) -> Places:
-    """The only line; the points where there is no line. Raises ParameterError that names what is there."""
-    lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS and geometry.places])
+def _one_route(key: str, geometries: Sequence[_Geometry], others: Sequence[str] = (), line: str | None = None) -> Places:
+    """The only line, or that of `line`; the points where there is no line. Raises ParameterError that names what is there."""
+    of_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
+    lines = [geometry for geometry in of_lines if geometry.places]
     points = [geometry for geometry in geometries if geometry.kind in POINTS]
-    kinds = _counted([*(line.kind for line in lines), *others])
-    if len(lines) > 1 or (lines and others):
-        raise ParameterError(f"{key}: found {kinds}, expected one, or Points alone")
+    beside = _counted([point.kind for point in points])
+    if (lines and others) or (lines and line is None and len(lines) > 1):
+        kinds = _counted([*(geometry.kind for geometry in lines), *others])
+        raise ParameterError(f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}")
+    if line is not None:
+        chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
+        require(
+            len(chosen) == 1, "--line", f"{short_repr(line)} for {len(chosen)} lines", _choice(lines) if lines else "a line"
+        )
+        if len(lines) > 1:
+            beside = " and ".join([f"{len(lines) - 1} further lines", *[beside] * bool(points)])
+        lines = chosen
     if lines:
-        beside = _counted([point.kind for point in points])
-        return Places(lines[0].places, (f"{beside} beside the {lines[0].kind}: no part of the route",) if points else ())
-    has = f", but {kinds}" if others else ""
+        return Places(lines[0].places, (f"{beside} beside the {lines[0].kind}: no part of the route",) if beside else ())
+    has = f", but {_counted(others)}" if others else ""
     require(bool(points) and not others, key, f"no LineString and no Point{has}", "a route")
+    found = f"{_counted([geometry.kind for geometry in of_lines])} without a position, and {beside}"
+    require(not of_lines, key, found, "a line, or Points alone")
     return Places([place for point in points for place in point.places])
 
 
+def _choice(lines: Sequence[_Geometry]) -> str:
+    """What `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
+    names = [f"{k} ({geometry.name})" if geometry.name else f"{k}" for k, geometry in enumerate(lines[:SHOWN], start=1)]
+    return f"--line {', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
+
+
+SHOWN = 5
+"""Lines of a file that a refusal names."""
+
 POINTS = ("Point", "MultiPoint", "wpt")
+GPX = ("rte", "trk", "wpt")  # names of elements, without a plural
 
 
 def _counted(kinds: Sequence[str]) -> str:
@@ -105,7 +130,7 @@ def _counted(kinds: Sequence[str]) -> str:
     counts = []
     for kind, count in Counter(kinds).items():
         noun, *rest = kind.split(" ", 1)
-        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1)}", *rest]))
+        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1 and noun not in GPX)}", *rest]))
     return " and ".join(counts)
 
 
@@ -113,7 +138,8 @@ def _joined(lines: Sequence[_Geometry]) -> list[_Geometry]:
     """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section 3.1.9)."""
     joined: list[_Geometry] = []
     for line in lines:
-        end, begin = (joined[-1].places[-1], line.places[0]) if joined else (None, None)
+        cut = bool(joined and joined[-1].places and line.places)
+        end, begin = (joined[-1].places[-1], line.places[0]) if cut else (None, None)
         if end is not None and begin is not None and _meets(end, begin):
             joined[-1] = joined[-1]._replace(places=[*joined[-1].places[:-1], *line.places[1:]])
         else:
@@ -134,27 +160,37 @@ def _meets(end: Place, begin: Place) -> bool:
 
 def _parsed_json(content: bytes, key: str) -> Any:
     try:
-        return json.loads(content.removeprefix(b"\xef\xbb\xbf"))
+        return json.loads(content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members)
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{key}: not valid JSON ({error}), expected {A_ROUTE}") from None
 
 
-def _read_json(content: bytes, key: str) -> Places:
+def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"the member {short_repr(twice)} twice")
+    return members
+
+
+def _read_json(content: bytes, key: str, line: str | None = None) -> Places:
     tree = _parsed_json(content, key)
     if _member(tree, "fileType") == "Plan":
-        return _read_plan_tree(tree, key)
+        return _read_plan_tree(tree, key, line)
     _require_wgs84(tree, key)
     geometries: list[_Geometry] = []
     others: list[str] = []
-    for node, speed in _nodes(tree):
+    for node, properties in _nodes(tree):
+        speed, name = _member(properties, "V"), _member(properties, "name")
         kind, coordinates = _member(node, "type"), _member(node, "coordinates")
         if isinstance(kind, str) and kind in GEOJSON:
             parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
-            name = kind if len(parts) == 1 else PARTS.get(kind, kind)
-            geometries += [_Geometry(name, [_lon_lat(position, speed) for position in part]) for part in parts]
+            part_kind = kind if len(parts) == 1 else PARTS.get(kind, kind)
+            named = name if isinstance(name, str) else ""
+            geometries += [_Geometry(part_kind, [_lon_lat(position, speed) for position in part], named) for part in parts]
         elif node is not None:
             others.append(f"geometry of the type {short_repr(kind)}")
-    return _one_route(key, geometries, others)
+    return _one_route(key, geometries, others, line)
 
 
 def read_lines(content: bytes, key: str) -> list[list[Place]]:
@@ -201,18 +237,18 @@ PARTS = {
 
 
 def _nodes(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """The geometries with the property V of their Feature, in the order of the file; None for a Feature without geometry."""
+    """The geometries with the properties of their Feature, in the order of the file; None for a Feature without geometry."""
     pending: list[tuple[Any, Any]] = [(tree, None)]
     while pending:
-        node, speed = pending.pop()
+        node, properties = pending.pop()
         members = [_member(node, name) for name in ("features", "geometries")]
         inside = next((member for member in members if isinstance(member, list)), None)
         if inside is not None:
-            pending += [(child, speed) for child in reversed(inside)]
+            pending += [(child, properties) for child in reversed(inside)]
         elif isinstance(node, Mapping) and "geometry" in node:
-            pending.append((node["geometry"], _member(_member(node, "properties"), "V")))
+            pending.append((node["geometry"], _member(node, "properties")))
         else:
-            yield node, speed
+            yield node, properties
 
 
 def _require_wgs84(tree: Any, key: str) -> None:
@@ -263,23 +299,38 @@ def _kind(element: Element) -> str:
 
 KML_LINES = ("LineString", "LinearRing", "Track")
 KML_OTHERS = ("Model", "NetworkLink")  # geometry elsewhere
+KML_VIEWS = ("Tour", "GroundOverlay", "PhotoOverlay", "ScreenOverlay")  # no geometry
+DJI = "dji.com/wpmz"  # in the namespace of its missions, with heights and speeds beside KML's own
 KML_MODES = {"absolute": Above.AS_POSE, "relativeToGround": Above.GROUND, "clampToGround": Above.GROUND}
 
 
-def _read_kml(content: bytes, key: str) -> Places:
+def _read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     root = _parsed_xml(content, key, "a KML file")
-    geometries: list[_Geometry] = []
-    kinds = [(_kind(element), element) for element in root.iter()]
-    others = [kind for kind, _ in kinds if kind in KML_OTHERS]
+    elements = [*root.iter()]
+    way_out = "a KML without it, a GeoJSON or a plan of QGroundControl: its heights and speeds are not read"
+    require(not any(DJI in str(element.tag) for element in elements), key, "a mission of DJI (WPML)", way_out)
+    kinds = [(_kind(element), element) for element in elements]
     has_line = any(kind in KML_LINES for kind, _ in kinds)
-    # The altitudeMode of a Polygon is that of its rings.
-    of_polygon = {ring: polygon for kind, polygon in kinds if kind == "Polygon" for ring in polygon.iter()}
+    of_polygon, of_track, of_mark = (
+        {inside: element for kind, element in kinds if kind == outer for inside in element.iter()}
+        for outer in ("Polygon", "Track", "Placemark")
+    )
+    others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in of_track]  # whose Model is a sign
+    geometries: list[_Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
             geometries.append(_Geometry(kind, []))  # a mark, at any altitude
-        elif kind in (*KML_LINES, "Point"):
-            geometries.append(_Geometry(kind, _kml_places(key, kind, element, of_polygon.get(element))))
-    return _one_route(key, geometries, others)
+        elif kind in (*KML_LINES, "Point"):  # the altitudeMode of a Polygon is that of its rings
+            name = _text(of_mark.get(element), "name") or ""
+            geometries.append(_Geometry(kind, _kml_places(key, kind, element, of_polygon.get(element)), name.strip()))
+    if not geometries:
+        others += [kind for kind, _ in kinds if kind in KML_VIEWS]
+    return _one_route(key, geometries, others, line)
+
+
+def _text(parent: Element | None, kind: str) -> str | None:
+    """The text of the first child of a kind; None without it."""
+    return next((child.text for child in (() if parent is None else parent) if _kind(child) == kind), None)
 
 
 def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) -> list[Place]:
@@ -304,7 +355,7 @@ def _number_of(text: str | None) -> float | str | None:
         return text
 
 
-def _read_kmz(content: bytes, key: str) -> Places:
+def _read_kmz(content: bytes, key: str, line: str | None = None) -> Places:
     """The KML file of a KMZ archive: doc.kml, or the only one, at the root where there is one (OGC 12-007r2, Annex C)."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -321,7 +372,7 @@ def _read_kmz(content: bytes, key: str) -> Places:
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
         raise ParameterError(f"{key}: cannot be unpacked ({error}), expected a KMZ archive") from None
     require(bool(chosen), key, f"{len(names)} .kml files and no doc.kml", "one")
-    return _read_kml(limited(inside, f"{key}: {chosen}", A_ROUTE), key)
+    return _read_kml(limited(inside, f"{key}: {chosen}", A_ROUTE), key, line)
 
 
 EARTH_RADIUS = 6371e3
@@ -331,34 +382,39 @@ LARGEST_GAP = 1000.0
 """m. Segments of a track that are nearer are one track: GPX begins a segment where the receiver lost its satellites."""
 
 
-def _read_gpx(content: bytes, key: str) -> Places:
-    """A route (rte), without one a track (trk), without both the waypoints (wpt)."""
+def _read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
+    """A route (rte), without one a track (trk), without both the waypoints (wpt); with `line` one of all routes and tracks."""
     root = _parsed_xml(content, key, "a GPX file")
-    routes = [places for element in root.iter() if _kind(element) == "rte" and (places := _gpx_places(element, "rtept"))]
-    tracks = [_gpx_track(element) for element in root.iter() if _kind(element) == "trk"]
-    tracks = [segments for segments in tracks if segments]
     marks = _gpx_places(root, "wpt")
-    kind = "rte" if routes else "trk"
-    lines = routes or [[*chain(*segments)] for segments in tracks]
-    require(len(lines) <= 1, key, f"{len(lines)} {kind}", "one: GPX of a single route or track")
-    gaps = [] if routes else [_gap(before[-1], after[0]) for segments in tracks for before, after in pairwise(segments)]
+    routes, tracks = (
+        [(element, _gpx_segments(element, kind)) for element in root.iter() if _kind(element) == kind]
+        for kind in ("rte", "trk")
+    )
+    flown = routes + tracks if line is not None or not any(segments for _, segments in routes) else routes
+    lines = [
+        _Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip()) for element, segments in flown
+    ]
+    require(bool(lines or marks), key, f"no rte, no trk and no wpt in {_kind(root)}", "a route in gpx")
+    route = _one_route(key, [*lines, *(_Geometry("wpt", [place]) for place in marks)], (), line)
+    notes = [*route.notes]
+    if flown == routes and any(segments for _, segments in tracks):
+        notes.append(f"{len(tracks)} trk beside the rte: no part of the route")
+    if shapes := sum(_kind(element) == "rpt" for element in root.iter()):
+        notes.append(f"{shapes} rpt of extensions: no part of the route")
+    segments = next((segments for _, segments in flown if [*chain(*segments)] == route.places), [])
+    gaps = [_gap(before[-1], after[0]) for before, after in pairwise(segments)]
     widest = max(gaps, default=0.0)
     fits = widest <= LARGEST_GAP
     require(fits, key, f"a gap of {widest / 1e3:.1f} km between two trkseg", f"at most {LARGEST_GAP / 1e3:g} km within a track")
-    if not lines:
-        require(bool(marks), key, "no rte, no trk and no wpt", "a route")
-        return Places(marks)
-    beside = {"trk": len(tracks) if routes else 0, "wpt": len(marks)}
-    notes = [f"{count} {what} beside the {kind}: no part of the route" for what, count in beside.items() if count]
     if gaps:
-        notes.append(f"{len(gaps) + 1} trkseg are one track: a leg joins them over each gap, up to {widest:.0f} m")
-    return Places(lines[0], tuple(notes))
+        notes.append(f"{len(segments)} trkseg are one track: a leg joins them over each gap, up to {widest:.0f} m")
+    return route._replace(notes=tuple(notes))
 
 
-def _gpx_track(track: Element) -> list[list[Place]]:
-    """The segments of a track that have a position."""
-    segments = [_gpx_places(element, "trkpt") for element in track if _kind(element) == "trkseg"]
-    return [places for places in segments if places]
+def _gpx_segments(line: Element, kind: str) -> list[list[Place]]:
+    """The segments of a track, or the only one of a route, that have a position."""
+    parts = [line] if kind == "rte" else [element for element in line if _kind(element) == "trkseg"]
+    return [places for element in parts if (places := _gpx_places(element, f"{kind}pt"))]
 
 
 def _gap(end: Place, begin: Place) -> float:
@@ -375,7 +431,7 @@ def _gpx_places(parent: Element, kind: str) -> list[Place]:
     places = []
     for element in (child for child in parent if _kind(child) == kind):
         latitude, longitude = (_number_of(element.get(name)) for name in ("lat", "lon"))
-        height = next((child.text for child in element if _kind(child) == "ele"), None)
+        height = _text(element, "ele")
         places.append(Place("route", latitude, longitude, _number_of(height), found=f"a {kind} without ele"))
     return places
 
@@ -487,11 +543,12 @@ def _mission_place(key: str, item: _Item, speed: Any, before: Place | None) -> P
     return Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
 
 
-def _read_plan(content: bytes, key: str) -> Places:
-    return _read_plan_tree(_parsed_json(content, key), key)
+def _read_plan(content: bytes, key: str, line: str | None = None) -> Places:
+    return _read_plan_tree(_parsed_json(content, key), key, line)
 
 
-def _read_plan_tree(tree: Any, key: str) -> Places:
+def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
+    require(line is None, "--line", f"a mission, {key}", "a file with several lines")
     mission = _member(tree, "mission")
     listed = _member(mission, "items")
     require(isinstance(listed, list), key, "no mission with items", "a plan of QGroundControl")
@@ -666,7 +723,8 @@ WPL = "QGC WPL"
 WPL_COLUMNS = 12
 
 
-def _read_wpl(content: bytes, key: str) -> Places:
+def _read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
+    require(line is None, "--line", f"a mission, {key}", "a file with several lines")
     items, home = _wpl_items(content, key)
     note = "" if home is None else f"item 0 is the home, at {home.latitude:.7g},{home.longitude:.7g}, and no waypoint"
     return _mission(key, items, home, [note] * bool(note))
@@ -699,7 +757,7 @@ FENCES = (".plan", ".geojson", ".json", *WPL_ENDINGS)
 """Endings of files with a fence."""
 
 
-FORMATS: Mapping[str, Callable[[bytes, str], Places]] = MappingProxyType(
+FORMATS: Mapping[str, Callable[[bytes, str, str | None], Places]] = MappingProxyType(
     {
         ".geojson": _read_json,
         ".json": _read_json,
