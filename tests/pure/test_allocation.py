@@ -11,7 +11,6 @@ from tests.conftest import REPOSITORY
 from tests.maps import named_map
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.margins import margins
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
@@ -221,8 +220,3 @@ def test_a_map_with_a_wrong_sign_contradicts_the_effect_of_an_effector() -> None
     scenario = find_scenario("osprey_servo").vary(controller=mixed(effect=effect, T=T))
     (sentence,) = check_scenario(channel_map, scenario, frame, None).contradictions
     assert "aileron has +85.9 on p_dot, allocation.effect has -85.9: a positive aileron means roll right" in sentence
-
-
-def test_the_c_code_refuses_an_allocation() -> None:
-    with pytest.raises(ParameterError, match=r"controller\.allocation: found a section"):
-        exportable(find_scenario("osprey_servo").vary(controller=mixed()).controller)

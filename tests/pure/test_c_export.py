@@ -56,10 +56,12 @@ pytestmark = [
     pytest.mark.skipif(GCC is None, reason="no gcc on this machine, which compiles the exported code"),
 ]
 SCHEDULE = {"schedule": {"speed": 25.0}}
+TWIN = find_scenario("osprey_twin").controller
+PRIORITY = {"allocation": {**TWIN.model_dump()["allocation"], "priority": TWIN.inputs[::-1]}}
 SCENARIOS: dict[str, Callable[[], Scenario]] = {
     "servo": lambda: find_scenario("osprey_servo"),
     "observer": lambda: find_scenario("osprey_observer"),
-    "schedule": lambda: find_scenario("osprey_servo").vary(controller=SCHEDULE),
+    "schedule and allocation": lambda: find_scenario("osprey_twin").vary(controller=SCHEDULE | PRIORITY),
 }
 
 
@@ -72,13 +74,14 @@ class Case(NamedTuple):
 
 
 def export_case(name: str, folder: Path) -> Case:
-    """Short flights at 100 Hz, 1500 drawn calls, and 300 steps with each parameter set."""
+    """Short flights at 100 Hz, 1500 drawn calls, and 300 steps with each parameter set; a tenth where Python allocates."""
     slow = {"rate": 100.0, "step": 0.005}
     scenario = SCENARIOS[name]().vary(aircraft=slow, reference_model={"rate": 100.0}, flight={"duration": 8.0})
     sets = parameter_sets(exportable(scenario.controller))
     write_code(sets[0], name, folder, float32=False)
-    steps = [drawn_steps(sets, k, 300, k) for k in range(len(sets))]
-    return Case(folder, sets, [*flight_recordings(scenario, sets), drawn_calls(sets, 1500, 3), *steps])
+    part = 10 if sets[0].allocation is None else 1
+    steps = [drawn_steps(sets, k, 30 * part, k) for k in range(len(sets))]
+    return Case(folder, sets, [*flight_recordings(scenario, sets), drawn_calls(sets, 150 * part, 3), *steps])
 
 
 @pytest.fixture(scope="module", params=list(SCENARIOS))
@@ -133,7 +136,9 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "is_finite": ("bool finite = true;", "bool finite = false;"),
     "product": ("int32_t j = 1; j < columns; j++", "int32_t j = columns - 1; j > 0; j--"),
     "product_transposed": ("(j * columns) + i", "(j * columns) + (columns - 1 - i)"),
-    "saturate": ("before - reach);\n    const", "before + reach);\n    const"),
+    "least": ("before - reach);", "before + reach);"),
+    "largest": ("before + reach);", "upper);"),
+    "saturate": ("greater(u, least", "lesser(u, least"),
     "control": ("(after->e[i] - after->e_0[i]) + integral", "(after->e[i] + integral) - after->e_0[i]"),
     "engage_law": ("law->Pi[i] = ZERO;", "law->Pi[i] = law->e[i];"),
     "step_law": ("(dt * (e + before->e[i])) / TWO", "dt * e"),
@@ -156,6 +161,13 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "step_feedforward": ("(k1[i] + (TWO * k2[i])) + (TWO * k3[i])", "k1[i] + (TWO * (k2[i] + k3[i]))"),
     "engage_all": ("engage_law(law, y, y_m);", "engage_law(law, y_m, y);"),
     "tick_law": ("u_trim[i] + begin.u_o[i]", "u_trim[i] - begin.u_o[i]"),
+    "is_inside": ("inside && (u[j] >= low[j])", "(u[j] >= low[j])"),
+    "pass_on": ("inside = false;\n                for", "for"),
+    "moved": ("(part * move[j])", "move[j]"),
+    "towards": ("(step > ZERO) ?", "(step < ZERO) ?"),
+    "add_by_priority": ("(int32_t)p->order[k]", "k"),
+    "allocate": ("product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);", "copy(change, rest, RISE_DI_P);"),
+    "reached": ("(u_free[i] < u[i]) ? u[i] : -REAL_MAX", "-REAL_MAX"),
     "sample_at": ("samples->newest - back", "samples->newest"),
     "rise_di_append": ("samples->newest + 1)", "samples->newest + 2)"),
     "align": (">= p->slope_ns", ">= 1"),
@@ -172,6 +184,7 @@ MUTANTS: dict[str, tuple[str, str]] = {
     "rise_di_take_y": ("&controller->y_samples", "&controller->y_m_samples"),
     "rise_di_take_y_m": ("&controller->y_m_samples", "&controller->y_samples"),
     "rise_di_tick": ("+ controller->parameters->period_ns", ""),
+    "rise_di_command": ("controller->effectors", "controller->effectors_failsafe"),
     "rise_di_retune": ("c->parameters = parameters;", "(void)parameters;"),
     "rise_di_restart": ("controller->mode = RISE_DI_WAITING;", ""),
 }
@@ -186,7 +199,7 @@ def bodies(source: str) -> dict[str, tuple[int, int]]:
 
 
 def test_proof_finds_a_mutant_of_each_function(tmp_path_factory: pytest.TempPathFactory) -> None:
-    cases = [export_case(name, tmp_path_factory.mktemp("code")) for name in ("observer", "schedule")]
+    cases = [export_case(name, tmp_path_factory.mktemp("code")) for name in ("observer", "schedule and allocation")]
     source = (SOURCE / "rise_di.c").read_text(encoding="utf-8")
     places = bodies(source)
     assert set(places) == set(MUTANTS)

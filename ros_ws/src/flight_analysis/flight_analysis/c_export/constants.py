@@ -13,6 +13,7 @@ from flight_core.arithmetic import INVERSE_PI, MAX_ANGLE, PI_HIGH, PI_LOW, SINE_
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
+from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
 from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
 from rise_di_controller.observer import ObserverParams
 from rise_di_controller.params import ControllerConfig
@@ -25,16 +26,17 @@ SCALARS = frozenset({"period", "dt_least", "dt_largest", "speed", "time", "V_lea
 
 
 class Constant(NamedTuple):
-    """A member of struct rise_di_parameters: whole numbers (int) or reals (array), of a matrix row by row."""
+    """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a matrix row by row."""
 
     name: str
-    value: int | FloatArray
+    value: int | tuple[int, ...] | FloatArray
 
 
 class Sizes(NamedTuple):
-    """Dimensions of the exported controller; 0 without a feedforward or an observer."""
+    """Dimensions of the exported controller; 0 without an allocation, a feedforward or an observer."""
 
     m: int  # channels
+    p: int  # effectors of the allocation
     n: int  # states of the nominal model
     s: int  # estimates
     schedule: bool
@@ -44,9 +46,6 @@ def exportable(controller: ControllerConfig) -> RiseDiConfig:
     """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that are learned or off."""
     require(isinstance(controller, RiseDiConfig), "controller.law", controller.law, "rise_di: C code exists for this law alone")
     assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
-    require(
-        controller.allocation is None, "controller.allocation", "a section", "none: the C code has the inputs of the law alone"
-    )
     require(not controller.vanes, "controller.observer.vanes", "a section", "none: the C code has the observer of y alone")
     require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
     at_trim = controller.schedule is None or not controller.schedule.models
@@ -62,7 +61,8 @@ def sizes(controller: RiseDiConfig) -> Sizes:
     """Dimensions of a controller."""
     n = 0 if controller.feedforward is None else len(controller.feedforward.states)
     s = 0 if controller.observer is None else len(controller.observer.states)
-    return Sizes(len(controller.outputs), n, s, controller.schedule is not None)
+    p = 0 if controller.allocation is None else len(controller.allocation.effectors)
+    return Sizes(len(controller.outputs), p, n, s, controller.schedule is not None)
 
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
@@ -70,7 +70,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     guard, law = controller.guard(), controller.law_params()
     of_law = controller.tuned_law().params
     period = seconds(guard.period_ns)
-    whole = {
+    whole: dict[str, int | tuple[int, ...]] = {
         "digest": controller.digest(),
         "period_ns": guard.period_ns,
         "max_age_ns": guard.max_age_ns,
@@ -83,6 +83,10 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     reals: dict[str, ArrayLike] = {"period": period, "dt_least": DT_RANGE[0] * period, "dt_largest": DT_RANGE[1] * period}
     reals |= {name: getattr(law, name) for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")}
     reals |= _limits("limits", guard.limits)
+    if (allocation := guard.allocation) is not None:
+        whole["order"] = allocation.order
+        reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
+        reals |= _limits("stops", allocation.limits)
     if isinstance(of_law, ScheduleParams):
         least, largest = airspeed_range(of_law)
         reals |= {"speed": of_law.speed, "airspeed": of_law.airspeed, "time": of_law.time}
@@ -106,7 +110,7 @@ def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
     """The bytes of struct rise_di_parameters: whole numbers of 64 bits, then the reals without a gap, filled to 8 bytes."""
     real = np.float32 if float32 else np.float64
     content = b"".join(
-        np.int64(value).tobytes() if isinstance(value, int) else _finite(value, real).astype(real).tobytes()
+        _finite(value, real).astype(real).tobytes() if isinstance(value, np.ndarray) else np.array(value, np.int64).tobytes()
         for _, value in constants(controller)
     )
     return content + bytes(-len(content) % 8)
@@ -120,7 +124,7 @@ def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
 
 def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
     """The text of rise_di_parameters.h."""
-    m, n, s, schedule = sizes(controller)
+    m, p, n, s, schedule = sizes(controller)
     suffix = "F" if float32 else ""
     real = np.float32 if float32 else np.float64
 
@@ -128,26 +132,31 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         return ", ".join(f"{float(real(x)).hex()}{suffix}" for x in _finite(value, real))
 
     members = [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in constants(controller)]
-    sine = {"MAX_ANGLE": MAX_ANGLE, "INVERSE_PI": INVERSE_PI, "PI_HIGH": PI_HIGH, "PI_LOW": PI_LOW}
+    single = {"MAX_ANGLE": MAX_ANGLE, "INVERSE_PI": INVERSE_PI, "PI_HIGH": PI_HIGH, "PI_LOW": PI_LOW}
+    single |= {"RELAXATION": RELAXATION, "EXCHANGE_LEAST": SMALL}
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
         " * SPDX-License-Identifier: Apache-2.0",
         " *",
         f" * Parameters of the controller of {scenario}, written by `rise-di export`. rise_di.h has units and meaning.",
-        f" * y and y_m: {', '.join(controller.outputs)}; u: {', '.join(controller.inputs)}; {controller.rate:g} Hz.",
+        f" * y and y_m: {', '.join(controller.outputs)}; u: {', '.join(controller.effectors)}; {controller.rate:g} Hz.",
         " */",
         "#ifndef RISE_DI_PARAMETERS_H",
         "#define RISE_DI_PARAMETERS_H",
         "",
         f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
         f"#define RISE_DI_INPUTS {_strings(controller.inputs)}",
+        *([f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []),
         f"#define RISE_DI_M {m} /* channels */",
+        f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
         f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
         f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
         f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic pressure */",
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
         f"#define RISE_DI_SAMPLES {SAMPLE_BUFFER_SIZE} /* samples kept of y and of y_m */",
-        *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in sine.items()),
+        *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
+        f"#define RISE_DI_SWEEPS {SWEEPS}",
+        f"#define RISE_DI_HALVINGS {HALVINGS}",
         f"#define RISE_DI_SINE_COEFFICIENTS {{{numbers(np.array(SINE_COEFFICIENTS))}}}",
         "",
         "#define RISE_DI_PARAMETERS { \\",
@@ -159,10 +168,12 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _initialiser(name: str, value: int | FloatArray, numbers: Callable[[FloatArray], str]) -> str:
+def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]) -> str:
     """A number, a list in braces; the first and the last list of a nested struct open and close the braces of the struct."""
     if isinstance(value, int):
         return str(value)
+    if isinstance(value, tuple):
+        return f"{{{', '.join(map(str, value))}}}"
     if name in SCALARS:
         return numbers(value)
     begin, end = name.endswith(".lower"), name.endswith(".rate")

@@ -14,6 +14,7 @@ from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller import feedforward
+from rise_di_controller.allocation import Allocation, allocate, reached
 from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.feedforward import FeedforwardState
 from rise_di_controller.guard import DT_RANGE
@@ -109,6 +110,9 @@ def _drawn_states(
         "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1], "feedforward.u": u_size,
         "feedforward.u_0": u_size, "u_ff": 0.3 * u_size * (controller.feedforward is not None),
     }  # fmt: skip
+    if controller.allocation is not None:
+        stops = controller.effector_limits()
+        of_groups["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
     drawn = {
         name: of_groups.get(name, 0.0) * rng.normal(size=(count, steps)) for name, count in real_groups(controller).items()
     }
@@ -144,18 +148,33 @@ def _stepped(
         of_model = {f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()}
     measured = Measurements(y, y_m, zero, u_trim, u_before)
     of_step, u_free = law.control_law.step(state, measured, dt, params)
+    last = before.get("effectors")
+    u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
+    limited = (u != u_free).any(axis=0)
+    limits = limits if guard.allocation is None else reached(u_free, u)
     of_limits, u_free_limited, u_limited = law.control_law.limited(state, measured, dt, params, limits)
-    limited = (saturate(u_free, u_before, dt, limits) != u_free).any(axis=0)
+    u, effectors = _given(np.where(limited, u_limited, u), last, dt, guard.allocation)
     after = {
         **before,
-        "u": np.where(limited, u_limited, saturate(u_free, u_before, dt, limits)),
+        "u": u,
         "u_free": np.where(limited, u_free_limited, u_free),
         "u_ff": u_ff,
+        **({} if effectors is None else {"effectors": effectors}),
         **fields(_chosen(limited, of_limits, of_step)),
         **of_model,
     }
     of_output = {"output.y": y, "output.y_m": y_m, "output.y_m_offset": np.zeros((1, len(dt))), "output.dt": dt[None]}
     return after | {"y": y, "y_m": y_m} | of_output
+
+
+def _given(
+    u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
+) -> tuple[FloatArray, FloatArray | None]:
+    """The u that the effectors give for a u, and the effectors, both by column; u and None without an allocation."""
+    if params is None or before is None:
+        return u, None
+    pairs = [allocate(v, last, step, params) for v, last, step in zip(u.T, before.T, dt, strict=True)]
+    return np.array([v for _, v in pairs]).T, np.array([effectors for effectors, _ in pairs]).T
 
 
 def _columns(params: Any) -> Any:

@@ -19,7 +19,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.text import printable
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_log.tape_reader import RecordedRun
-from rise_di_controller import guard
+from rise_di_controller import guard, internals
 from rise_di_controller.control_law import fields
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.guard import TickInputs
@@ -56,8 +56,10 @@ def event_type(m: int) -> np.dtype[np.void]:
 
 def real_groups(controller: RiseDiConfig) -> dict[str, int]:
     """Groups of reals in a state and their numbers of values, in the order of proof.c."""
-    m, n, s, schedule = sizes(controller)
-    groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe", "y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
+    m, p, n, s, schedule = sizes(controller)
+    groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
+    groups |= {"effectors": p, "effectors_failsafe": p} if p else {}
+    groups |= dict.fromkeys(("y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
     groups |= {"scale": m} if schedule else {}
     groups |= {"z": s, "u_o": m, "sigma": 1} if s else {}
     groups |= {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1} if n else {}
@@ -164,6 +166,9 @@ class Recorder(Controller):
         self._refused = 0
         row = np.zeros(self._width)
         parts = [state.u, state.u_free, state.u_trim, state.u_ff, state.u_failsafe]
+        if (effectors := state.effectors) is not None:
+            at_failsafe = state.effectors_failsafe
+            parts += [effectors, np.zeros_like(effectors) if at_failsafe is None else at_failsafe]
         if state.law is not None and state.y is not None and state.y_m is not None:
             parts += [state.y.value, state.y_m, *fields(state.law).values()]
             if state.feedforward is not None:
@@ -183,7 +188,7 @@ class Recorder(Controller):
 
 
 def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
-    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule, observer."""
+    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule, observer, stops."""
     widths = np.array(controller.input_scale) * controller.law_params().eps
     bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
     tight = {"lower": tuple(-value for value in bound), "upper": tuple(bound), "slew": tuple(4.0 * value for value in bound)}
@@ -203,6 +208,11 @@ def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
     if controller.observer is not None:
         changes.append({"observer.F": tuple(0.9 * value for value in controller.observer.F)})
         changes.append({"observer.fade": 0.0})
+    if controller.allocation is not None:
+        stops = controller.effector_limits()
+        bind = {"allocation.lower": 0.05 * stops.lower, "allocation.upper": 0.05 * stops.upper}
+        bind |= {"allocation.slew": 0.2 * (stops.upper - stops.lower)}
+        changes.append({name: tuple(value.tolist()) for name, value in bind.items()})
     sets = [controller]
     for change in changes:
         with suppress(ParameterError):  # an observer without a margin under these gains
@@ -262,7 +272,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]
     log = run.tape["internals"]
-    groups = {name: log.group(name).values for name in ("y", "y_m", "u")}
+    of_command = "u" if sets[0].allocation is None else internals.EFFECTOR
+    groups = {name: log.group(name).values for name in ("y", "y_m", of_command)}
     recorder, equal = Recorder(sets), 0
     now_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
     for k in np.argsort(now_ns, kind="stable").tolist():
@@ -279,5 +290,5 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             offset_ns = round(float(log["y_m_offset"][k]) * NANOSECONDS)
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
-        equal += recorder.state.u.tobytes() == groups["u"][k].tobytes()
+        equal += recorder.state.command.tobytes() == groups[of_command][k].tobytes()
     return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal

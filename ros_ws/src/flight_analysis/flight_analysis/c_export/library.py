@@ -12,7 +12,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from flight_analysis.c_export.constants import sizes
 from flight_analysis.c_export.events import GUARD_TICK, START, Recording
 from flight_analysis.c_export.proof import CODE, FLAGS, PARAMETERS, SOURCE, build
 from flight_core.vectors import FloatArray
@@ -22,13 +21,13 @@ _POINTER = ctypes.c_void_p
 
 
 class CController:
-    """A controller in C, with the calls of `rise_di_controller.controller.Controller`."""
+    """A controller in C, with the calls of `rise_di_controller.controller.Controller`; p values of u."""
 
-    def __init__(self, library: Path, m: int) -> None:
-        self._m, self._library = m, ctypes.CDLL(str(library))
+    def __init__(self, library: Path, p: int) -> None:
+        self._p, self._library = p, ctypes.CDLL(str(library))
         self._library.library_bytes.restype = ctypes.c_int64
         self._memory = ctypes.create_string_buffer(self._library.library_bytes())
-        self._u = np.zeros(m)
+        self._u = np.zeros(p)
         self._library.library_start(self._memory)
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
@@ -51,7 +50,7 @@ class CController:
         return self._u.copy(), mode
 
     def replay(self, recording: Recording) -> FloatArray:
-        """The u of each tick of a log, `events.run_recording`, shape (T, m)."""
+        """The u of each tick of a log, `events.run_recording`, shape (T, p)."""
         events = recording.events
         starts = events["kind"] == START
         ticks = events[events["kind"] == GUARD_TICK]
@@ -60,7 +59,7 @@ class CController:
         flags = ticks["flag"] + begins[events["kind"] == GUARD_TICK]
         whole = [np.ascontiguousarray(values) for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])]
         reals = [np.ascontiguousarray(ticks[name]) for name in ("y", "y_m")]
-        u = np.zeros((len(ticks), self._m))
+        u = np.zeros((len(ticks), self._p))
         addresses = (_POINTER(values.ctypes.data) for values in (*whole, *reals, u))
         self._library.library_replay(self._memory, ctypes.c_int64(len(ticks)), *addresses)
         return u
@@ -86,7 +85,7 @@ VALUE_REFERENCES = {"y": 0, "y_m": 100, "u": 200, "active": 300, "y_new": 301, "
 
 def model_description(controller: RiseDiConfig, scenario: str) -> str:
     """modelDescription.xml of the unit. Inputs y, y_m, active, y_new, y_m_new; outputs u and mode; a step is a tick."""
-    groups = {"y": controller.outputs, "y_m": controller.outputs, "u": controller.inputs}
+    groups = {"y": controller.outputs, "y_m": controller.outputs, "u": controller.effectors}
     variables = []
     for group, names in groups.items():
         for i, name in enumerate(names):
@@ -101,8 +100,8 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
         variables.append(f'<ScalarVariable {of}><Boolean start="true"/></ScalarVariable>')
     of = f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" variability="discrete"'
     variables.append(f"<ScalarVariable {of}><Integer/></ScalarVariable>")
-    m = sizes(controller).m
-    outputs = [*range(2 * m + 1, 3 * m + 1), len(variables)]
+    begin = 2 * len(controller.outputs) + 1
+    outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
     of_model = (
         f'modelName={quoteattr(f"RISE-DI {scenario}")} guid="{controller.digest():012x}" generationTool="rise-di export" '

@@ -114,11 +114,17 @@ int fmi2Terminate(unit *u) { return (void)u, OK; }
 
 int fmi2CancelStep(unit *u) { return (void)u, ERROR; }
 
-/* The place of a real variable; NULL for an unknown reference. */
-static rise_di_real *real_of(unit *u, unsigned reference) {
-    rise_di_real *const groups[3] = {u->y, u->y_m, u->controller.u};
+/* The place of an input; NULL for an unknown reference. */
+static rise_di_real *input_of(unit *u, unsigned reference) {
+    rise_di_real *const groups[2] = {u->y, u->y_m};
     const unsigned group = reference / 100, i = reference % 100;
-    return (group < 3 && i < RISE_DI_M) ? &groups[group][i] : NULL;
+    return (group < 2 && i < RISE_DI_M) ? &groups[group][i] : NULL;
+}
+
+/* The place of a real variable; NULL for an unknown reference. */
+static const rise_di_real *real_of(unit *u, unsigned reference) {
+    const int commanded = reference >= U && reference < U + RISE_DI_COMMANDS;
+    return commanded ? &rise_di_command(&u->controller)[reference - U] : input_of(u, reference);
 }
 
 static int *boolean_of(unit *u, unsigned reference) {
@@ -139,8 +145,8 @@ int fmi2GetReal(unit *u, const unsigned *references, size_t count, double *value
 
 int fmi2SetReal(unit *u, const unsigned *references, size_t count, const double *values) {
     for (size_t i = 0; i < count; i++) {
-        rise_di_real *place = real_of(u, references[i]);
-        if (place == NULL || references[i] >= U) {
+        rise_di_real *place = input_of(u, references[i]);
+        if (place == NULL) {
             return ERROR;
         }
         *place = (rise_di_real)values[i];

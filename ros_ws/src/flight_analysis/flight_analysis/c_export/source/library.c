@@ -20,9 +20,10 @@ static void from_double(const double *from, rise_di_real *to) {
     }
 }
 
-static void to_double(const rise_di_real *from, double *to) {
-    for (int32_t i = 0; i < RISE_DI_M; i++) {
-        to[i] = (double)from[i];
+/* What the controller sends. */
+static void command_of(const rise_di_controller *controller, double *u) {
+    for (int32_t i = 0; i < RISE_DI_COMMANDS; i++) {
+        u[i] = (double)rise_di_command(controller)[i];
     }
 }
 
@@ -41,7 +42,7 @@ int64_t library_take(rise_di_controller *controller, int64_t is_y, int64_t stamp
 int64_t library_tick(rise_di_controller *controller, int64_t now_ns, int64_t active, double *u) {
     rise_di_output output;
     const bool published = rise_di_tick(controller, now_ns, active != 0, &output);
-    to_double(controller->u, u);
+    command_of(controller, u);
     return published ? (int64_t)controller->mode : -1;
 }
 
@@ -68,6 +69,6 @@ void library_replay(rise_di_controller *controller, int64_t ticks, const int64_t
         }
         (void)rise_di_guard_tick(controller, now_ns[k], ((flags[k] & 2) != 0) ? &sample : (const rise_di_sample *)0, &samples,
                                  (flags[k] & 1) != 0, &output);
-        to_double(controller->u, &u[k * RISE_DI_M]);
+        command_of(controller, &u[k * RISE_DI_COMMANDS]);
     }
 }

@@ -47,6 +47,10 @@ static void write_state(const rise_di_controller *c, bool published, int64_t ref
     write_reals(c->u_trim, RISE_DI_M);
     write_reals(c->u_ff, RISE_DI_M);
     write_reals(c->u_failsafe, RISE_DI_M);
+#if RISE_DI_P > 0
+    write_reals(rise_di_command(c), RISE_DI_P);
+    write_reals(c->effectors_failsafe, RISE_DI_P);
+#endif
     if (!c->has_law) { /* nothing of these exists yet */
         fill(y, RISE_DI_M, ZERO);
         fill(y_m, RISE_DI_M, ZERO);
@@ -93,6 +97,10 @@ static void load_state(rise_di_controller *c, FILE *from, int64_t stamp_ns) {
     read_reals(from, c->u_trim, RISE_DI_M);
     read_reals(from, c->u_ff, RISE_DI_M);
     read_reals(from, c->u_failsafe, RISE_DI_M);
+#if RISE_DI_P > 0
+    read_reals(from, c->effectors, RISE_DI_P);
+    read_reals(from, c->effectors_failsafe, RISE_DI_P);
+#endif
     read_reals(from, c->y, RISE_DI_M);
     read_reals(from, c->y_m, RISE_DI_M);
     read_reals(from, (rise_di_real *)&c->law, (int)(sizeof c->law / sizeof(rise_di_real)));

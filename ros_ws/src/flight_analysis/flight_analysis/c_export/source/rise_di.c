@@ -2,7 +2,8 @@
  * SPDX-License-Identifier: Apache-2.0
  *
  * The RISE-DI controller in C99. rise_di.h says what is called when. Functions and order of operations are those of the Python
- * modules law, saturation, observer, schedule, feedforward, guard and controller of rise_di_controller, and of flight_core.arithmetic.
+ * modules law, saturation, allocation, observer, schedule, feedforward, guard and controller of rise_di_controller, and of
+ * flight_core.arithmetic.
  */
 #include "rise_di.h"
 
@@ -66,7 +67,9 @@ static bool is_finite(const rise_di_real *values, int32_t count) {
 #if (RISE_DI_N > 0) || (RISE_DI_S > 0)
 /* The nearest integer, half to even, for magnitudes below 2^51 (float: 2^22). */
 static rise_di_real rounded(rise_di_real a) { return (a + ROUNDING) - ROUNDING; }
+#endif
 
+#if (RISE_DI_N > 0) || (RISE_DI_S > 0) || (RISE_DI_P > 0)
 /* result = matrix vector, summed over the columns 0, 1, ... in this order. */
 static void product(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector, rise_di_real *result) {
     for (int32_t i = 0; i < rows; i++) {
@@ -78,6 +81,9 @@ static void product(const rise_di_real *matrix, int32_t rows, int32_t columns, c
     }
 }
 
+#endif
+
+#if (RISE_DI_N > 0) || (RISE_DI_S > 0)
 /* result = matrix' vector for a matrix of these rows and columns, in the same order. */
 static void product_transposed(const rise_di_real *matrix, int32_t rows, int32_t columns, const rise_di_real *vector,
                                rise_di_real *result) {
@@ -91,12 +97,20 @@ static void product_transposed(const rise_di_real *matrix, int32_t rows, int32_t
 }
 #endif
 
+/* The least value within the limits of magnitude, and of rate from `before` within `reach`. */
+static rise_di_real least(rise_di_real lower, rise_di_real before, rise_di_real reach) {
+    return greater(lesser(lower, before + reach), before - reach);
+}
+
+/* The largest such value. */
+static rise_di_real largest(rise_di_real upper, rise_di_real before, rise_di_real reach) {
+    return lesser(greater(upper, before - reach), before + reach);
+}
+
 /* u within the limits of magnitude, and of rate from `before` in dt. */
 static rise_di_real saturate(rise_di_real u, rise_di_real before, rise_di_real dt, const rise_di_limits *limits, int32_t i) {
     const rise_di_real reach = limits->rate[i] * dt;
-    const rise_di_real low = greater(lesser(limits->lower[i], before + reach), before - reach);
-    const rise_di_real high = lesser(greater(limits->upper[i], before - reach), before + reach);
-    return lesser(greater(u, low), high);
+    return lesser(greater(u, least(limits->lower[i], before, reach)), largest(limits->upper[i], before, reach));
 }
 
 /* ---- the law, equations (20) to (22) ---- */
@@ -151,11 +165,11 @@ static void step_law(const rise_di_parameters *p, const rise_di_law *before, con
 
 /* Anti-windup of a tick: an outward increment of integral_e or Pi beyond a limit is reduced. Gives u before and after saturation. */
 static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, const rise_di_law *before, rise_di_real dt,
-                      const rise_di_real *u_trim, const rise_di_real *u_before, rise_di_law *after, rise_di_real *u_free,
-                      rise_di_real *u) {
+                      const rise_di_real *u_trim, const rise_di_real *u_before, const rise_di_limits *limits,
+                      rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         const rise_di_real total = u_trim[i] + control(p, scale, before, after, i);
-        const rise_di_real beyond = total - saturate(total, u_before[i], dt, &p->limits, i);
+        const rise_di_real beyond = total - saturate(total, u_before[i], dt, limits, i);
         const rise_di_real increment = after->integral_e[i] - before->integral_e[i];
         const rise_di_real increment_Pi = after->Pi[i] - before->Pi[i];
         const rise_di_real change = (((-scale[i] * p->D[i]) * p->K[i]) * p->Lambda[i]) * increment;
@@ -172,7 +186,7 @@ static void limit_law(const rise_di_parameters *p, const rise_di_real *scale, co
             after->Pi[i] = before->Pi[i] + (kept * increment_Pi);
         }
         u_free[i] = u_trim[i] + control(p, scale, before, after, i);
-        u[i] = saturate(u_free[i], u_before[i], dt, &p->limits, i);
+        u[i] = saturate(u_free[i], u_before[i], dt, limits, i);
     }
 }
 
@@ -417,10 +431,10 @@ static void engage_all(const rise_di_parameters *p, rise_di_law *law, const rise
 #endif
 }
 
-/* A tick of the whole law from the state `before`: without limits u_free is the result, with limits u_free and u. */
+/* A tick of the whole law from the state `before`: u_free, and u within limits; both are equal with a null pointer for these. */
 static void tick_law(const rise_di_parameters *p, const rise_di_law *before, const rise_di_real *y, const rise_di_real *y_m,
-                     rise_di_real dt, const rise_di_real *u_trim, const rise_di_real *u_before, bool limited,
-                     rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
+                     rise_di_real dt, const rise_di_real *u_trim, const rise_di_real *u_before,
+                     const rise_di_limits *limits, rise_di_law *after, rise_di_real *u_free, rise_di_real *u) {
     rise_di_law begin = *before;
     rise_di_real scale[RISE_DI_M];
     rise_di_real trim[RISE_DI_M];
@@ -437,8 +451,8 @@ static void tick_law(const rise_di_parameters *p, const rise_di_law *before, con
     scheduled(p, &begin, scale);
     *after = begin;
     step_law(p, &begin, y, y_m, dt, after);
-    if (limited) {
-        limit_law(p, scale, &begin, dt, trim, u_before, after, u_free, u);
+    if (limits != (const rise_di_limits *)0) {
+        limit_law(p, scale, &begin, dt, trim, u_before, limits, after, u_free, u);
     } else {
         for (int32_t i = 0; i < RISE_DI_M; i++) {
             u_free[i] = trim[i] + control(p, scale, &begin, after, i);
@@ -449,6 +463,144 @@ static void tick_law(const rise_di_parameters *p, const rise_di_law *before, con
     predict(p, u, u_trim, after->z);
 #endif
 }
+
+/* ---- allocation of the inputs of the law to the effectors ---- */
+
+#if RISE_DI_P > 0
+static bool is_inside(const rise_di_real *u, const rise_di_real *low, const rise_di_real *high) {
+    bool inside = true;
+    for (int32_t j = 0; j < RISE_DI_P; j++) {
+        inside = inside && (u[j] >= low[j]) && (u[j] <= high[j]);
+    }
+    return inside;
+}
+
+/* u with the same effect, inside its limits where the sweeps find such a u. */
+static void pass_on(const rise_di_parameters *p, const rise_di_real *low, const rise_di_real *high, rise_di_real *u) {
+    bool inside = false;
+    for (int32_t sweep = 0; (sweep < RISE_DI_SWEEPS) && (!inside); sweep++) {
+        inside = true;
+        for (int32_t j = 0; j < RISE_DI_P; j++) {
+            const rise_di_real own = p->exchange[(j * RISE_DI_P) + j];
+            const rise_di_real excess = u[j] - lesser(greater(u[j], low[j]), high[j]);
+            if ((excess != ZERO) && (magnitude(own) > RISE_DI_EXCHANGE_LEAST)) {
+                const rise_di_real part = (RISE_DI_RELAXATION * excess) / own;
+                inside = false;
+                for (int32_t i = 0; i < RISE_DI_P; i++) {
+                    u[i] = u[i] - (part * p->exchange[(i * RISE_DI_P) + j]);
+                }
+            }
+        }
+    }
+}
+
+/* target = the effectors after `begin + part move` and what they pass on. Returns whether these are inside. */
+static bool moved(const rise_di_parameters *p, const rise_di_real *begin, rise_di_real part, const rise_di_real *move,
+                  const rise_di_real *low, const rise_di_real *high, rise_di_real *target) {
+    for (int32_t j = 0; j < RISE_DI_P; j++) {
+        target[j] = begin[j] + (part * move[j]);
+    }
+    pass_on(p, low, high, target);
+    return is_inside(target, low, high);
+}
+
+/* u after a move as far as the limits let it, from a u inside; the halvings find the part of it, then the way is straight. */
+static void towards(const rise_di_parameters *p, const rise_di_real *move, const rise_di_real *low, const rise_di_real *high,
+                    rise_di_real *u) {
+    rise_di_real begin[RISE_DI_P];
+    rise_di_real target[RISE_DI_P];
+    rise_di_real halfway[RISE_DI_P];
+    copy(u, begin, RISE_DI_P);
+    if (moved(p, begin, ONE, move, low, high, target)) {
+        copy(target, u, RISE_DI_P);
+    } else {
+        rise_di_real part = ZERO;
+        rise_di_real size = ONE;
+        rise_di_real last = ONE;
+        for (int32_t k = 0; k < RISE_DI_HALVINGS; k++) {
+            size = size / TWO;
+            if (moved(p, begin, part + size, move, low, high, halfway)) {
+                copy(halfway, u, RISE_DI_P);
+                part = part + size;
+            } else {
+                copy(halfway, target, RISE_DI_P);
+            }
+        }
+        for (int32_t j = 0; j < RISE_DI_P; j++) {
+            const rise_di_real step = target[j] - u[j];
+            const rise_di_real room = (step > ZERO) ? (high[j] - u[j]) : (low[j] - u[j]);
+            if (magnitude(step) > magnitude(room)) {
+                last = lesser(last, room / step);
+            }
+        }
+        for (int32_t j = 0; j < RISE_DI_P; j++) {
+            u[j] = lesser(greater(u[j] + (last * (target[j] - u[j])), low[j]), high[j]);
+        }
+    }
+}
+
+/* u after the effectors of each input of the law in the order of priority. */
+static void add_by_priority(const rise_di_parameters *p, const rise_di_real *v, const rise_di_real *low,
+                            const rise_di_real *high, rise_di_real *u) {
+    for (int32_t k = 0; k < RISE_DI_M; k++) {
+        const int32_t i = (int32_t)p->order[k];
+        rise_di_real move[RISE_DI_P];
+        for (int32_t j = 0; j < RISE_DI_P; j++) {
+            move[j] = p->T[(j * RISE_DI_M) + i] * v[i];
+        }
+        towards(p, move, low, high, u);
+    }
+}
+
+/* The effectors inside their limits for v, and the v that they give. */
+static void allocate(const rise_di_parameters *p, const rise_di_real *u_before, rise_di_real dt, rise_di_real *v,
+                     rise_di_real *u) {
+    const rise_di_stops *stops = &p->stops;
+    rise_di_real low[RISE_DI_P];
+    rise_di_real high[RISE_DI_P];
+    for (int32_t j = 0; j < RISE_DI_P; j++) {
+        const rise_di_real reach = stops->rate[j] * dt;
+        low[j] = least(stops->lower[j], u_before[j], reach);
+        high[j] = largest(stops->upper[j], u_before[j], reach);
+    }
+    product(p->T, RISE_DI_P, RISE_DI_M, v, u);
+    if (!is_inside(u, low, high)) {
+        pass_on(p, stops->lower, stops->upper, u);
+        if (!is_inside(u, stops->lower, stops->upper)) {
+            fill(u, RISE_DI_P, ZERO);
+            add_by_priority(p, v, stops->lower, stops->upper, u);
+        }
+        if (!is_inside(u, low, high)) {
+            rise_di_real target[RISE_DI_P];
+            rise_di_real change[RISE_DI_P];
+            rise_di_real rest[RISE_DI_P];
+            rise_di_real v_change[RISE_DI_M];
+            copy(u, target, RISE_DI_P);
+            for (int32_t j = 0; j < RISE_DI_P; j++) {
+                u[j] = lesser(greater(u_before[j], low[j]), high[j]);
+                change[j] = target[j] - u[j];
+            }
+            product(p->effect, RISE_DI_M, RISE_DI_P, change, v_change);
+            add_by_priority(p, v_change, low, high, u);
+            for (int32_t j = 0; j < RISE_DI_P; j++) {
+                change[j] = target[j] - u[j];
+            }
+            product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);
+            towards(p, rest, low, high, u);
+        }
+        product(p->effect, RISE_DI_M, RISE_DI_P, u, v);
+    }
+}
+
+/* The limits that take u_free to the u that the effectors give, for the anti-windup of the law. */
+static void reached(const rise_di_real *u_free, const rise_di_real *u, rise_di_limits *limits) {
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        limits->lower[i] = (u_free[i] < u[i]) ? u[i] : -REAL_MAX;
+        limits->upper[i] = (u_free[i] > u[i]) ? u[i] : REAL_MAX;
+        limits->rate[i] = REAL_MAX;
+    }
+}
+#endif
 
 /* ---- guard ---- */
 
@@ -547,6 +699,9 @@ static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di
         if ((c->mode == RISE_DI_ENGAGED) || (c->mode == RISE_DI_WAITING) || (was_active != active)) {
             c->failsafe_start_ns = now_ns;
             copy(c->u, c->u_failsafe, RISE_DI_M);
+#if RISE_DI_P > 0
+            copy(c->effectors, c->effectors_failsafe, RISE_DI_P);
+#endif
             c->hold_ns = active ? p->hold_ns : 0;
             c->ramp_ns = p->ramp_ns;
         }
@@ -564,6 +719,11 @@ static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di
             c->u[i] = (scale == ONE) ? c->u_failsafe[i] : (scale * c->u_failsafe[i]);
             c->u_free[i] = c->u[i];
         }
+#if RISE_DI_P > 0
+        for (int32_t j = 0; j < RISE_DI_P; j++) {
+            c->effectors[j] = (scale == ONE) ? c->effectors_failsafe[j] : (scale * c->effectors_failsafe[j]);
+        }
+#endif
         log_inputs(output, now_ns, c->y, c->y_m, ZERO, ZERO);
     } else {
         c->mode = active ? RISE_DI_WAITING : RISE_DI_INACTIVE;
@@ -594,7 +754,12 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     rise_di_real u_trim[RISE_DI_M];
     rise_di_real u_free[RISE_DI_M];
     rise_di_real u[RISE_DI_M];
+    const rise_di_limits *limits = &p->limits;
     bool limited = false;
+#if RISE_DI_P > 0
+    rise_di_real effectors[RISE_DI_P];
+    rise_di_limits given;
+#endif
 #if RISE_DI_S > 0
     rise_di_law predicted = c->law;
     const int32_t missed = (int32_t)rounded(dt / p->period) - 1;
@@ -614,14 +779,29 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
 #else
     copy(c->u_trim, u_trim, RISE_DI_M);
 #endif
-    tick_law(p, before, y->value, y_m, dt, u_trim, c->u, false, &after, u_free, u);
+    tick_law(p, before, y->value, y_m, dt, u_trim, c->u, (const rise_di_limits *)0, &after, u_free, u);
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         u[i] = saturate(u_free[i], c->u[i], dt, &p->limits, i);
+    }
+#if RISE_DI_P > 0
+    allocate(p, c->effectors, dt, u, effectors);
+#endif
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
         limited = limited || (u[i] != u_free[i]);
     }
     if (limited) {
-        tick_law(p, before, y->value, y_m, dt, u_trim, c->u, true, &after, u_free, u);
+#if RISE_DI_P > 0
+        reached(u_free, u, &given);
+        limits = &given;
+#endif
+        tick_law(p, before, y->value, y_m, dt, u_trim, c->u, limits, &after, u_free, u);
+#if RISE_DI_P > 0
+        allocate(p, c->effectors, dt, u, effectors);
+#endif
     }
+#if RISE_DI_P > 0
+    copy(effectors, c->effectors, RISE_DI_P);
+#endif
     c->law = after;
     copy(u, c->u, RISE_DI_M);
     copy(u_free, c->u_free, RISE_DI_M);
@@ -695,6 +875,10 @@ void rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
     fill(controller->u_trim, RISE_DI_M, ZERO);
     fill(controller->u_ff, RISE_DI_M, ZERO);
     fill(controller->u_failsafe, RISE_DI_M, ZERO);
+#if RISE_DI_P > 0
+    fill(controller->effectors, RISE_DI_P, ZERO);
+    fill(controller->effectors_failsafe, RISE_DI_P, ZERO);
+#endif
 }
 
 static rise_di_status take(const rise_di_controller *c, rise_di_samples *samples, int64_t stamp_ns, int64_t now_ns,
@@ -738,6 +922,14 @@ bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, r
         }
     }
     return rise_di_guard_tick(controller, now_ns, y, y_m, active, output);
+}
+
+const rise_di_real *rise_di_command(const rise_di_controller *controller) {
+#if RISE_DI_P > 0
+    return controller->effectors;
+#else
+    return controller->u;
+#endif
 }
 
 void rise_di_retune(rise_di_controller *controller, const rise_di_parameters *parameters) {

@@ -1,13 +1,14 @@
 /* SPDX-FileCopyrightText: RISE-DI contributors
  * SPDX-License-Identifier: Apache-2.0
  *
- * The RISE-DI controller in C99: law, anti-windup, limits, guard, feedforward, observer, schedule. No library, no heap, no global.
+ * The RISE-DI controller in C99: law, anti-windup, limits, guard, allocation, feedforward, observer, schedule. No library, no
+ * heap, no global.
  *
  * The caller owns the struct rise_di_controller. Order of calls in a period:
  *
  *   rise_di_start     once, before the first sample
  *   rise_di_take_y    for each sample of y; rise_di_take_y_m for each sample of y_m
- *   rise_di_tick      once a period; true: send u with the stamp output.stamp_ns
+ *   rise_di_tick      once a period; true: send rise_di_command(controller) with the stamp output.stamp_ns
  *
  * Vectors have RISE_DI_M values in the order of RISE_DI_OUTPUTS and RISE_DI_INPUTS (rise_di_parameters.h): SI and rad, deviations
  * from trim. Stamps are nanoseconds of the clock of the caller. An interrupt must not call two functions for one controller at once.
@@ -57,6 +58,19 @@ typedef struct {
     rise_di_real rate[RISE_DI_M];  /* units of u / s */
 } rise_di_limits;
 
+#if RISE_DI_P > 0
+#define RISE_DI_COMMANDS RISE_DI_P /* values of a command, in the order of RISE_DI_EFFECTORS */
+
+/* End stops and rates of the effectors. */
+typedef struct {
+    rise_di_real lower[RISE_DI_P]; /* units of the effector, from trim */
+    rise_di_real upper[RISE_DI_P]; /* units of the effector, from trim */
+    rise_di_real rate[RISE_DI_P];  /* units of the effector / s */
+} rise_di_stops;
+#else
+#define RISE_DI_COMMANDS RISE_DI_M /* values of a command, in the order of RISE_DI_INPUTS */
+#endif
+
 /* Parameters of a controller, constant. RISE_DI_PARAMETERS initialises the parameters of the scenario. */
 typedef struct {
     uint64_t digest;          /* hash of the parameters, the channel `parameters` of the log */
@@ -67,6 +81,9 @@ typedef struct {
     int64_t slope_ns;         /* least distance of two samples for a slope of y_m */
     int64_t deactivation_holds; /* 1: u is held when deactivated, 0: u ramps to trim */
     int64_t sign;             /* rise_di_sign */
+#if RISE_DI_P > 0
+    int64_t order[RISE_DI_M]; /* inputs of the law, the one that keeps its effect the longest first */
+#endif
     rise_di_real period;      /* s */
     rise_di_real dt_least;    /* s, lower limit of dt */
     rise_di_real dt_largest;  /* s, upper limit of dt */
@@ -78,6 +95,12 @@ typedef struct {
     rise_di_real omega[RISE_DI_M];       /* abs(Omega_ii) in scaled inputs; implicit sign */
     rise_di_real eps[RISE_DI_M];         /* half-width of the softened sign, units of y */
     rise_di_limits limits;               /* of u */
+#if RISE_DI_P > 0 /* allocation: effectors = T u, u = effect effectors, P effectors; row by row, as every matrix */
+    rise_di_real T[RISE_DI_P * RISE_DI_M];
+    rise_di_real effect[RISE_DI_M * RISE_DI_P];
+    rise_di_real exchange[RISE_DI_P * RISE_DI_P]; /* I - T effect: the motions without effect on u */
+    rise_di_stops stops;
+#endif
 #if RISE_DI_SCHEDULE
     rise_di_real speed;               /* trim speed V0, m/s */
     rise_di_real airspeed[RISE_DI_M]; /* 1 for the output V, else 0 */
@@ -146,7 +169,7 @@ typedef struct {
     int32_t count;  /* number of samples, at most RISE_DI_SAMPLES */
 } rise_di_samples;
 
-/* A controller. Read by the caller: mode, u. */
+/* A controller. Read by the caller: mode, rise_di_command. */
 typedef struct {
     const rise_di_parameters *parameters;
     rise_di_mode mode;
@@ -161,6 +184,10 @@ typedef struct {
     rise_di_real u_ff[RISE_DI_M];    /* feedforward, 0 without */
     int64_t failsafe_start_ns;
     rise_di_real u_failsafe[RISE_DI_M]; /* u at the start of the failsafe */
+#if RISE_DI_P > 0
+    rise_di_real effectors[RISE_DI_P]; /* commanded, inside stops and rates, from trim; u is what they give */
+    rise_di_real effectors_failsafe[RISE_DI_P]; /* at the start of the failsafe */
+#endif
     int64_t hold_ns;                 /* times of the present failsafe */
     int64_t ramp_ns;
 #if RISE_DI_N > 0
@@ -186,8 +213,11 @@ void rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);
 
-/* A tick at now_ns. Returns whether controller->u is to be sent, with the stamp output->stamp_ns. active false: deactivated. */
+/* A tick at now_ns. Returns whether rise_di_command is to be sent, with the stamp output->stamp_ns. active false: deactivated. */
 bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, rise_di_output *output);
+
+/* What is to be sent, RISE_DI_COMMANDS values from trim: u, or the effectors of an allocation. */
+const rise_di_real *rise_di_command(const rise_di_controller *controller);
 
 /* A tick with samples of the caller in place of those taken; y may be a null pointer. */
 bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
