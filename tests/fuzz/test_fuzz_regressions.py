@@ -146,7 +146,7 @@ def test_exponential_and_recursive_aliases_are_rejected() -> None:
 def test_notes_of_log_contain_no_terminal_control_codes(tmp_path: Path) -> None:
     hostile = [("/\x1b[2Jz", JOINT_STATE, vector(k, (name,), (1.0,))) for k, name in ((1, "a"), (2, "b"))]
     notes = read_run(write_run(tmp_path, log([*Y, *hostile]))).tape.notes
-    assert r"\x1b[2Jz: 1 samples with other names refused" in notes
+    assert r"\x1b[2Jz: 1 samples refused: damaged, not finite, or of other channels" in notes
     assert all(note.isprintable() for note in notes)
 
 
@@ -164,9 +164,16 @@ def test_text_of_log_cannot_end_script_of_page() -> None:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of NumPy, for extreme values
-@pytest.mark.parametrize("value", [1e300, float("nan"), float("-inf")])
-def test_value_of_summary_that_is_not_finite_is_null(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
-    summary = read_flight(write_run(tmp_path, constant_flight(osprey_gust, value))).summary
+def test_value_of_summary_that_is_not_finite_is_null(tmp_path: Path, osprey_gust: Scenario) -> None:
+    summary = read_flight(write_run(tmp_path, constant_flight(osprey_gust, 1e300))).summary
     json.dumps(summary, allow_nan=False)
     assert summary["errors"]["q"]["whole"]["rms"] in (None, 0.0)
     assert summary["inputs"]["elevator"]["whole"]["rms"] is None
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+def test_log_without_finite_value_is_refused(value: float, tmp_path: Path, osprey_gust: Scenario) -> None:
+    with pytest.raises(
+        ParameterError, match=r"found no sample of a flight among .*/y: \d+ samples refused: damaged, not finite"
+    ):
+        read_flight(write_run(tmp_path, constant_flight(osprey_gust, value)))

@@ -37,10 +37,10 @@ from flight_bringup.scenarios import find_scenario, written
 from flight_cli.cli import application
 from flight_cli.replay import replay
 from flight_cli.report import report
-from flight_core.outcome import STATUS_ENDED_EARLY, exit_status
+from flight_core.outcome import STATUS_ENDED_EARLY, STATUS_INCOMPLETE, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Process, Recording, Tape
+from flight_core.tape import Process, Recording, Signal, Tape
 from flight_log.bag import LogAttachments
 from flight_log.clock import StampClock
 from flight_log.flight_processes import Span, flight_processes
@@ -71,7 +71,7 @@ def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     """What `rise-di replay --json` prints."""
     with pytest.raises(typer.Exit) as end:
         replay(log, as_json=True)
-    assert end.value.exit_code in {0, 1}
+    assert end.value.exit_code in {0, 1, STATUS_INCOMPLETE}
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
     return result
 
@@ -139,7 +139,9 @@ def test_report_says_what_log_lacks_of_guidance(topic: str, name: str, guided: F
 
 def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
-    report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
+    with pytest.raises(typer.Exit) as end:
+        report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
+    assert end.value.exit_code == STATUS_INCOMPLETE
     output = " ".join(capsys.readouterr().out.split())
     assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
     assert "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in output
@@ -309,6 +311,31 @@ def test_stray_messages_are_no_step_of_clock() -> None:
     assert (count, clock.recording().step_ns) == (400, 0)
 
 
+@pytest.mark.parametrize("damaged", [[0], [40], [199], [40, 41, 42]])
+@pytest.mark.parametrize("by", [-5 * NANOSECONDS, 2**62], ids=["back", "forth"])
+def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: int) -> None:
+    """The clock goes on behind them: the samples after a damaged stamp stay."""
+    (log_ns,) = stamps(range(1000, 1200))
+    stamp_ns = log_ns.copy()
+    stamp_ns[damaged] += by
+    clock = StampClock()
+    keep, _ = clock.usable(stamp_ns, log_ns, more=False, end=True)
+    assert np.flatnonzero(~keep).tolist() == damaged
+    assert (clock.recording().unset, clock.recording().step_ns) == (len(damaged), 0)
+
+
+def test_sample_that_comes_late_keeps_its_place() -> None:
+    """A sample that the network held back by 0.3 s has a right stamp."""
+    (stamp_ns,) = stamps(range(1000, 1200))
+    recorded_ns = stamp_ns.copy()
+    recorded_ns[50] += 3 * NANOSECONDS // 10
+    order = np.argsort(recorded_ns, kind="stable")
+    clock = StampClock()
+    keep, _ = clock.usable(stamp_ns[order], recorded_ns[order], more=False, end=True)
+    assert keep.all()
+    assert clock.recording().step_ns == 0
+
+
 def test_clock_step_is_found_across_batches() -> None:
     stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
     log_ns = np.concatenate([*stamps(range(1000, 1200))])
@@ -320,6 +347,18 @@ def test_clock_step_is_found_across_batches() -> None:
         taken, usable = taken + count, usable + int(keep.sum())
     of = clock.recording()
     assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
+
+
+def test_channel_of_scenario_that_y_does_not_have_is_a_lack(tape: Tape, osprey_gust: Scenario) -> None:
+    y = tape["y"]
+    other = Signal(y.stamp_ns, ("pitch_rate", *y.names[1:]), y.values)
+    assert account(replace(tape, signals={**tape.signals, "y": other}), osprey_gust).lacks == (f"{y.names[0]} of y",)
+
+
+def test_samples_before_the_flight_stand_for_none_of_the_flight(tape: Tape, osprey_gust: Scenario) -> None:
+    early = replace(tape["u"], stamp_ns=tape["u"].stamp_ns - 1000 * NANOSECONDS)
+    of = account(replace(tape, signals={**tape.signals, "u": early}, scenario=osprey_gust), osprey_gust)
+    assert of.topics["u"].found == 0
 
 
 def test_rms_is_weighted_by_time() -> None:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writing and reading bags: with independent readers, truncated and damaged files, bags of other recorders."""
 
+import math
 import struct
 import sys
 import tracemalloc
@@ -553,6 +554,19 @@ def test_publisher_with_channels_in_another_order_read_by_names(tmp_path: Path) 
     tape = read_run(tmp_path).tape
     assert (tape["y"].names, tape.notes) == (("q", "V"), ())
     assert tape["y"].values.tolist() == [[k, 50.0] for k in range(20)]
+
+
+def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> None:
+    """Values that are not finite, and a name twice."""
+    with BagWriter(tmp_path) as bag:
+        channel, only = bag.add_topic("/y", JOINT_STATE, ""), bag.add_topic("/u", JOINT_STATE, "")
+        for k, q in enumerate((1.0, math.nan, 3.0, math.inf)):
+            bag.write(channel, k, k, k, vector(k + 1, ("q", "V"), (q, 50.0)))
+            bag.write(only, k, k, k, vector(k + 1, ("thrust", "thrust"), (q, 50.0)))
+    tape = read_run(tmp_path).tape
+    assert tape["y"]["q"].tolist() == [1.0, 3.0]
+    why = "samples refused: damaged, not finite, or of other channels"
+    assert set(tape.notes) == {f"y: 2 {why}", f"u: 4 {why}"}
 
 
 def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> N
             bag.write(topic, k, k, k, vector(k, ["z"], [0.1]))
     tape = read_run(tmp_path / "run").tape
     assert tape["pose"]["climb"].tolist() == [3.0, 4.0, 5.0, 6.0]
-    assert "pose: 12 samples with other names refused" in tape.notes
+    assert "pose: 12 samples refused: damaged, not finite, or of other channels" in tape.notes
 
 
 @pytest.mark.parametrize("indexed", [True, False])

@@ -18,6 +18,7 @@ from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_core.modes import Mode
+from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import flatten, nest
 from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
@@ -33,7 +34,7 @@ def replayed(start: Start, run: Path, *settings: str, status: int = 0) -> dict[s
     process = start("flight_cli.cli", "replay", str(run), "--json", *settings)
     assert process.end() == status, process.output
     output: dict[str, Any] = json.loads(process.output)
-    assert output["equal"] is (status == 0)
+    assert output["equal"] is (status != 1)
     return output
 
 
@@ -125,7 +126,7 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     recorder.wait_for("recording to")
     receive_more(peer_node, 201)
     recorder.interrupt().succeed()
-    output = replayed(start, tmp_path / "run")
+    output = replayed(start, tmp_path / "run", status=STATUS_INCOMPLETE)
     # the recorder is matched with one topic after the other: further first ticks may lack y or u, 7 on a busy host
     assert 0 < output["ticks"] - output["checked"] < 50
     assert output["checked"] > 150

@@ -414,9 +414,9 @@ def sign_switches(tape: Tape) -> dict[str, float]:
     else:
         signal = tracking_error(tape)
         moves = signal.values
-    if len(signal.stamp_ns) < 2:
+    time = seconds(int(np.ptp(signal.stamp_ns))) if len(signal.stamp_ns) else 0.0
+    if time == 0.0:
         return {}
-    time = seconds(int(signal.stamp_ns[-1] - signal.stamp_ns[0]))
     signs = {name: np.sign(column[column != 0.0]) for name, column in zip(signal.names, moves.T, strict=True)}
     return {name: float(np.count_nonzero(np.diff(of))) / time for name, of in signs.items()}
 

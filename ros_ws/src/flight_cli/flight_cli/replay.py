@@ -17,10 +17,12 @@ from flight_analysis.closed_loop.guidance_replay import GuidanceReplay, replay_g
 from flight_analysis.closed_loop.replay import Difference, ReplayResult, recorded_parameters, recorded_scenario, vary
 from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
+from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_core.files import parse_yaml
+from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.tape_reader import read_run
@@ -42,7 +44,8 @@ def replay(
     """Compute every tick of a recorded flight again, and every step of guidance, and compare it with the log bit by bit.
 
     --set computes u from the recorded y and y_m with other parameters. That is an open loop: the aircraft did not fly this u.
-    Exit status: 0 every bit equal, 1 a tick differs or flew with other parameters, 2 bad input.
+    Exit status: 0 every bit equal, 1 a tick differs or flew with other parameters, 2 bad input, 4 every bit equal, and less
+    than 99 % of the ticks are in the log with y and u.
     """
     changed = dict(map(_parse_setting, settings or []))
     require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
@@ -72,7 +75,9 @@ def replay(
         _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
         if guided is not None:
             _show_guidance(guided)
-    raise typer.Exit(0 if result.equal() and (guided is None or guided.equal()) else DIFFERS)
+    equal = result.equal() and (guided is None or guided.equal())
+    part = STATUS_INCOMPLETE if result.whole.sum() < WHOLE * ticks else 0
+    raise typer.Exit(part if equal else DIFFERS)
 
 
 def _show_guidance(guided: GuidanceReplay) -> None:
@@ -119,7 +124,10 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
     first, checked = result.first(), int(result.whole.sum())
     of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
     if first is None:
-        console.print(f"{of}, every bit equal" + (", yet with other parameters" if result.other_parameters.any() else ""))
+        console.print(
+            (f"{of}, every bit equal" if checked else f"{of}: the log holds no tick with y and u")
+            + (", yet with other parameters" if result.other_parameters.any() else "")
+        )
     else:
         different = result.different()
         rows = np.flatnonzero(different.any(axis=1))

@@ -16,6 +16,7 @@ from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
 from flight_cli.output import LATEST, new_table, options, print_json, show_flight
 from flight_core.files import display_path
+from flight_core.outcome import STATUS_INCOMPLETE
 
 
 def report(
@@ -48,7 +49,7 @@ def report(
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
 
-    Exit status: 0, or 2 bad input.
+    Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
     given = scenario_file(scenario)
     with options("html", "output", "png", "csv", "parquet", "figure", "width", "channels", "mat", "tables", "latex"):
@@ -71,13 +72,15 @@ def report(
     if as_json:
         summaries = [flight.summary for flight in flights]
         print_json(summaries[0] if len(flights) == 1 else summaries)
-        return
-    if len(flights) == 1:
-        show_flight(Console(), flights[0])
-        print(f"outcome: {flights[0].summary['outcome']}")
     else:
-        show_comparison(Console(), flights)
-    print(f"report:  {display_path(page)}")
+        if len(flights) == 1:
+            show_flight(Console(), flights[0])
+            print(f"outcome: {flights[0].summary['outcome']}")
+        else:
+            show_comparison(Console(), flights)
+        print(f"report:  {display_path(page)}")
+    if any(flight.summary["account"] and flight.summary["account"]["lacks"] for flight in flights):
+        raise typer.Exit(STATUS_INCOMPLETE)
 
 
 def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None:

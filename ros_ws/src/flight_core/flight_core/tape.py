@@ -67,11 +67,11 @@ class Signal:
 class Recording(NamedTuple):
     """Stamps of the messages of a topic in the order of the recording.
 
-    The samples from a step of the clock of the stamps on, and the samples with a zero stamp, are absent in the signal.
+    The samples from a step of the clock of the stamps on, and the samples without a usable stamp, are absent in the signal.
     """
 
     found: int  # messages
-    unset: int = 0  # zero stamps
+    unset: int = 0  # zero stamps, and stamps far from those around
     repeated: int = 0  # stamps equal to the stamp of the message before
     step_ns: int = 0  # the first step of the clock: negative for a step back; 0 without a step
     step_at_ns: int = 0  # the last stamp before the step

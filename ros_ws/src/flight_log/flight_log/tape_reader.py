@@ -132,6 +132,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     }
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
     without = [f"no stamp of {topic}" for topic, samples in log.topics.items() if samples.recording().unset]
+    without += filter(None, (samples.note(topic) for topic, samples in log.topics.items()))
     require(bool(filled), str(run), "; ".join([nothing, *without, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
@@ -141,7 +142,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     stamped = names_within(aircraft, log.topics).items()
     recording = {printable(name): of for topic, name in stamped if (of := log.topics[topic].recording()).found}
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    told = [log.topics[topic].note(name) for topic, name in names.items()]
+    told = [log.topics[topic].note(name) for topic, name in stamped]
     told += [recording_note(name, of, start_ns) for name, of in recording.items()]
     told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, told)]
@@ -210,7 +211,7 @@ class _TopicSamples:
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
         self._numbered, self._lost = False, 0
-        self._unset = 0  # samples with a zero stamp, left out at the end
+        self._unset = 0  # samples with a zero stamp that `signal` left out
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
         self.spans: dict[str, Span] = {}  # by publisher
         self._refused = 0
@@ -239,9 +240,14 @@ class _TopicSamples:
             return
         decoded = self._decode(table)
         self._refused += decoded.unreadable
-        for received, stamp_ns, unordered, sender in decoded.samples:
-            if unordered.shape[1] == len(received):
+        for received, stamps, unordered, sender in decoded.samples:
+            if unordered.shape[1] == len({*received}) == len(received):
                 names, values = self._ordered(received, unordered)
+                finite = np.isfinite(values).all(axis=1)
+                self._refused += int(np.count_nonzero(~finite))
+                stamp_ns, values = (stamps, values) if finite.all() else (stamps[finite], values[finite])
+                if not len(stamp_ns):
+                    continue
                 span = Span(int(stamp_ns.min()), int(stamp_ns.max()), len(stamp_ns))
                 self.spans[sender] = span.joined(self.spans[sender]) if sender in self.spans else span
                 if names not in self._samples:
@@ -249,7 +255,7 @@ class _TopicSamples:
                     self._samples[names] = Columns(len(names), max(expected, len(values)))
                 self._samples[names].append(stamp_ns, values)
             else:
-                self._refused += len(stamp_ns)
+                self._refused += len(stamps)
 
     def _ordered(self, names: tuple[str, ...], values: NDArray[np.float64]) -> tuple[tuple[str, ...], NDArray[np.float64]]:
         """Names and values in the order of the first sample with these names: values are matched by name."""
@@ -270,8 +276,10 @@ class _TopicSamples:
         signal = self._samples[names].signal(tuple(map(printable, names)))
         stamps = signal.stamp_ns
         zero = stamps == 0
-        zeros, least = int(np.count_nonzero(zero)), len(stamps) - 1 if name in RESTING else 1
-        if name not in UNSTAMPED and zeros and (zeros > max(least, 1) or stamps.max() > SINCE_EPOCH_NS):
+        zeros, usual = int(np.count_nonzero(zero)), len(stamps) - 1 if name in RESTING else 1
+        if zeros > usual:  # a recorder may take each message twice
+            usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
+        if name not in UNSTAMPED and zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
             self._unset = zeros
             signal = signal.where(~zero)
             if not len(signal.stamp_ns):
@@ -303,7 +311,7 @@ class _TopicSamples:
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
         refused = self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
-        return f"{name}: {refused} samples with other names refused" if refused else ""
+        return f"{name}: {refused} samples refused: damaged, not finite, or of other channels" if refused else ""
 
 
 class _Log:

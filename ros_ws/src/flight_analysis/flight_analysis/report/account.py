@@ -40,7 +40,7 @@ class TopicAccount(NamedTuple):
     gap: float | None  # longest interval between two samples
     gap_at: float | None  # begin of the interval
     repeated: int  # samples with the stamp of the sample before, except in a failsafe; not among `found`
-    unset: int  # samples with a zero stamp, left out
+    unset: int  # samples without a usable stamp, left out
     step: float  # of the clock of the stamps, s; 0 without a step
     left_out: int  # samples after the step
     unsent: int  # samples that the publisher left out on a busy host, by the numbers of the messages
@@ -192,7 +192,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
         end_ns = planned_ns
     expected = {} if scenario is None else _expected(tape, scenario, end_ns, from_start=from_start, simulated=simulated)
     names = [*dict.fromkeys([*(name for name in tape.signals if name in RATED), *expected])]
-    topics = {name: _topic(tape, name, expected.get(name), end_ns) for name in names}
+    begin_ns = tape.start_ns if from_start else None
+    topics = {name: _topic(tape, name, expected.get(name), begin_ns, end_ns) for name in names}
     late = {} if scenario is None else _latest(scenario)
     if scenario is not None and tape.start_ns > SINCE_EPOCH_NS:  # in real time
         for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
@@ -222,8 +223,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     unflown = unflown_legs(tape, section) if legs and section is not None else ()
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
     return Account(
-        end, topics, (*parts, *lacks), _too_busy(busy), unguided, tuple(legs), tuple(unflown), _processes(tape),
-        late=first if first is not None and first > end / 2.0 else None,
+        end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided, tuple(legs), tuple(unflown),
+        _processes(tape), late=first if first is not None and first > end / 2.0 else None,
     )  # fmt: skip
 
 
@@ -251,6 +252,16 @@ def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
     """Parts of a bag that are missing. A truncated end counts where no planned end does."""
     kinds = ["and missing; the log is a part", *([] if planned else [" is truncated: "])]
     return [note.partition(";")[0] for note in notes if any(kind in note for kind in kinds)]
+
+
+def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
+    """The channels of the scenario that the samples of y, y_m and u do not have, a sentence a topic."""
+    if scenario is None:
+        return []
+    outputs = scenario.controller.outputs
+    wanted = {"y": outputs, "y_m": outputs, "u": scenario.controller.effectors}
+    absent = {name: [of for of in wanted[name] if of not in tape[name].names] for name in wanted if name in tape}
+    return [f"{', '.join(names)} of {name}" for name, names in absent.items() if names]
 
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
@@ -335,14 +346,15 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     return ticks, float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
 
 
-def _topic(tape: Tape, name: str, expected: int | None, end_ns: int) -> TopicAccount:
+def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, end_ns: int) -> TopicAccount:
     of = tape.recording.get(name, Recording(0))
     signal = tape.signals.get(name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))).until(end_ns)
+    early = 0 if begin_ns is None else int(np.searchsorted(signal.stamp_ns, begin_ns))
     count, t = len(signal.stamp_ns), (signal.stamp_ns - tape.start_ns) / NANOSECONDS
     gaps = np.diff(t)
     longest = int(np.argmax(gaps)) if len(gaps) else None
     return TopicAccount(
-        expected, count,
+        expected, count - early,
         float(t[0]) if count else None, float(t[-1]) if count else None,
         None if longest is None else float(gaps[longest]), None if longest is None else float(t[longest]),
         of.repeated if of.found else int(np.count_nonzero(gaps == 0.0)), of.unset, seconds(of.step_ns), of.left_out, 0,
@@ -378,7 +390,7 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: floa
     if topic.step and topic.last is not None:
         facts.append(f"the clock of its stamps steps by {topic.step:+.3f} s after t = {topic.last:.3f} s")
     if topic.unset:
-        facts.append(f"{topic.unset} samples without a stamp")
+        facts.append(f"{topic.unset} samples without a usable stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
     missing = not topic.holds(topic.found + topic.unsent)

@@ -151,7 +151,8 @@ def summarise(
     outcome = tape.outcome if outcome is None else outcome
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
-        require(topic in tape, "the log", f"no sample of {topic}{unset}", "a flight with y and y_m")
+        refused = "".join(f" ({note})" for note in tape.notes if note.startswith(f"{topic}: ") and "refused" in note)
+        require(topic in tape, "the log", f"no sample of {topic}{unset}{refused}", "a flight with y and y_m")
     of, events = account(tape, scenario, outcome) if of is None else of, transients(scenario, tape)
     of = of._replace(commands=_commands(tape, events, of.end))
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
