@@ -283,6 +283,13 @@ def test_vector_environment_starts_diverged_aircraft_and_ended_flight_again() ->
     assert again.shape == first.shape
 
 
+@pytest.mark.parametrize(("name", "actions"), [("osprey_learn", 4), ("osprey_twin", 7)])
+def test_vector_environment_takes_a_learner_and_an_allocation(name: str, actions: int) -> None:
+    """The agent acts in place of the learner; it commands the effectors of the allocation."""
+    flights = rise_di.FlightVectorEnv(rise_di.find_scenario(name, 1.0), 2)
+    assert flights.action_space.shape == (2, actions)
+
+
 @pytest.mark.parametrize(
     ("actions", "expected"), [(np.zeros((3, M)), r"of shape \(2, 4\)"), (np.full((2, M), np.nan), "finite")]
 )

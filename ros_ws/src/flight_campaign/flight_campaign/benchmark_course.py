@@ -61,8 +61,8 @@ class Course(NamedTuple):
 def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, an allocation, a delay of y by a part of a
-    tick, dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y by a part of a tick, dropouts
+    of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
@@ -72,8 +72,6 @@ def build_course(scenario: Scenario) -> Course:
     require(
         at_trim, "controller.schedule", "models at other speeds", "none: the aircraft of a campaign fly at their trim speed"
     )
-    allocation = controller.allocation
-    require(allocation is None, "controller.allocation", "a section", "none: many aircraft at once fly the inputs of the law")
     airframe, plant = aircraft.load()[0], aircraft.plant()
     tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
     ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")

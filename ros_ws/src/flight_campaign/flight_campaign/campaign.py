@@ -221,7 +221,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
     result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
-    outputs, inputs = scenario.controller.outputs, scenario.controller.inputs
+    outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
     if result.mission is None:
         figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
     else:

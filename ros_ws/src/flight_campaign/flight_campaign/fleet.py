@@ -21,15 +21,17 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams, share
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign import missions
+from flight_campaign import fleet_allocation, missions
 from flight_campaign.benchmark_course import Course, Segments
+from flight_campaign.fleet_allocation import allocate
 from flight_campaign.missions import Mission
 from flight_core.arithmetic import product
 from flight_core.integrators import rk4
 from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray
+from rise_di_controller.allocation import Allocation, reached
 from rise_di_controller.control_law import ControlLaw, Measurements
-from rise_di_controller.saturation import Limits
+from rise_di_controller.saturation import Limits, saturate
 
 jax.config.update("jax_enable_x64", True)  # float64 as everywhere else in the stack
 
@@ -61,9 +63,9 @@ class Fleet(NamedTuple):
     """
 
     blocks: tuple[StateBlock, ...]
-    tick: tuple[Array, ...]  # (n, n + K m + q, N), by blocks, without entries that are 0 in all aircraft
+    tick: tuple[Array, ...]  # (n, n + K p + q, N), by blocks, without entries that are 0 in all aircraft
     forced: Array  # (n, K r, N)
-    rate: Array  # (m, n + m, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
+    rate: Array  # (m, n + p, N): C x_dot = rate @ [x, p] + wind forced_rate @ w_1, up to the remainder
     forced_rate: Array  # (m, r, N)
     wind: Array  # (N,) factor of the course's gusts and turbulence
     late: Array  # (N,) delay of u, whole ticks
@@ -74,14 +76,15 @@ class Vehicle(NamedTuple):
     """Properties that all aircraft of a fleet share."""
 
     outputs: Array  # (m,) indices of the outputs in the state, in the law's order
-    inputs: Array  # (m,) indices of the law's inputs in the airframe's order
+    inputs: Array  # (p,) indices of the effectors in the airframe's order
     remainder_states: Array  # (c,) indices of the states in the nonlinear remainder
     remainder: Aircraft  # reduced to the remainder: f_state of x[remainder_states] gives the rows `remainder_rows`
-    actuators: Actuators  # (m, 1), airframe's order
+    actuators: Actuators  # (p, 1), airframe's order
     limits: Limits  # (m, 1), law's order: of u, as the controller has them
     quantum: Array | None  # (m, 1), law's order
     dt: float  # s, of a step of the integration
     vanes: tuple[int, ...] = ()  # indices in the state of what the vanes read
+    allocation: Allocation | None = None  # None: the inputs of the law are the effectors
 
 
 def vehicle(scenario: Scenario) -> Vehicle:
@@ -90,15 +93,17 @@ def vehicle(scenario: Scenario) -> Vehicle:
     aircraft, errors = plant.aircraft, scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
     quantum = None if errors.quantum is None else errors.quantum[order]
+    guard = scenario.controller.guard()
     return Vehicle(
         np.argmax(aircraft.C[order], axis=1),
-        np.array([list(channels.inputs).index(name) for name in scenario.controller.inputs]),
+        np.array([list(channels.inputs).index(name) for name in scenario.controller.effectors]),
         *_reduced(aircraft),
         Actuators(*(None if values is None else values[:, None] for values in plant.actuators)),
-        Limits(*(values[:, None] for values in scenario.controller.guard().limits)),
+        Limits(*(values[:, None] for values in guard.limits)),
         None if quantum is None else quantum[:, None],
         seconds(plant.step_ns),
         tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
+        None if guard.allocation is None else fleet_allocation.of_fleet(guard.allocation),
     )
 
 
@@ -112,7 +117,7 @@ class FleetResult(NamedTuple):
 
     rms: Array  # (m, N)
     max: Array  # (m, N)
-    slew: Array  # (m, N) mean abs(u_dot), units of u / s
+    slew: Array  # (p, N) mean abs(u_dot) by effector, units of u / s
     diverged: Array  # (N,) bool: the state exceeded DIVERGENCE_LIMIT, the other figures are invalid
     mission: dict[str, Array] | None = None  # of `missions.figures`; None without guidance
     windows: Array | None = None  # (W, m, N) rms by window
@@ -127,7 +132,7 @@ def assemble(
     late: Array = 0,
     gust_directions: FloatArray | None = None,
 ) -> Fleet:
-    """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, m).
+    """The matrices of N aircraft, A of shape (N, n, n) and B of (N, n, p).
 
     With L = A + gravity, Phi and Gamma the matrices of one Runge-Kutta step of x_dot = L x + u with u held,
 
@@ -273,15 +278,16 @@ class LoopState(NamedTuple):
     """State of the closed loop from tick to tick."""
 
     x: Array  # (n, N)
-    position: Array  # (m, N) airframe's order
+    position: Array  # (p, N) airframe's order
     remainder: Array  # (q, N) of the previous tick
     law: Any
     u: Array  # (m, N) law's order
+    command: Array  # (p, N) the effectors; u without an allocation
     y_before: Array  # (y_late, m, N) newest first
-    u_before: Array  # (u_late, m, N)
+    command_before: Array  # (u_late, p, N)
     squares: Array  # (W, m, N) sums over the ticks of a window
     max: Array
-    travel: Array  # sum of abs(u - previous u)
+    travel: Array  # (p, N) sum of abs(command - previous command)
     bounded: Array  # (N,) whether the state stayed below DIVERGENCE_LIMIT
     mission: Any  # MissionState; None without guidance
 
@@ -309,25 +315,37 @@ def _fly(
         if vehicle.vanes:
             vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
             vane_m = segment.vane_m[:, None] + 0.0 * vane
-        return Measurements(y, y_m, y_m_dot, u_trim, now.u, now.position[vehicle.inputs], x, x_air, moving, vane, vane_m)
+        position = now.position[vehicle.inputs]
+        if vehicle.allocation is not None:
+            position = product(vehicle.allocation.effect, position)
+        return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
-    def engage(now: LoopState, *measured: Any) -> tuple[Any, Array]:
+    def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
         started = control_law.engage(measure(now, *measured), params)
-        return jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law), now.u
+        law = jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law)
+        return law, now.u, now.command
 
-    def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array]:
-        law, _, u = control_law.limited(now.law, measure(now, segment, sample), segment.dt, params, vehicle.limits)
-        return law, u
+    def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array, Array]:
+        measured, limits, allocation = measure(now, segment, sample), vehicle.limits, vehicle.allocation
+        if allocation is None:
+            law, _, u = control_law.limited(now.law, measured, segment.dt, params, limits)
+            return law, u, u
+        # As the guard: what the effectors give limits the law.
+        _, u_free = control_law.step(now.law, measured, segment.dt, params)
+        _, given = allocate(saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation)
+        law, _, u = control_law.limited(now.law, measured, segment.dt, params, reached(u_free, given))
+        command, u = allocate(u, now.command, segment.dt, allocation)
+        return law, u, command
 
-    def hold(now: LoopState, *measured: Any) -> tuple[Any, Array]:
-        return control_law.missed(now.law, measure(now, *measured), params), now.u
+    def hold(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
+        return control_law.missed(now.law, measure(now, *measured), params), now.u, now.command
 
     def tick(now: LoopState, at_tick: tuple[Segments, Array | None, Array]) -> tuple[LoopState, None]:
         segment, action, window = at_tick
         sensed, sample = _sense(now, segment, action, window, vehicle, mission)
-        law, u = jax.lax.switch(segment.phase, (hold, engage, step), now, segment, sample)
-        return _advance(sensed._replace(law=law), u, segment, fleet, vehicle, mission, timing), None
+        law, u, command = jax.lax.switch(segment.phase, (hold, engage, step), now, segment, sample)
+        return _advance(sensed._replace(law=law, u=u), command, segment, fleet, vehicle, mission, timing), None
 
     first = jax.tree.map(lambda segment: segment[0], segments)
     begin = _in_trim(fleet, vehicle, mission, timing)
@@ -377,17 +395,17 @@ def _sense(
 
 
 def _advance(
-    now: LoopState, u: Array, segment: Segments, fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing
+    now: LoopState, command: Array, segment: Segments, fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing
 ) -> LoopState:
-    """The state at the next tick, with the command u of this one."""
+    """The state at the next tick, with the command of this one."""
     blocks, u_late, flown = timing.blocks, timing.u_late, now.mission
     places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
-    history = jnp.concatenate([u[None], now.u_before])
-    acting = u if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
-    command = acting[jnp.argsort(vehicle.inputs)]
+    history = jnp.concatenate([command[None], now.command_before])
+    acting = command if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
+    commanded = acting[jnp.argsort(vehicle.inputs)]
 
     def move(position: Array, t: Array) -> tuple[Array, Array]:
-        return actuators.move(t, position, command, vehicle.dt, vehicle.actuators)
+        return actuators.move(t, position, commanded, vehicle.dt, vehicle.actuators)
 
     # A loop of its own: without one the compiler computes all mean positions again for each state that they act on.
     position, means = jax.lax.scan(move, now.position, segment.t + np.arange(timing.steps) * vehicle.dt)
@@ -408,9 +426,9 @@ def _advance(
         x=x,
         position=position,
         remainder=remainder,
-        u=u,
-        u_before=history[:u_late],
-        travel=now.travel + jnp.abs(u - now.u),
+        command=command,
+        command_before=history[:u_late],
+        travel=now.travel + jnp.abs(command - now.command),
         mission=flown,
     )
 
@@ -461,7 +479,7 @@ class Stepper:
         return y, np.broadcast_to(np.asarray(sample.y_m), y.shape)
 
     def advance(self, u: FloatArray) -> None:
-        """To the next tick with the command u, (m, N), in the law's order."""
+        """To the next tick with the command u, (p, N), in the order of the controller's effectors."""
         self._state = _advance_once(
             self._state, u, self._segments, self._k, self._fleet, self._vehicle, self._mission, self._timing
         )
@@ -483,9 +501,16 @@ def _sense_once(now: LoopState, segments: Segments, k: int, *others: Any) -> tup
 
 @partial(jax.jit, static_argnames=("timing",))
 def _advance_once(
-    now: LoopState, u: Array, segments: Segments, k: int, fleet: Fleet, of: Vehicle, mission: Mission | None, timing: Timing
+    now: LoopState,
+    command: Array,
+    segments: Segments,
+    k: int,
+    fleet: Fleet,
+    of: Vehicle,
+    mission: Mission | None,
+    timing: Timing,
 ) -> LoopState:
-    return _advance(now, u, jax.tree.map(lambda values: values[k], segments), fleet, of, mission, timing)
+    return _advance(now, command, jax.tree.map(lambda values: values[k], segments), fleet, of, mission, timing)
 
 
 def _at(t: Array, fleet: Fleet) -> Fleet:
@@ -501,19 +526,20 @@ def _at(t: Array, fleet: Fleet) -> Fleet:
 
 def _in_trim(fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing) -> LoopState:
     """The state of the closed loop before the first tick, without that of the law."""
-    n, count, m = len(fleet.forced), len(fleet.wind), len(vehicle.outputs)
-    none = jnp.zeros((m, count))
+    n, count, m, p = len(fleet.forced), len(fleet.wind), len(vehicle.outputs), len(vehicle.inputs)
+    none, command = jnp.zeros((m, count)), jnp.zeros((p, count))
     return LoopState(
         jnp.zeros((n, count)),
-        none,
+        command,
         jnp.zeros((len(vehicle.remainder.gravity), count)),
         None,
         none,
+        command,
         jnp.zeros((timing.y_late, m, count)),
-        jnp.zeros((timing.u_late, m, count)),
+        jnp.zeros((timing.u_late, p, count)),
         jnp.zeros((len(timing.windows) + 1, m, count)),
         none,
-        none,
+        command,
         jnp.ones(count, dtype=bool),
         None if mission is None else missions.initial_state(count, timing.y_late, mission),
     )

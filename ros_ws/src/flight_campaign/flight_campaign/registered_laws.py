@@ -71,8 +71,11 @@ def find_laws(names: Iterable[str], scenario: Scenario, others: Mapping[str, Sce
     """For each name the controller that flies, None for a law of the catalogue.
 
     Beside the catalogue a name may be the law of the scenario's own controller, or a key of `others`: scenarios given in place
-    of a law. Raises ParameterError for an unknown name, and for a controller with a different rate or order of the channels.
+    of a law. Raises ParameterError for an unknown name, for an allocation, and for a controller with a different rate or order
+    of the channels.
     """
+    effectors = "none: the laws that are compared command the effectors"
+    require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
     found: dict[str, ControllerConfig | None] = {}
     for name in names:
         if name in others:

@@ -50,6 +50,12 @@ def _channels(scenario: Scenario) -> _Channels:
     )
 
 
+def _without_models(scenario: Scenario) -> Scenario:
+    """The scenario with the law alone, in whose place the agent acts: models of a law, or a learner, bind no agent."""
+    models = ("feedforward", "observer", "schedule", "learn")
+    return scenario.vary(controller={key: None for key in models if getattr(scenario.controller, key, None) is not None})
+
+
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Inputs of a step. Raises ParameterError for another shape, and for values that are not finite numbers."""
     expected = f"finite numbers of shape {shape}"
@@ -62,7 +68,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     """Simulator and reference model of a scenario; the agent gives u.
 
     Observation: y then y_m, shape (2 m,), SI, deviations from trim, outputs in the order of the controller; the newest y that
-    has arrived. Action: u, shape (m,), SI, deviation from trim, in the order of the controller's inputs, within its limits.
+    has arrived. Action: u, shape (p,), SI, deviation from trim, in the order of the controller's inputs, or of the effectors of
+    its allocation, within their limits.
     Reward of a step: -T sum_i abs(y_i - y_m_i) / unit_i, T the period of the controller and unit_i the unit of the score,
     10 mrad/s (p 20) or 0.1 m/s. An aircraft that diverges terminates the episode: LOSS_OF_TRACK_SCORE for each second left.
     The end of the flight's duration truncates the episode.
@@ -148,7 +155,7 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):
     """N uncertain aircraft of a scenario on one course, compiled.
 
-    Observations have the shape (N, 2 m), actions (N, m) and rewards (N,), with the rows of FlightEnv. The aircraft share
+    Observations have the shape (N, 2 m), actions (N, p) and rewards (N,), with the rows of FlightEnv. The aircraft share
     commands, wind and the noise of the sensors, and end together. Every `reset` draws N aircraft. A diverged aircraft
     terminates. The next step starts the same aircraft from trim at the present time of the course, and the step after the end
     of the flight draws N aircraft again: `AutoresetMode.NEXT_STEP`.
@@ -158,7 +165,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         num_envs: N.
         uncertainty: The largest part by which the entries of A and B of an aircraft are off, 0 to 1.
 
-    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of JSBSim or an allocation.
+    Raises ParameterError without gymnasium, and for a scenario beyond a campaign, as an aircraft of JSBSim.
     """
 
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
@@ -169,7 +176,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self.scenario = as_scenario(scenario)
         self.num_envs = as_count(num_envs, "num_envs", 1)
         self._uncertainty = as_number(uncertainty, "uncertainty", 0.0, 1.0)
-        self._course, self._vehicle, self._fleet = build_course(self.scenario), fleet.vehicle(self.scenario), fleet
+        plain = _without_models(self.scenario)
+        self._course, self._vehicle, self._fleet = build_course(plain), fleet.vehicle(plain), fleet
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
@@ -189,8 +197,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         return self._begin(), {}
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Hold u for a period, (N, m). Raises ParameterError for another shape, and for an action that is not finite."""
-        u = _actions(actions, (self.num_envs, len(self._units)))
+        """Hold u for a period, (N, p). Raises ParameterError for another shape, and for an action that is not finite."""
+        u = _actions(actions, (self.num_envs, len(self._vehicle.inputs)))
         require(self._last > 0, "step", "a step before an episode", "reset() first")
         none = np.zeros(self.num_envs, dtype=bool)
         if self._last == self._k:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from flight_core.arithmetic import product
-from flight_core.vectors import Array, FloatArray
+from flight_core.vectors import Array, FloatArray, array_namespace
 from rise_di_controller.saturation import Limits, bounds
 
 SWEEPS = 10
@@ -76,10 +76,11 @@ def allocate(v: FloatArray, u_before: FloatArray, dt: Array, params: Allocation)
     return u, product(params.effect, u)
 
 
-def reached(v_free: FloatArray, v: FloatArray) -> Limits:
+def reached(v_free: Array, v: Array) -> Limits:
     """The limits that take v_free to the v that the effectors give, for the anti-windup of a law."""
-    infinite = np.full_like(v, np.inf)
-    return Limits(np.where(v_free < v, v, -infinite), np.where(v_free > v, v, infinite), infinite)
+    xp = array_namespace(v)
+    infinite = xp.full_like(v, xp.inf)
+    return Limits(xp.where(v_free < v, v, -infinite), xp.where(v_free > v, v, infinite), infinite)
 
 
 def _inside(u: FloatArray, low: FloatArray, high: FloatArray) -> bool:

@@ -24,7 +24,7 @@ from rise_di_controller.linear_loop import (
     linear_law,
 )
 from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
-from rise_di_controller.params import ControllerConfig
+from rise_di_controller.params import AllocationConfig, ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
 
@@ -115,6 +115,9 @@ def scenario_loop(
     """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as `margins`."""
     airframe = _model(scenario, controller)
     A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
+    if controller.allocation is not None and not scenario.aircraft.is_jsbsim:  # B of each effector is drawn
+        B = B @ _distribution(airframe, controller.allocation)
+        airframe = through_allocation(airframe, controller)
     return linear_loop(controller, airframe, A, B)
 
 
@@ -138,8 +141,13 @@ def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airf
     """The airframe that the law of a controller sees: with its inputs v, u = T v; without an allocation as it is."""
     if (allocation := controller.allocation) is None:
         return airframe
+    return airframe.through(_distribution(airframe, allocation), controller.inputs)
+
+
+def _distribution(airframe: Airframe, allocation: AllocationConfig) -> FloatArray:
+    """T (p, m) with the rows in the order of the inputs of an airframe."""
     T = np.reshape(allocation.T, (len(allocation.effectors), -1))
-    return airframe.through(T[[allocation.effectors.index(name) for name in airframe.inputs]], controller.inputs)
+    return T[[allocation.effectors.index(name) for name in airframe.inputs]]
 
 
 def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
@@ -171,13 +179,13 @@ def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[in
 
 
 def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
-    """The airframe of a scenario, or y_dot = Omega u from the controller of an aircraft of JSBSim.
+    """The airframe of a scenario, or y_dot = Omega u of the inputs of the law from the controller of an aircraft of JSBSim.
 
     Omega comes from the feedforward, or from abs(Omega_ii) = omega / input_scale of RISE-DI, an upper bound.
     """
     aircraft = scenario.aircraft
     if not aircraft.is_jsbsim:
-        return through_allocation(load_airframe(aircraft.airframe), controller)
+        return load_airframe(aircraft.airframe)
     if controller.feedforward is not None and set(controller.feedforward.states) == set(controller.outputs):
         names = controller.feedforward.states
         A, B = np.reshape(controller.feedforward.A, (len(names), -1)), np.reshape(controller.feedforward.B, (len(names), -1))
