@@ -7,7 +7,9 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 import timeit
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -68,6 +70,21 @@ def test_variable_without_use_is_named(variables: dict[str, str], sentence: str,
 @pytest.mark.parametrize("value", ["0", "232", ""])
 def test_right_domain_passes(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
+    require_ros_environment()
+
+
+@pytest.mark.parametrize("date", ["1969-12-31T23:59:59", "2038-01-18T03:14:08", "2038-01-20T00:00:00", "2107-01-01T00:00:00"])
+def test_clock_beyond_the_stamps_of_ros_is_named(date: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """2^31 s is 2038-01-19T03:14:08 UTC. The middleware reports that it "cannot publish data"."""
+    at = datetime.fromisoformat(f"{date}+00:00").timestamp()
+    monkeypatch.setattr(time, "time", lambda: at)
+    with pytest.raises(ParameterError, match=rf"^system clock: found {date[:10]} .* to 2038-01-18 03:14 UTC.* --in-process$"):
+        require_ros_environment()
+
+
+@pytest.mark.parametrize("date", ["1970-01-01T00:00:00", "2038-01-18T03:14:07"])
+def test_clock_within_the_stamps_of_ros_passes(date: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(time, "time", lambda: datetime.fromisoformat(f"{date}+00:00").timestamp())
     require_ros_environment()
 
 

@@ -10,6 +10,7 @@ import re
 import resource
 import socket
 import sys
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
@@ -18,11 +19,15 @@ PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 MAX_PARTICIPANTS = 100  # of a domain, by `flight_ros/loopback.xml`
 SHARED_MEMORY, LEAST_SHARED_MEMORY = Path("/dev/shm"), 1 << 16  # bytes; rclpy and a flight use 12 kB # noqa: S108
 LEAST_FILES = 128  # open at once in a process
+LAST_START = 2**31 - 86_400
+"""s. A stamp of ROS 2 has seconds of 32 bits with a sign: the last is on 2038-01-19 (builtin_interfaces/Time). Nodes start
+until a day before."""
 MAX_DOMAIN = 232  # a higher domain has port numbers above 65535 (DDSI-RTPS 2.3, section 9.6.1.1)
 
 
 def require_ros_environment() -> None:
-    """Raise ParameterError with the mend where no node can start: logs, shared memory, loopback, domain, middleware."""
+    """Raise ParameterError with the mend where no node can start: clock, logs, shared memory, loopback, domain, middleware."""
+    _require_clock()
     _require_domain()
     _require_middleware()
     _require_shared_memory()
@@ -31,6 +36,14 @@ def require_ros_environment() -> None:
     _require_log_settings()
     if PROFILE_VARIABLE not in os.environ:
         _require_loopback()
+
+
+def _require_clock() -> None:
+    now = time.time()
+    if not 0.0 <= now < LAST_START:
+        date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(now))
+        wanted = "1970 to 2038-01-18 03:14 UTC, which the stamps of ROS 2 can hold"
+        _refuse(f"system clock: found {date}, expected {wanted}: set the clock (date --set), or fly with --in-process")
 
 
 def _require_domain() -> None:
