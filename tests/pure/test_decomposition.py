@@ -273,7 +273,29 @@ def test_search_prefers_smaller_u_among_equal_changes(near: float, far: float, i
     assert float(np.max(np.abs(pairing.U - np.eye(3)))) < 0.2  # it is above 1 for the other pairing
 
 
+@pytest.mark.parametrize("m", [6, 16])
+def test_search_pairs_many_channels(m: int) -> None:
+    """Sixteen have (16!)^2 orders, 4e26, of which no computer tries all."""
+    random = np.random.default_rng(m)
+    inputs = random.permutation(m)
+    Omega = 0.02 * random.uniform(-1.0, 1.0, (m, m))
+    Omega[range(m), inputs] = random.choice([-1.0, 1.0], m) * random.uniform(1.0, 2.0, m)
+    pairing = pairing_of(Omega, largest_U=0.5)
+    assert (pairing.outputs, pairing.inputs) == (tuple(range(m)), tuple(inputs))
+    ordered = Omega[:, inputs] * np.array(pairing.signs)
+    assert all(np.linalg.det(ordered[:k, :k]) > 0.0 for k in range(1, m + 1))
+
+
+def test_search_of_many_channels_pivots() -> None:
+    """[[0, 1], [1, 1]] three times: each output responds most to an input that leaves a minor of zero."""
+    Omega: FloatArray = np.kron(np.eye(3), np.array([[0.0, 1.0], [1.0, 1.0]])).astype(np.float64)
+    outputs, inputs, input_signs, _ = pairing_of(Omega)
+    ordered = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
+    np.testing.assert_array_equal(signs(ordered), np.ones(6))
+
+
 def test_search_finds_nothing_for_a_singular_omega() -> None:
+    assert search(np.ones((6, 6))) is None
     assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
 
 
