@@ -161,6 +161,7 @@ def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.
         ("./two", "found 'jsbsim:./two', a folder with a.xml, b.xml, expected a folder with one model"),
         ("empty", "found 'jsbsim:empty', expected jsbsim:./empty perhaps"),
         ("engine.xml", "found 'jsbsim:engine.xml', a file with piston_engine, expected the XML file of an aircraft"),
+        ("./page", "found 'jsbsim:./page', a file with html, expected the XML file of an aircraft"),
         ("text.xml", "found 'jsbsim:text.xml', a file with no XML, expected the XML file of an aircraft"),
         ("c172q", r"found 'jsbsim:c172q', expected jsbsim:c172\w perhaps, or jsbsim:PATH with a /"),
         ("zzz", "found 'jsbsim:zzz', expected a name in .*/aircraft, or jsbsim:PATH with a /"),
@@ -170,8 +171,9 @@ def test_wrong_path_refused_with_what_is_there(
     path: str, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for folder in ("empty", "two"):
+    for folder in ("empty", "two", "page"):
         (tmp_path / folder).mkdir()
+    (tmp_path / "page" / "page.xml").write_text("<html/>", encoding="utf-8")
     for name in ("a", "b"):
         (tmp_path / "two" / f"{name}.xml").write_text('<?xml version="1.0"?><fdm_config/>', encoding="utf-8")
     (tmp_path / "engine.xml").write_bytes((PACKAGE / "engine" / "eng_io320.xml").read_bytes())
@@ -193,3 +195,17 @@ def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Pa
     condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
     with pytest.raises(FlightEnded, match=rf"cannot be loaded: no .xml of own_engine is in {tmp_path}/Engines or .*/engine$"):
         trim_solution(condition)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_model_writes_no_file_of_its_choice(inside: bool, tmp_path: Path) -> None:
+    """JSBSim takes an absolute name of an output as it stands, and writes while it loads."""
+    table, output = tmp_path / "table.csv", '<output name="{}" type="CSV" rate="10"><rates> ON </rates></output>'
+    output = output.format(table)
+    (tmp_path / "output.xml").write_text(output, encoding="utf-8")
+    model = write_model(tmp_path / "plane", "electric147kW")
+    reference = output if inside else '<output file="../output.xml"/>'
+    model.write_text(model.read_text(encoding="utf-8").replace("</fdm_config>", f"{reference}</fdm_config>"), encoding="utf-8")
+    with pytest.raises(FlightEnded, match=f"cannot be loaded: its output would write {table}, expected a model without"):
+        trim_solution(FlightCondition(str(model), 46.3, 1219.2, STEP_NS))
+    assert not table.exists()

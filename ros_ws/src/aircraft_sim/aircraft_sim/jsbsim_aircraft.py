@@ -172,11 +172,9 @@ def _model_file(path: Path, airframe: str) -> Path:
         require(element == MODEL_ELEMENT, "airframe", f"{airframe!r}, a file with {element or 'no XML'}", expected)
         return path
     named = path / f"{path.name}{SUFFIX}"
-    models = (
-        [named]
-        if named.is_file()
-        else sorted(file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT)
-    )
+    if named.is_file():
+        return _model_file(named, airframe)
+    models = sorted(file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT)
     found = ", ".join(model.name for model in models) or "no model"
     require(len(models) == 1, "airframe", f"{airframe!r}, a folder with {found}", f"a folder with one model, or {expected}")
     return models[0]
@@ -222,10 +220,22 @@ def missing_engines(model: Path) -> str:
     return f"no {SUFFIX} of {', '.join(missing)} is in {folders[0]} or {folders[-1]}" if missing else ""
 
 
+def foreign_output(model: Path) -> str:
+    """A sentence on a file anywhere on this host that a model would write; "" where its output is relative, which is off."""
+    named = [model, *(model.parent / name for name in _named_files(model, ("output",)))]
+    outputs = (element for path in named if path.is_file() for element in _elements(path) if element.tag == "output")
+    absolute = [name for element in outputs if Path(name := element.get("name", "")).is_absolute()]
+    return f"its output would write {absolute[0]}, expected a model without the output" if absolute else ""
+
+
 def _named_files(model: Path, elements: Collection[str] = ()) -> list[str]:
     """The files that a model names, in these elements or in all. Raises ParameterError for a file cut short."""
+    every = _elements(model)
+    return [name for element in every if (name := element.get("file")) and (not elements or element.tag in elements)]
+
+
+def _elements(model: Path) -> list[ElementTree.Element]:
     try:
-        every = ElementTree.parse(model).iter()  # noqa: S314 - JSBSim reads the file too
+        return [*ElementTree.parse(model).iter()]  # noqa: S314 - JSBSim reads the file too
     except ElementTree.ParseError as error:
         raise ParameterError(f"{model}: found XML with {error}, expected a whole file") from None
-    return [name for element in every if (name := element.get("file")) and (not elements or element.tag in elements)]

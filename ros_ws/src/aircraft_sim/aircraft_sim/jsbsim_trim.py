@@ -19,6 +19,7 @@ from aircraft_sim.jsbsim_aircraft import (
     Command,
     FlightCondition,
     Trim,
+    foreign_output,
     missing_engines,
     root,
     root_of,
@@ -250,7 +251,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
         fdm.set_aircraft_path(str(model.parent))
     fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
     try:
-        problem = missing_engines(model) if own else ""
+        problem = (missing_engines(model) or foreign_output(model)) if own else ""
     except ParameterError as error:
         problem = str(error)
     if problem:
