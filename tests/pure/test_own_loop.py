@@ -18,7 +18,7 @@ from flight_core.modes import Mode
 from flight_core.outcome import FlightEnded
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, select
-from rise_di_controller.linear_loop import sampled_plant
+from rise_di_controller.linear_loop import linear_law, sampled_plant
 from rise_di_controller.margins import loop_transfer
 
 SCENARIO = rise_di.find_scenario("osprey_servo", 3.0)
@@ -158,6 +158,21 @@ def test_python_control_flies_law_to_rounding(flown: Tape) -> None:
     response = control.input_output_response(law, np.arange(v.shape[1]) / CONTROLLER.rate, v)
     # stamps in ns against t = k T: dt of the law differs in the last bits
     np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
+
+
+def test_python_control_commands_effectors() -> None:
+    """At the stops as the guard; near e = 0 the gain is T times that of the inputs of the law."""
+    twin = rise_di.find_scenario("osprey_twin").controller
+    assert twin.allocation is not None
+    law, loop, size = rise_di.as_control(twin), rise_di.Loop(twin), len(twin.outputs)
+    v = np.zeros((2 * size, 60))
+    v[0, 1:], v[2, 1:] = 0.5, -0.5  # errors of q and r, which take an elevator to its stop
+    u = np.array([loop.step(k * loop.period, *np.split(row, 2)) for k, row in enumerate(v.T)])
+    assert (np.abs(u) > 0.99 * twin.effector_limits().upper).any()
+    response = control.input_output_response(law, np.arange(60) / twin.rate, v)
+    np.testing.assert_allclose(response.outputs.T, u, atol=1e-9)
+    near, inner = rise_di.as_control(twin, linear=True), linear_law(twin.tuned_law(), size, loop.period)
+    np.testing.assert_allclose(near.D, np.reshape(twin.allocation.T, (-1, size)) @ inner.D)
 
 
 def test_linear_law_closes_loop_of_margins() -> None:

@@ -20,6 +20,7 @@ from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.control_law import Measurements, fields, restored
 from rise_di_controller.controller import Controller, ControlOutput
+from rise_di_controller.guard import law_within_limits
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.params import ControllerConfig
@@ -143,7 +144,8 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     """The engaged law as a discrete system of python-control, with limits and anti-windup: `y_NAME`, `y_m_NAME` -> `u_NAME`.
 
     The period is that of the controller. The state is that of the law, then u and y_m of the last tick; from 0 the flight
-    starts in trim. With `linear` the law near e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins.
+    starts in trim. With an allocation the outputs are the effectors, and the state ends with these. With `linear` the law near
+    e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins: inside the limits the effectors are T times its u.
     Raises ParameterError without python-control, for a controller with a feedforward, whose model is beside the law, and with
     `linear` for the literal sign.
     """
@@ -151,14 +153,14 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     import control  # noqa: PLC0415 - an extra
 
     config = Loop(controller).config
-    for key, section in (("feedforward", config.feedforward), ("allocation", config.allocation)):
-        require(section is None, f"controller.{key}", "a section", "none: as_control has the law alone")
-    dt, (law, params), m = 1.0 / config.rate, config.tuned_law(), len(config.outputs)
-    measured, names = [f"y_{name}" for name in config.outputs], [f"u_{name}" for name in config.inputs]
+    require(config.feedforward is None, "controller.feedforward", "a section", "none: as_control has the law alone")
+    dt, tuned, guard, m = 1.0 / config.rate, config.tuned_law(), config.guard(), len(config.outputs)
+    measured, names = [f"y_{name}" for name in config.outputs], [f"u_{name}" for name in config.effectors]
     if linear:
-        near = linear_law(config.tuned_law(), m, dt)
-        return control.ss(near.A, near.B, near.C, near.D, dt, inputs=measured, outputs=names, name=config.law)
-    limits, zero = config.guard().limits, np.zeros(m)
+        near, T = linear_law(tuned, m, dt), np.eye(m) if guard.allocation is None else guard.allocation.T
+        return control.ss(near.A, near.B, T @ near.C, T @ near.D, dt, inputs=measured, outputs=names, name=config.law)
+    law, params = tuned
+    zero, p = np.zeros(m), 0 if guard.allocation is None else len(names)
     start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
     sizes = [value.size for value in start.values()]
     offset = np.concatenate([value.ravel() for value in start.values()])  # so that x = 0 is the engagement in trim
@@ -167,17 +169,18 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     def tick(x: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         parts = np.split(offset + x[: ends[-1]], ends[:-1])
         state = restored(law, {name: part.reshape(start[name].shape) for name, part in zip(start, parts, strict=True)})
-        u_before, y_m_before = x[ends[-1] : -m], x[-m:]
+        u_before, y_m_before, effectors = np.split(x[ends[-1] :], [m, 2 * m])
         sample = Measurements(v[:m], v[m:], (v[m:] - y_m_before) / dt, zero, u_before)
-        after, _, u = law.limited(state, sample, np.float64(dt), params, limits)
+        after, _, u, given = law_within_limits(state, sample, np.float64(dt), tuned, guard, effectors if p else None)
         flat = np.concatenate([value.ravel() for value in fields(after).values()])
-        return np.concatenate([flat - offset, u, v[m:]]), np.asarray(u)
+        commanded = np.asarray(u if given is None else given)
+        return np.concatenate([flat - offset, u, v[m:], commanded[:p]]), commanded
 
     return control.nlsys(
         lambda t, x, v, _: tick(x, v)[0],
         lambda t, x, v, _: tick(x, v)[1],
         dt=dt,
-        states=int(ends[-1]) + 2 * m,
+        states=int(ends[-1]) + 2 * m + p,
         inputs=[*measured, *(f"y_m_{name}" for name in config.outputs)],
         outputs=names,
         name=config.law,

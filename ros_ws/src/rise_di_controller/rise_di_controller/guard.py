@@ -208,12 +208,7 @@ def tick(
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
     slope, vane_m = (reference - state.y_m) / dt, None if vanes is None else vanes.reference
     measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
-    after, u_free = control_law.step(law_state, measured, dt, params)
-    u, effectors = _within_effectors(saturate(u_free, state.u, dt, guard.limits), state, dt, guard)
-    if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
-        limits = guard.limits if guard.allocation is None else reached(u_free, u)
-        after, u_free, u = control_law.limited(law_state, measured, dt, params, limits)
-        u, effectors = _within_effectors(u, state, dt, guard)
+    after, u_free, u, effectors = law_within_limits(law_state, measured, dt, law, guard, state.effectors)
     if guard.history:
         lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal)),) * missed
         last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt))
@@ -241,13 +236,29 @@ def _vanes(
     return Vanes(reading, recorded if state is None else state.x[list(guard.vanes)])  # type: ignore[arg-type]
 
 
+def law_within_limits(
+    state: Any, measured: Measurements, dt: Array, law: TunedLaw, guard: GuardParams, effectors: FloatArray | None
+) -> tuple[Any, FloatArray, FloatArray, FloatArray | None]:
+    """A step of the law inside its limits and those of the effectors: state, u before saturation, u, effectors.
+
+    Arguments: `effectors` (p,) of the last tick, None without an allocation.
+    """
+    after, u_free = law.control_law.step(state, measured, dt, law.params)
+    u, given = _within_effectors(saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard)
+    if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
+        limits = guard.limits if guard.allocation is None else reached(u_free, u)
+        after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
+        u, given = _within_effectors(u, effectors, dt, guard)
+    return after, u_free, u, given
+
+
 def _within_effectors(
-    u: FloatArray, state: ControllerState, dt: float, guard: GuardParams
+    u: FloatArray, before: FloatArray | None, dt: Array, guard: GuardParams
 ) -> tuple[FloatArray, FloatArray | None]:
     """The u that the effectors give for a u, and the effectors; u and None without an allocation."""
-    if guard.allocation is None or state.effectors is None:
+    if guard.allocation is None or before is None:
         return u, None
-    effectors, u = allocate(u, state.effectors, dt, guard.allocation)
+    effectors, u = allocate(u, before, dt, guard.allocation)
     return u, effectors
 
 
