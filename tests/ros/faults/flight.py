@@ -492,6 +492,10 @@ class Flight:
         silences = np.diff(sorted([begin, *arrivals])) - 2.0 * TICK
         return float(max([0.0, *gaps, *silences, *(delay for at, delay in samples if at >= begin)]))
 
+    def waited(self, begin: float, end: float) -> float:
+        """At most so long did a process wait for a processor between two instants, all its delays together, s."""
+        return sum(delay for at, delay in list(self.probe.delays) if begin <= at <= end + DELAY_PERIOD)
+
     def first_line(self, role: str, pattern: str, begin: float) -> float | None:
         """When a node first logged a line that matches the pattern."""
         for arrival in self.probe.since("/rosout", begin):

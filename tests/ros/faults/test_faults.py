@@ -153,7 +153,8 @@ def check(case: Case, flight: Flight) -> tuple[float | None, float, float]:
     if reaction is not None:
         allowed = case.within + slack
         assert reaction <= allowed, f"detected after {reaction:.3f} s, allowed {allowed:.3f} s"
-    allowed = case.recovery + slack
+    # A node starts again, and catches up, in many shares of a busy processor: their delays add up.
+    allowed = case.recovery + max(slack, SLACK + flight.waited(flight.end, engaged))
     disturbed = case.response is Response.UNCHANGED and host_delay > QUIET  # by the host, during the fault or later
     assert recovery <= allowed or disturbed, f"engaged {recovery:.3f} s after the fault, allowed {allowed:.3f} s"
     for key in ("ready_to_traffic", "ready_to_caught_up"):
