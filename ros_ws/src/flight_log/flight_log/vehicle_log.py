@@ -158,7 +158,7 @@ MAV_TYPES: Mapping[int, str] = MappingProxyType(
 """Kinds of vehicles by MAV_TYPE, common.xml."""
 
 PX4, PX4_MANUAL = 12, 1 << 16  # MAV_AUTOPILOT_PX4, and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
-BACK_NS, AHEAD_NS = NANOSECONDS, 60 * NANOSECONDS  # a clock that goes back by more has started again; ahead, the link was lost
+STEP_NS, LOST_NS = NANOSECONDS, 60 * NANOSECONDS  # an autopilot that goes back by a step has started again; a link may be lost
 AGREEING = 5  # samples, after which another time is that of the clock
 
 
@@ -334,17 +334,17 @@ def _wanted(of: Format) -> dict[str, set[str]]:
 def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> tuple[dict[str, Table], str]:
     """Tables of messages: name, stamp in ns, message; and a note. A field that its first message lacks is absent.
 
-    Where the clock goes back by more than BACK_NS, as of an autopilot that started again, the longest part counts alone. A
+    Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the longest part counts alone. A
     stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it.
     """
     parts, newest_ns = [list[tuple[str, int, Any]]()], 0
     apart: list[tuple[str, int, Any]] = []  # the samples before, near each other and not near those of the part
     for sample in samples:
-        if parts[-1] and _follows(sample[1], newest_ns):
+        if parts[-1] and abs(sample[1] - newest_ns) <= STEP_NS:
             parts[-1].append(sample)
             newest_ns, apart = max(newest_ns, sample[1]), []
             continue
-        apart = [*apart, sample] if apart and _follows(sample[1], apart[-1][1]) else [sample]
+        apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
         if len(apart) == AGREEING:
             if parts[-1] and apart[0][1] < newest_ns:
                 parts.append([])
@@ -353,10 +353,6 @@ def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[st
     note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
     longest = max(parts, key=len) or apart
     return _columns(longest, wanted), note
-
-
-def _follows(stamp_ns: int, earlier_ns: int) -> bool:
-    return -BACK_NS <= stamp_ns - earlier_ns <= AHEAD_NS
 
 
 def _columns(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
@@ -383,7 +379,7 @@ def _near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
     around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5) if len(stamp_ns) > 2 else None
     if around is None:
         return np.ones(len(stamp_ns), dtype=bool)
-    return np.abs(stamp_ns - np.median(around, axis=1)) <= AHEAD_NS
+    return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(np.abs(np.diff(stamp_ns)))
 
 
 def _table(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:
