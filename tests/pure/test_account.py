@@ -382,13 +382,15 @@ def test_process_has_ready_time_of_its_own_start() -> None:
     spans = {
         "/controller#9": Span(10 * second, 30 * second, 2000),
         "/controller#4": Span(41 * second, 60 * second, 1900),
-        "base_link": Span(0, 1, 2),
+        "": Span(0, 1, 2),  # of ros2 topic pub
     }
     assert flight_processes(spans, ready, "") == {
         "/controller#9": Process(3 * second, 10 * second, 30 * second, 2000),
         "/controller#4": Process(40 * second, 41 * second, 60 * second, 1900),
         "/recorder": Process(1, None, None),
+        "a publisher without a name": Process(None, 0, 1, 2),
     }
+    assert flight_processes({"": Span(0, 1, 2)}, [], "") == {}  # in one process
 
 
 def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:

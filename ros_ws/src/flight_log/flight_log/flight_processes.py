@@ -14,6 +14,7 @@ from flight_log.named_vectors import typestore
 
 ROSOUT, LOG = "/rosout", "rcl_interfaces/msg/Log"
 READY = b"\x06\x00\x00\x00ready\x00"  # the text of the line in CDR: its length with the final zero, and its bytes
+UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id
 
 
@@ -46,8 +47,10 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
     """The processes by name, "/controller#4711", by the `spans` of the publishers.
 
     A node that was restarted is several processes. A process was ready at the last such time of its node before its first
-    sample. A node without samples, as the recorder, has no process id.
+    sample. A node without samples, as the recorder, has no process id. Beside nodes of the stack every publisher counts, as
+    `ros2 topic pub`, which gives no name.
     """
+    of_stack = any(INSTANCE.fullmatch(name) for name in spans)
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
         if node.rpartition("/")[0] == namespace:
@@ -58,4 +61,6 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
             before = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns <= first_ns + NANOSECONDS]
             processes[name] = Process(before[-1] if before else None, first_ns, last_ns, samples)
             waiting[instance[1]] = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before]
+        elif of_stack:
+            processes[name or UNNAMED] = Process(None, first_ns, last_ns, samples)
     return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}

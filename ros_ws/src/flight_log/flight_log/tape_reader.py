@@ -28,7 +28,7 @@ from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
-from flight_log.flight_processes import LOG, READY, ROSOUT, Span, flight_processes, ready_times
+from flight_log.flight_processes import INSTANCE, LOG, READY, ROSOUT, UNNAMED, Span, flight_processes, ready_times
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
 from flight_log.learning import DIAGNOSTIC_ARRAY
@@ -147,7 +147,8 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, told)]
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
-    processes = flight_processes(_spans(log.topics[topic] for topic in names), ready_times(log.lines), aircraft)
+    spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
+    processes = flight_processes(spans, ready_times(log.lines), aircraft)
     tape = Tape(
         signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments),
         processes={printable(name): process for name, process in processes.items()},
@@ -158,12 +159,13 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
 
 
-def _spans(topics: Iterable["_TopicSamples"]) -> dict[str, Span]:
-    """The span of each publisher over its topics."""
+def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
+    """The span of each publisher over its topics, which are names with spans; of other programs on those of aircraft alone."""
     spans: dict[str, Span] = {}
-    for topic in topics:
-        for sender, span in topic.spans.items():
-            spans[sender] = span.joined(spans[sender]) if sender in spans else span
+    for name, of_topic in topics:
+        for sender, span in of_topic.items():
+            if name in AIRCRAFT_TOPICS or INSTANCE.fullmatch(sender):
+                spans[sender] = span.joined(spans[sender]) if sender in spans else span
     return spans
 
 
@@ -302,7 +304,8 @@ class _TopicSamples:
         spans = sorted(self.spans.items(), key=itemgetter(1))
         if all(before[1][1] < after[1][0] for before, after in pairwise(spans)):
             return ""
-        return f"{name}: samples of {', '.join(sorted(self.spans))}: the figures are of all, the nodes refuse all but one"
+        publishers = ", ".join(publisher or UNNAMED for publisher in sorted(self.spans))
+        return f"{name}: samples of {publishers}: the figures are of all, the nodes refuse all but one"
 
     def recording(self) -> Recording:
         """The stamps in the order of the recording; after `signal`."""
