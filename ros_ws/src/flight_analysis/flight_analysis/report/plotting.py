@@ -4,7 +4,8 @@
 
 The figures of a page share the time axis and the margins, so the subplots line up. A figure holds short curves. `SampleStore`
 holds the samples of longer curves: the page decimates the samples to the view. A figure also holds the extremes of a very
-long curve, since the page takes long to unpack the samples.
+long curve, since the page takes long to unpack the samples. Of a curve of MAX_STORED samples or more the page has the
+smallest and the largest value of each bin of time alone; the figures in numbers are of all samples.
 """
 
 import base64
@@ -12,7 +13,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from hashlib import blake2b
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +23,12 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 
+T = TypeVar("T", bound=np.generic)
 MAX_POINTS = 2400  # of a curve over the page's width: above the smallest and the largest value of each pixel
 LEVEL = 4  # of zlib: of the samples of a flight 1 % larger than with 6, in 60 % of the time
 PACKERS = 2  # threads that pack: each holds a channel twice
 MAX_READ = 100_000  # samples: the page unpacks a longer curve only for a zoom, and first draws its extremes
+MAX_STORED = 200_000  # samples of a curve on a page, of 400 s at 500 Hz: with all of them an hour of flight has 141 MB
 MANTISSA = 16  # bits of a stored value, with the leading one: within 1 in 2^16, finer than a pixel and the 4 digits of a hover
 MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
@@ -39,8 +42,9 @@ DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 class Instants(NamedTuple):
     """The instants of a curve."""
 
-    t_ns: NDArray[np.int64]  # since the start of the flight, with one more at the start of each gap
+    t_ns: NDArray[np.int64]  # since the start of the flight, with one more at the start of each gap; two of each bin
     gaps: NDArray[np.intp]  # the samples before which a NaN stands for a gap
+    width: int  # samples of a bin; 1 where each sample is drawn
 
 
 class SampleStore:
@@ -247,7 +251,7 @@ def _trace(context: PlotContext, curve: Curve, channel: str, factor: float, most
 def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
     """Rows of the minimum, the maximum and the first NaN in `most` / 2 bins, as the page decimates a view."""
     width = -(-len(values) // (most // 2))
-    bins = np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
+    bins = _bins(values, width)
     gaps = np.isnan(bins)
     below, above = (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins)) if gaps.any() else (bins, bins)
     low, high = below.argmin(axis=1), above.argmax(axis=1)
@@ -266,17 +270,37 @@ def _drawn(
     context: PlotContext, signal: Signal, channel: str, factor: float, steps: bool
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Instants and values of a channel times a factor, with a NaN at the start of a gap."""
-    t_ns, gaps = context.samples.instants(signal.stamp_ns, context.tape.start_ns, steps=steps)
+    t_ns, gaps, width = context.samples.instants(signal.stamp_ns, context.tape.start_ns, steps=steps)
     values = signal[channel] * factor
-    return t_ns, np.insert(values, gaps, np.nan) if len(gaps) else values
+    values = np.insert(values, gaps, np.nan) if len(gaps) else values
+    return t_ns, values if width == 1 else _extremes_of_bins(values, width)
+
+
+def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
+    """Smallest and largest value of each bin in their order, two a bin; a NaN in place of the second in a bin with a gap."""
+    bins = _bins(values, width)
+    gaps = np.isnan(bins)
+    low, high = np.where(gaps, np.inf, bins).argmin(axis=1), np.where(gaps, -np.inf, bins).argmax(axis=1)
+    columns = np.sort(np.column_stack([low, high]), axis=1)
+    drawn = np.take_along_axis(bins, columns, axis=1)
+    drawn[gaps.any(axis=1), 1] = np.nan
+    return drawn.ravel()
+
+
+def _bins(values: NDArray[T], width: int) -> NDArray[T]:
+    """Values by bin, (N, width); the last value fills the last bin."""
+    return np.append(values, np.full(-len(values) % width, values[-1])).reshape(-1, width)
 
 
 def _instants(t_ns: NDArray[np.int64], steps: bool) -> Instants:
     periods = np.diff(t_ns)
-    if steps or len(periods) == 0:
-        return Instants(t_ns, np.zeros(0, dtype=np.intp))
-    before = np.flatnonzero(periods > MIN_GAP_PERIODS * np.median(periods))
-    return Instants(np.insert(t_ns, before + 1, t_ns[before]), before + 1)
+    before = np.zeros(0, dtype=np.intp)
+    if not steps and len(periods):
+        before = np.flatnonzero(periods > MIN_GAP_PERIODS * np.median(periods))
+        t_ns = np.insert(t_ns, before + 1, t_ns[before]) if len(before) else t_ns
+    width = -(-len(t_ns) // (MAX_STORED // 2)) if len(t_ns) > MAX_STORED else 1
+    drawn = t_ns if width == 1 else _bins(t_ns, width)[:, [0, width // 2]].ravel()
+    return Instants(drawn, before + 1, width)
 
 
 def _shade_intervals(figure: Figure, intervals: Sequence[Interval], columns: int, end: float) -> None:
