@@ -208,18 +208,18 @@ def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     model = model._replace(A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity)
     names = Names(("V", "alpha", "q", "theta"), ("elevator", "thrust"), ("q", "V"), ("vertical", "longitudinal"))
     bank = innovation_filters.filter_bank(model, names, 25.0, np.ones((1, 2)))
-    level = np.array([4])
     # simulate the filter's own model with the noise for which it is designed
     generator, Phi, H = np.random.default_rng(1), bank.sampled.Phi[0, 0], bank.sampled.H
-    wind = [bank.sampled.states.index("wind.vertical"), bank.sampled.states.index("wind.longitudinal")]
+    wind = [bank.sampled.states.index("x.wind.vertical"), bank.sampled.states.index("x.wind.longitudinal")]
     _, gust = innovation_filters.wind_model(names.winds, 25.0)
     z, y = np.zeros(len(Phi)), np.zeros((20_000, 2))
     for k in range(len(y)):
         y[k] = H @ z + model.noise * generator.standard_normal(2)
         z = Phi @ z
         z[wind] += gust * 0.1 * generator.standard_normal(2)  # root of the period, s
-    r, _ = bank.advance(np.zeros((1, len(Phi))), y, np.zeros((len(y), 2)), np.zeros(1, dtype=np.int64), level)
-    e = np.asarray(np.linalg.solve(np.linalg.cholesky(bank.covariance[0, 4]), r[1000:, 0].T).T, dtype=np.float64)
+    level = np.full(len(y) // innovation_filters.HOLD, 4)
+    r, _ = innovation_filters.Passage(bank, y, np.zeros((len(y), 2)), level).run(np.zeros((1, len(Phi))))
+    e = np.asarray(np.linalg.solve(np.linalg.cholesky(bank.covariance[0, 4]), r[0, 1000:].T).T, dtype=np.float64)
     # 19000 samples: the standard deviation of a variance is 1 %; states and disturbances have almost no noise here
     np.testing.assert_allclose(np.cov(e.T), np.eye(2), atol=0.04)
     assert whiteness(e, np.ones(len(e), dtype=bool)).max() < 2.0

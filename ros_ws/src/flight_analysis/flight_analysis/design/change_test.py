@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether an aircraft has changed since its model was identified: a likelihood ratio over the last seconds of a flight."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.design.innovation_filters import Actuation, Block, Recording, blocks, filter_model
-from flight_analysis.design.model_identification import Search, Unknown
+from flight_analysis.design.model_identification import STARTS, Search, Unknown
 from flight_core.vectors import FloatArray
 
 RECORD = 10.0  # s, of the flight that is tested
@@ -57,16 +58,16 @@ def change_test(
         delay = (delays or {}).get(outputs, actuation.delay)
         search = _search(recorded, flown, actuation, block, delay)
         near = np.array([max(deviation.get(entry.name, 0.0), LEAST_DEVIATION) for entry in search.nominal_entries()])
-        changed, changed_cost = _least(search, np.full(search.count, FREE_DEVIATION))
-        same, _ = _least(search, near)
+        changed, changed_cost, levels = _least(search, np.full(search.count, FREE_DEVIATION), STARTS)
+        same, _, _ = _least(search, near, levels=levels)
         dead = ""
         if same - changed > MAX_GAIN:
-            _, flown_cost = _least(search, np.full(search.count, EXACT))
+            _, flown_cost, _ = _least(search, np.full(search.count, EXACT), levels=levels)
             for name in search.names.inputs:
                 B = flown.matrix_b() * np.array([NO_EFFECT if column == name else 1.0 for column in flown.inputs])
                 without = flown.with_matrices(flown.matrix_a(), B, np.ones((len(B), len(flown.gusts))))
                 of_dead = _search(recorded, without, actuation, block, delay)
-                _, cost = _least(of_dead, np.full(of_dead.count, EXACT))
+                _, cost, _ = _least(of_dead, np.full(of_dead.count, EXACT), levels=levels)
                 if flown_cost - cost > MAX_GAIN and cost < changed_cost + DEAD_WITHIN:
                     dead = name
         found.append(Change(outputs, same - changed, dead))
@@ -77,10 +78,17 @@ def _search(recorded: Recording, flown: Airframe, actuation: Actuation, block: B
     return Search(recorded, filter_model(flown, actuation, recorded), block, flown, delay, Unknown(angle=ANGLE))
 
 
-def _least(search: Search, deviation: FloatArray) -> tuple[float, float]:
-    """The least J with these standard deviations of the entries, and its -sum log p."""
+def _least(
+    search: Search, deviation: FloatArray, starts: Sequence[int] = (), levels: NDArray[np.int64] | None = None
+) -> tuple[float, float, NDArray[np.int64]]:
+    """The least J with these standard deviations of the entries, the -sum log p there, and the levels of the wind.
+
+    Also with `levels`, of an alternative hypothesis: another wind is no change.
+    """
     search.believe(deviation)
-    known = search.known()
-    fit = search.fit(known, lambda: None)
-    cost = -float(np.sum(fit.after.log_likelihood[known]))
-    return cost + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0, cost
+    known, found = search.known(), []
+    for each in (None,) if levels is None else (None, levels):
+        fit = search.fit(known, starts=starts, levels=each)
+        cost = -float(np.sum(fit.after.log_likelihood[known]))
+        found.append((cost + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0, cost, fit.levels))
+    return min(found, key=lambda least: least[0])

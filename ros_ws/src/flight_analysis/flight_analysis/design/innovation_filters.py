@@ -3,7 +3,6 @@
 """The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of many models side by side."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +26,15 @@ TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count:
 DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observer_design.Weights` has them: small
 MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
-HOLD = 5  # periods for which sin(x) - x is held: it changes slowly
-LEVELS = np.array([0.002, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])  # 1, strengths of the wind in the filter, from calm air to gusts
+HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
+GUST_TIME = 0.5  # s, decay of the rate of a gust
+LEAST_RATE = 1e-4  # m/s^2 per root s, noise of that rate where there is no gust: negligible
+LEVELS = np.array(
+    [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
+    + [(0.03, strength) for strength in (2.5, 5.0, 10.0, 20.0, 40.0)]
+)
+"""Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of moderate turbulence, and
+noise of its rate, m/s^2 per root s. A gust is smooth: noise of the rate explains a gust, noise of the wind does not."""
 
 
 class Recording(NamedTuple):
@@ -38,6 +44,17 @@ class Recording(NamedTuple):
     t: FloatArray  # (T,) flight time, s
     y: FloatArray  # (T, m), NaN where a sample was lost
     u: FloatArray  # (T, m) as the actuators received it
+
+
+def coarser(recorded: Recording, factor: int) -> Recording:
+    """The means over `factor` periods; u between the middles of two means of y."""
+    count = len(recorded.t) // factor
+    ahead = [np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)]) for k in ((factor - 1) // 2, factor // 2)]
+    t, y, u = (
+        values[: count * factor].reshape(count, factor, *values.shape[1:]).mean(axis=1)
+        for values in (recorded.t, recorded.y, (ahead[0] + ahead[1]) / 2.0)
+    )
+    return Recording(factor * recorded.period, t, y, u)
 
 
 class Actuation(NamedTuple):
@@ -105,34 +122,79 @@ class FilterBank(NamedTuple):
     gravity: FloatArray  # (n, n)
     period: float  # s
 
-    def advance(
-        self, z: FloatArray, y: FloatArray, u: FloatArray, member: NDArray[np.int64], level: NDArray[np.int64]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Innovations of K periods, (K, F, m), and z after them, for F filters: `member` at `level`, z (F, s).
-
-            r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
-
-        with r = 0 in the update where y, (K, m), is lost; u (K, m), or (F, K, m) where the filters have inputs of their own.
-        """
-        H, Phi, L = self.sampled.H, self.sampled.Phi[member, 0], self.L[member, level]
-        n, s, angles = len(self.gravity), Phi.shape[1], np.flatnonzero(self.gravity.any(axis=0))
-        size = s + len(angles)  # z, and sin(x) - x of the angles
-        steps = np.tile(np.eye(size), (2, len(z), 1, 1))  # without and with y
-        steps[:, :, :s, :s], steps[:, :, :n, s:] = [Phi, Phi - Phi @ L @ H], self.period * self.gravity[:, angles]
-        seen = np.asarray(np.isfinite(y).all(axis=1))
-        states = np.zeros((len(y) + 1, len(z), size, 1))
-        states[0, :, :s, 0] = z
-        states[1:, :, :s, 0] = np.einsum("fsm,km->kfs", Phi @ L, np.where(np.isfinite(y), y, 0.0))
-        states[1:, :, :s, 0] += np.einsum(
-            "fsm,km->kfs" if u.ndim == y.ndim else "fsm,fkm->kfs", self.sampled.Gamma[member, 0], u
+    def by_level(self) -> "FilterBank":
+        """The first model at the levels, as a model a level."""
+        levels = self.L.shape[1]
+        Phi, Gamma = (np.repeat(matrix[:1], levels, axis=0) for matrix in (self.sampled.Phi, self.sampled.Gamma))
+        sampled = self.sampled._replace(Phi=Phi, Gamma=Gamma)
+        return self._replace(
+            sampled=sampled, L=np.swapaxes(self.L[:1], 0, 1), covariance=np.swapaxes(self.covariance[:1], 0, 1)
         )
-        step = [steps[int(k_seen)] for k_seen in seen.tolist()]
-        moved = np.empty(states.shape[1:])
-        for k, (now, following) in enumerate(pairwise(states)):
-            if k % HOLD == 0:
-                now[:, s:] = np.sin(now[:, angles]) - now[:, angles]
-            np.add(np.matmul(step[k], now, out=moved), following, out=following)
-        return y[:, None] - states[:-1, :, :s, 0] @ H.T, states[-1, :, :s, 0]
+
+    def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
+        """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then sin(x) - x, to r and z."""
+        H, Phi, Gamma, L = self.sampled.H, self.sampled.Phi[:, 0], self.sampled.Gamma[:, 0], self.L[:, level]
+        (m, s), angles = H.shape, np.flatnonzero(self.gravity.any(axis=0))
+        z = np.zeros((len(Phi), s, s + 2 * HOLD * m + len(angles)))
+        z[:, :, :s], rows = np.eye(s), []
+        for j in range(HOLD):
+            r = -H @ z
+            r[:, np.arange(m), s + j * m + np.arange(m)] += 1.0
+            z = Phi @ (z + L @ r if seen[j] else z)
+            z[:, :, s + (HOLD + j) * m : s + (HOLD + j + 1) * m] += Gamma
+            z[:, : len(self.gravity), s + 2 * HOLD * m :] += self.period * self.gravity[:, angles]
+            rows.append(r)
+        return np.concatenate([*rows, z], axis=1)
+
+
+class Passage:
+    """The filters of a bank over y, (T, m), and u, (T, m) or (N, T, m) with inputs a model.
+
+        r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
+
+    with no update where y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x is held over a block, so the
+    blocks are linear: with the same level and the same lost samples they have the same matrix.
+    """
+
+    def __init__(self, bank: FilterBank, y: FloatArray, u: FloatArray, level: NDArray[np.int64]) -> None:
+        (T, m), (N, _, s, _), blocks = y.shape, bank.L.shape, len(level)
+        self._angles = np.flatnonzero(bank.gravity.any(axis=0))
+        short, self._shape = blocks * HOLD - T, (N, m, s)  # the last block is filled with lost samples
+        y = np.vstack([y, np.full((short, m), np.nan)])
+        u = np.concatenate([u, np.zeros((*u.shape[:-2], short, m))], axis=-2)
+        self._seen: NDArray[np.bool_] = np.asarray(np.isfinite(y).all(axis=1))
+        known = np.where(self._seen[:, None], y, 0.0).reshape(blocks, HOLD * m).T
+        given = np.swapaxes(u.reshape(*u.shape[:-2], blocks, HOLD * m), -1, -2)
+        inputs = np.concatenate([np.broadcast_to(known, given.shape), given], axis=-2)
+        code = level << HOLD | self._seen.reshape(blocks, HOLD) @ (1 << np.arange(HOLD))
+        kinds, self._kind = np.unique(code, return_inverse=True)
+        lifted = [bank.lifted(kind >> HOLD, [bool(kind >> j & 1) for j in range(HOLD)]) for kind in kinds.tolist()]
+        self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
+        own, driven = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]], slice(s, s + 2 * HOLD * m)
+        for k, matrix in enumerate(lifted):
+            of = np.flatnonzero(self._kind == k)
+            forced = matrix[..., driven] @ inputs[..., of]
+            self._forced[..., of], self._states[of + 1, :, :s, 0] = forced[:, :-s], np.moveaxis(forced[:, -s:], -1, 0)
+        self._steps = [np.ascontiguousarray(matrix[:, -s:, own]) for matrix in lifted]
+        self._outputs = [np.ascontiguousarray(matrix[:, :-s, own]) for matrix in lifted]
+
+    def run(self, z: FloatArray, first: int = 0, last: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and z after them."""
+        (N, m, s), angles, steps = self._shape, self._angles, self._steps
+        kind = self._kind[first:last]
+        states = self._states[first : first + len(kind) + 1]
+        states[0, :, :s, 0] = z
+        for k, now, following in zip(kind.tolist(), states[:-1], states[1:], strict=True):
+            turned = now[:, angles]
+            np.subtract(np.sin(turned), turned, out=now[:, s:])
+            following[:, :s] += steps[k] @ now
+        r, x = self._forced[..., first : first + len(kind)].copy(), np.moveaxis(states[:-1, ..., 0], 0, -1)
+        for k in np.unique(kind).tolist():
+            of = kind == k
+            r[..., of] += self._outputs[k] @ x[..., of]
+        r = np.moveaxis(r, -1, 1).reshape(N, len(kind) * HOLD, m)
+        r[:, ~self._seen[HOLD * first : HOLD * first + r.shape[1]]] = np.nan
+        return r, states[-1, :, :s, 0]
 
 
 def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArray]:
@@ -147,20 +209,41 @@ def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArra
     return np.where(along, time, time / np.sqrt(3.0)), noise
 
 
-def filter_bank(model: NominalModel, names: Names, speed: float, strength: FloatArray) -> FilterBank:
-    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s.
+def filter_bank(
+    model: NominalModel, names: Names, speed: float, strength: FloatArray, levels: NDArray[np.int64] | slice = slice(None)
+) -> FilterBank:
+    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, rate, ..].
 
-    `strength` (N, G) multiplies the levels of the wind.
+        w_dot = rate - w / wind_time + noise,  rate_dot = -rate / GUST_TIME + noise
+
+    The noises are of `levels` of LEVELS, times `strength` (N, G).
     """
     wind_time, noise = wind_model(names.winds, speed)
-    gust, m = LEVELS[:, None] * strength[:, None] * noise, model.B.shape[-1]
-    each = model._replace(A=model.A[:, None], B=model.B[:, None], wind=model.wind[:, None], kinematic=LEAK * model.kinematic)
-    sampled = observer_design.aircraft_model(each, names, wind_time)
-    weights = Weights(np.ones(m), np.full(m, DRIFT), gust, wind_time, np.full(1, LOOSE))
+    (N, n, m), G = model.B.shape, model.wind.shape[-1]
+    x, w, rate = np.split(np.arange(n + 2 * G), [n, n + G])
+    A, B, gravity = np.zeros((N, n + 2 * G, n + 2 * G)), np.zeros((N, n + 2 * G, m)), np.zeros((n + 2 * G, n + 2 * G))
+    A[:, x[:, None], x], A[:, x[:, None], w], B[:, x], gravity[:n, :n] = model.A, model.wind, model.B, model.gravity
+    A[:, w, w], A[:, w, rate], A[:, rate, rate] = -1.0 / wind_time, 1.0, -1.0 / GUST_TIME
+    each = model._replace(
+        A=A[:, None],
+        B=B[:, None],
+        C=np.hstack([model.C, np.zeros((m, 2 * G))]),
+        gravity=gravity,
+        wind=np.zeros((n + 2 * G, 0)),
+        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(2 * G)]),
+        size=np.concatenate([model.size, np.ones(2 * G)]),
+    )
+    of_wind = tuple(f"{kind}.{axis}" for kind in ("wind", "rate") for axis in names.winds)
+    sampled = observer_design.aircraft_model(each, names._replace(states=names.states + of_wind, winds=()), np.zeros(0))
+    gust, gust_rate = (
+        strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
+    )
+    loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, gust_rate + LEAST_RATE], axis=-1)
+    weights = Weights(np.ones(m), np.full(m, DRIFT), np.zeros(0), np.zeros(0), loose)
     L = observer_design.aircraft_correction(sampled, each, weights)
     # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
     covariance = np.linalg.solve(np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m)))
-    return FilterBank(sampled, L, np.asarray(covariance), model.gravity, model.period)
+    return FilterBank(sampled, L, np.asarray(covariance), gravity, model.period)
 
 
 class Block(NamedTuple):

@@ -20,13 +20,16 @@ from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import (
+    HOLD,
     LEVELS,
     TRANSIENT,
     Actuation,
     Block,
     FilterBank,
+    Passage,
     Recording,
     blocks,
+    coarser,
     delayed,
     filter_bank,
     filter_model,
@@ -39,13 +42,14 @@ MAX_ERROR = 0.6  # 1, bound of a relative error: two standard deviations
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
-MAX_ITERATIONS = 22  # of 0.45 s each on one core: an identification takes at most 10 s
-MIN_PROGRESS, MIN_PROGRESS_STRONG = 0.05, 5.0  # of the cost, a log-likelihood, in a step: the search ends, or its first part
+STARTS = (0, 3, 4, 9)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
+START_STEPS, STEPS = 8, 12  # at most, of each start, and of the search from the best one
+START_PROGRESS, PROGRESS = 5.0, 0.3  # of the cost, a log-likelihood, in a step: a start ends, or the search
 
-STRONG = 4  # index of the level at which the search begins
 CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
-
-RECOVERY = 2  # spans after a gust that do not count either: the estimates recover
+UNEXPLAINED = 5.0  # 1, mean square of the innovations of a span in parts of the median one: no level explains it
+FEW = 0.25  # of the spans: so few gusts do not count, for a gust is no noise
+RECOVERY = 2  # spans after such a one that do not count either: the estimates recover
 SPAN = 1.0  # s, within which the level is constant
 HELD_OUT = 3  # Every third span is held out: each command and gust is then in both parts. A last third has no command.
 MAX_DEVIATION = 0.1  # of the best known effect of an input on each output: two deviations are then a fifth of the loop gain
@@ -54,8 +58,13 @@ LAGS = 20  # of the autocorrelation in the figure of whiteness: 0.2 s at 100 Hz
 
 
 def span_length(recorded: Recording) -> int:
-    """Periods of a span."""
-    return max(round(SPAN / recorded.period), 1)
+    """Periods of a span: whole blocks of the filters."""
+    return HOLD * max(round(SPAN / recorded.period / HOLD), 1)
+
+
+def held_out(periods: int, span: int) -> NDArray[np.bool_]:
+    """Mask of the validation's periods, every HELD_OUT-th span."""
+    return np.asarray(np.arange(periods) // span % HELD_OUT == HELD_OUT - 1)
 
 
 class Innovations(NamedTuple):
@@ -70,6 +79,7 @@ class Models(NamedTuple):
     """The filters of N models, and their inputs."""
 
     bank: FilterBank
+    levels: NDArray[np.int64]  # (levels of the bank,), those of LEVELS
     begin: FloatArray  # (N, s) estimates at the begin
     u: FloatArray  # (T, m), or (N, T, m) where the delay is identified
 
@@ -93,7 +103,7 @@ class Fit(NamedTuple):
     deviation: FloatArray  # (p,) standard deviations after the flight
     before: Innovations  # of the nominal model in these winds
     after: Innovations  # of the identified one
-    iterations: int
+    levels: NDArray[np.int64]  # (spans,) of the wind, with the identified model
 
 
 def uncertain(model: NominalModel) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -129,8 +139,17 @@ class Search:
         airframe: Airframe,
         delay: float,
         unknown: Unknown = KNOWN,
+        factor: int | None = None,
     ) -> None:
-        """The prior of each relative error is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known."""
+        """The prior of each relative error is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known.
+
+        The starts of the search take means of `factor` periods, by default of the shortest lag.
+        """
+        factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1) if factor is None else factor
+        self._coarse = self
+        if factor > 1:
+            slow = model._replace(noise=model.noise / np.sqrt(factor), period=factor * recorded.period)
+            self._coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1)
         self._period = recorded.period
         self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
         angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
@@ -148,6 +167,8 @@ class Search:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
         of_delay = np.ones(1 if self._delay_deviation else 0)
         of_winds = np.full(len(self._block.winds), WIND_PRIOR)
+        if self._coarse is not self:
+            self._coarse.believe(deviation)
         self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
         self.bound = MAX_ERROR / PRIOR * self.prior
         self._lower = -self.bound
@@ -171,95 +192,126 @@ class Search:
         wind = gust_directions(self._airframe, whole, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
-    def models(self, thetas: FloatArray) -> Models:
-        """The filters of theta, (N, p)."""
-        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, np.exp(thetas[:, self._winds]))
+    def models(self, thetas: FloatArray, levels: NDArray[np.int64]) -> Models:
+        """The filters of theta, (N, p), at the winds of some levels."""
+        levels = np.unique(levels)
+        strength = np.exp(thetas[:, self._winds])
+        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength, levels)
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
         if not self._delay_deviation:
-            return Models(bank, begin, delayed(self._u, self._delay))
-        periods = self._delay + self._delay_deviation * thetas[:, -1]
-        return Models(bank, begin, np.array([delayed(self._u, value) for value in np.maximum(periods, 0.0).tolist()]))
+            return Models(bank, levels, begin, delayed(self._u, self._delay))
+        periods = np.maximum(self._delay + self._delay_deviation * thetas[:, -1], 0.0)
+        late = {value: delayed(self._u, value) for value in set(periods.tolist())}
+        return Models(bank, levels, begin, np.array([late[value] for value in periods.tolist()]))
 
     def delay(self, fit: Fit) -> float:
         """The delay of u, periods."""
         return self._delay + self._delay_deviation * (float(fit.theta[-1]) if self._delay_deviation else 0.0)
 
-    def levels(self, models: Models) -> NDArray[np.int64]:
-        """The level of the wind in each span for the first of some models, shape (spans,).
+    def levels(self, theta: FloatArray) -> NDArray[np.int64]:
+        """The level of the wind in each span, (spans,), for theta, (p,).
 
         Every level predicts the span from the estimates at its begin. The calmest one is taken whose log-likelihood is within
         CHANGE of the best.
         """
-        bank, u = models.bank, models.u if models.u.ndim == self._u.ndim else models.u[0]
-        every, zeros = np.arange(len(LEVELS)), np.zeros(len(LEVELS), dtype=np.int64)
-        precision, log_det = np.linalg.inv(bank.covariance[0]), np.linalg.slogdet(bank.covariance[0])[1]
-        z, found = np.repeat(models.begin[:1], len(LEVELS), axis=0), []
-        for span in self._spans:
-            r, after = bank.advance(z, self._y[span], u[span], zeros, every)
-            gain = -np.nansum(np.einsum("kli,lij,klj->kl", r, precision, r) + log_det, axis=0) / 2.0
+        models = self.models(theta[None], np.arange(len(LEVELS)))
+        bank, u = models.bank.by_level(), models.u.reshape(self._u.shape)
+        precision, log_det = np.linalg.inv(bank.covariance[:, 0]), np.linalg.slogdet(bank.covariance[:, 0])[1]
+        length = self._spans[0].stop // HOLD
+        flight = Passage(bank, self._y, u, np.zeros(-(-len(self._y) // HOLD), dtype=np.int64))
+        z, found = np.repeat(models.begin, len(LEVELS), axis=0), []
+        for k in range(len(self._spans)):
+            r, after = flight.run(z, k * length, (k + 1) * length)
+            gain = -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1) / 2.0
             found.append(int(np.argmax(gain >= gain.max() - CHANGE)))
             z = np.repeat(after[found[-1]][None], len(LEVELS), axis=0)
         return np.array(found)
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Innovations of all models at given levels, and normalised, (N, T, m), and half the log of det S, (N, T)."""
-        bank, z, u = models
-        every = np.arange(len(bank.L))
+        """Innovations of N models at given levels, and normalised, (N, T, m), and half the log of det S, (N, T)."""
+        bank, T = models.bank, len(self._y)
+        place = np.repeat(np.searchsorted(models.levels, levels), self._spans[0].stop)[:T]
+        r = Passage(bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][:, :T]
         root = np.linalg.cholesky(bank.covariance)
         inverse, half_log_det = np.linalg.inv(root), np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-        r = np.empty((len(every), *self._y.shape))
-        normalised, weight = np.empty_like(r), np.empty(r.shape[:2])
-        for span, level in zip(self._spans, levels, strict=True):
-            ahead, z = bank.advance(z, self._y[span], u[..., span, :], every, np.full(len(every), level))
-            r[:, span] = np.swapaxes(ahead, 0, 1)
-            normalised[:, span] = r[:, span] @ np.swapaxes(inverse[:, level], -1, -2)
-            weight[:, span] = half_log_det[:, level, None]
-        return r, normalised, weight
+        normalised = np.empty_like(r)
+        for k in range(len(models.levels)):
+            normalised[:, place == k] = r[:, place == k] @ np.swapaxes(inverse[:, k], -1, -2)
+        return r, normalised, half_log_det[:, place]
 
-    def best_levels(self, theta: FloatArray) -> Innovations:
-        """The innovations of one theta, (p,)."""
-        models = self.models(theta[None])
-        (r,), (normalised,), (weight,) = self.innovations(models, self.levels(models))
+    def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
+        """The innovations of a theta, (p,)."""
+        (r,), (normalised,), (weight,) = self.innovations(self.models(theta[None], levels), levels)
         return Innovations(r, normalised, -np.sum(normalised**2, axis=1) / 2.0 - weight)
 
-    def fit(self, used: NDArray[np.bool_], progress: Callable[[], None]) -> Fit:
+    def fit(
+        self,
+        used: NDArray[np.bool_],
+        progress: Callable[[], None] = lambda: None,
+        starts: Sequence[int] = STARTS,
+        levels: NDArray[np.int64] | None = None,
+    ) -> Fit:
         """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2 where `used`, (T,).
 
-        r are the normalised innovations, S their covariance, N the number of those used. Gauss-Newton with damping, the
-        derivatives by differences, the filters of all parameters side by side. The Hessian is J'J + prior^-2, with J the
-        derivatives of the innovations over their rms. The first steps take a strong wind in every span, for which the cost has
-        hardly a second minimum. Then the levels follow theta, and their strengths are part of it. At last the spans of gusts do
-        not count: a gust is no noise. Source: L. Ljung, "System Identification", 7.4 and 10.2.
+        r are the normalised innovations, S their covariance, N the number of samples. The cost has further minima: a wrong
+        wind explains a wrong model. So the search begins several times, with a level of `starts` in a span, on means over
+        the shortest lag. From the theta of the least cost, or 0, the search goes on with the level of a span by theta, or with
+        `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
+        a few gusts.
         """
-        size, errors, free = len(self.prior), self._errors, np.ones(len(self.prior), dtype=bool)
-        free[self._winds] = False
-        theta, levels, follows, gusts = np.zeros(size), np.full(len(self._spans), STRONG), False, False
-        for iteration in range(MAX_ITERATIONS + 1):
+        coarse = self._coarse
+        fitted = coarse.known() & ~held_out(len(coarse._y), coarse._spans[0].stop)
+        fixed = np.ones(len(self.prior), dtype=bool)
+        fixed[self._winds] = False
+        found = [(self.cost(np.zeros(len(self.prior)), used), np.zeros(len(self.prior)))]
+        for level in starts:
+            theta, calm = np.zeros(len(self.prior)), np.full(len(coarse._spans), level)
+            for _ in range(START_STEPS):
+                progress()
+                theta, _, progressed = coarse._step(theta, calm, fitted, fixed)
+                if progressed < START_PROGRESS:
+                    break
+            found.append((self.cost(theta, used), theta))
+        _, theta = min(found, key=lambda start: start[0])
+        for iteration in range(STEPS):
             progress()
-            models, before = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)])), levels
-            levels = self.levels(models) if follows else levels
-            settled = follows and np.array_equal(levels, before)
-            quiet = used & self._quiet(levels) if gusts else used
-            counted = quiet if quiet.any() else used  # a gust in every span
-            costs, e, half_log_det = self._costs(models, levels, counted, theta[None])
-            rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
-            J = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(size, -1)
-            hessian = J @ J.T + np.diag(self.prior**-2)
-            slope = J @ (e[0] / rms).ravel() + (half_log_det[1:] - half_log_det[0]) / DIFFERENCE + theta / self.prior**2
-            steps = damped_steps(theta, slope, hessian, self._lower, self.bound, follows | free)
-            tried = np.clip(theta + steps, self._lower, self.bound)
-            lower, _, _ = self._costs(self.models(tried), levels, counted, tried)
-            progressed = costs[0] - lower.min()
-            if iteration == MAX_ITERATIONS or (settled and gusts and progressed < MIN_PROGRESS):
+            flown = self.levels(theta) if levels is None else levels
+            counted = used & self._counted(theta, flown) if iteration > 1 else used
+            theta, hessian, progressed = self._step(theta, flown, counted, np.ones(len(theta), dtype=bool))
+            if iteration > 1 and progressed < PROGRESS:
                 break
-            gusts |= settled and progressed < MIN_PROGRESS
-            theta = tried[int(lower.argmin())] if progressed > 0.0 else theta
-            follows |= progressed < MIN_PROGRESS_STRONG
         deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
-        nominal = np.where(errors, 0.0, theta)
-        return Fit(theta, deviation, self.best_levels(nominal), self.best_levels(theta), iteration)
+        nominal = np.where(self._errors, 0.0, theta)
+        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
+        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+
+    def cost(self, theta: FloatArray, used: NDArray[np.bool_]) -> float:
+        """The cost of `fit` for the best levels of a theta, (p,)."""
+        levels = self.levels(theta)
+        (cost,), _, _ = self._costs(self.models(theta[None], levels), levels, used, theta[None])
+        return float(cost)
+
+    def _step(
+        self, theta: FloatArray, levels: NDArray[np.int64], used: NDArray[np.bool_], free: NDArray[np.bool_]
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Theta after a step of Gauss-Newton with damping, the Hessian before, and by how much the cost is less.
+
+        The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2, with J the
+        derivatives of the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
+        """
+        size, moving = len(theta), np.flatnonzero(free)
+        models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels)
+        costs, e, half_log_det = self._costs(models, levels, used, theta[None])
+        rms, J = np.sqrt(np.mean(e[0] ** 2, axis=0)), np.zeros((size, e[0].size))
+        J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
+        hessian, slope = J @ J.T + np.diag(self.prior**-2), J @ (e[0] / rms).ravel() + theta / self.prior**2
+        slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
+        tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self.bound, free), self._lower, self.bound)
+        lower, _, _ = self._costs(self.models(tried, levels), levels, used, tried)
+        progressed = float(costs[0] - lower.min())
+        return (tried[int(lower.argmin())] if progressed > 0.0 else theta), hessian, progressed
 
     def nominal_entries(self) -> list[Entry]:
         """The entries of A and B that are identified, before the flight."""
@@ -280,11 +332,19 @@ class Search:
         """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
         return np.isfinite(self._y).all(axis=1) & (np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5)
 
-    def _quiet(self, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples, (T,), that are neither in a gust nor within RECOVERY spans after one."""
-        gust = levels > np.median(levels)
-        recent = np.convolve(gust, np.ones(RECOVERY + 1))[: len(gust)] > 0.0
-        return ~np.repeat(recent, self._spans[0].stop)[: len(self._y)]
+    def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Mask of the samples to count, (T,): not of spans without a level to explain them, nor of gusts if these are FEW.
+
+        RECOVERY spans afterwards do not count either.
+        """
+        _, (e,), _ = self.innovations(self.models(theta[None], levels), levels)
+        square = np.array([np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans])
+        unexplained, gusts = (
+            np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
+            for spans in (square > UNEXPLAINED * np.median(square), LEVELS[levels, 1] > 0.0)
+        )
+        left_out = unexplained | gusts if np.mean(gusts) < FEW else unexplained
+        return ~np.repeat(left_out, self._spans[0].stop)[: len(self._y)]
 
     def _costs(
         self, models: Models, levels: NDArray[np.int64], used: NDArray[np.bool_], thetas: FloatArray
@@ -325,7 +385,7 @@ def damped_steps(
 
 
 class Prediction(NamedTuple):
-    """How well a model predicts the held-out samples one period ahead."""
+    """How well a model predicts the held-out samples a period ahead."""
 
     rms: FloatArray  # (m,) of the innovations, units of y
     whiteness: FloatArray  # (m,) 1 for white noise, see `whiteness`
@@ -383,15 +443,16 @@ def identify(
     """
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
-    held_out = known & (np.arange(len(recorded.t)) // span_length(recorded) % HELD_OUT == HELD_OUT - 1)
+    validating = known & held_out(len(recorded.t), span_length(recorded))
     every, done = blocks(model), count(1)
+    total = len(every) * (len(STARTS) * START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     parts, before, after = [], [], []
     for block in every:
         search = Search(recorded, model, block, airframe, actuation.delay, unknown)
-        fit = search.fit(known & ~held_out, lambda: progress(completed=next(done), total=len(every) * (MAX_ITERATIONS + 1)))
+        fit = search.fit(known & ~validating, lambda: progress(completed=next(done), total=total))
         outputs, entries = search.names.outputs, search.entries(fit)
-        predictions = prediction(fit.before, held_out), prediction(fit.after, held_out)
+        predictions = prediction(fit.before, validating), prediction(fit.after, validating)
         sentences = (
             another_airframe(entries, airframe.name, at_bound),
             too_little_excitation(entries, outputs),
@@ -404,8 +465,8 @@ def identify(
         after.append(fit.after)
     first, last = joined(before, every), joined(after, every)
     identified = with_entries(airframe, (entry for part in parts for entry in part.entries))
-    figures = prediction(first, held_out), prediction(last, held_out)
-    return Identification(identified, recorded, held_out, (first.r, last.r), *figures, tuple(parts))
+    figures = prediction(first, validating), prediction(last, validating)
+    return Identification(identified, recorded, validating, (first.r, last.r), *figures, tuple(parts))
 
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
