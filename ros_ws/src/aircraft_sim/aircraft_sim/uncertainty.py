@@ -115,13 +115,13 @@ def sampled_matrices(
     known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
     def drawn(matrix: FloatArray, part: FloatArray, numbers: FloatArray) -> FloatArray:
-        d = _deviations(numbers.reshape(count, *matrix.shape), spread.distribution)
+        d = deviations(numbers.reshape(count, *matrix.shape), spread.distribution)
         return np.asarray(matrix * (1.0 + known * part * d))
 
     return drawn(A, parts["A"], uniform[:, : A.size]), drawn(B, parts["B"], uniform[:, A.size :])
 
 
-def _deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
+def deviations(uniform: FloatArray, distribution: Distribution) -> FloatArray:
     """Deviations in [-1, 1] from numbers in [0, 1)."""
     if distribution == "uniform":
         return 2.0 * uniform - 1.0

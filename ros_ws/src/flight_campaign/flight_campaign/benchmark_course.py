@@ -39,6 +39,7 @@ class Segments(NamedTuple):
     sampled_y_m_dot: FloatArray  # (T, m)
     u_ff: FloatArray  # (T, m) feedforward
     error: FloatArray  # (T, m) sensor error of the y of the tick
+    noise: FloatArray  # (T, m) noise in it
     forcing: FloatArray  # (T, K r) mean over each of the steps from here to the next tick: wind along `axes`, basis' @ the rest
     forcing_now: FloatArray  # (T, r) at the tick
     air: FloatArray  # (T, n) wind's contribution to alpha and beta, rad
@@ -85,8 +86,10 @@ def build_course(scenario: Scenario) -> Course:
     vanes = [outputs.index(name) for name in controller.vanes]
     _require_plain_vanes(scenario, late)
     error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
+    noise, bias = np.zeros_like(error), 0.0 if errors.bias is None else errors.bias
     for k in range(ticks):
         error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
+        noise[k] = error[k] - bias - drift.value
 
     reference = Reference(scenario.reference_model)
     y_m, y_m_dot = np.zeros((ticks, len(order))), np.zeros((ticks, len(order)))
@@ -116,6 +119,7 @@ def build_course(scenario: Scenario) -> Course:
         y_m_dot[used],
         u_ff,
         error[:, order],
+        noise[:, order],
         over_step.reshape(ticks, -1),
         now,
         _air_angles(wind.at_tick, airframe),

@@ -17,6 +17,7 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Distribution, Spread, WindEffect, drawn_entries, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
+from flight_campaign import equipment
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
@@ -25,6 +26,7 @@ from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
 from flight_core.files import replacing, write_file, writing
 from flight_core.parameters import Config, ParameterError, Positive, Positives, require
+from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig
 
@@ -91,8 +93,13 @@ class Definition(Config):
 
     @property
     def spread(self) -> Spread:
-        """How the entries are drawn."""
-        return Spread(self.entries, self.distribution)
+        """How the entries of A and B are drawn."""
+        own = {name: part for name, part in self.entries.items() if not equipment.is_of_equipment(name)}
+        return Spread(own, self.distribution)
+
+    def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
+        """The lags and the noise of aircraft of a case, as `equipment.drawn`."""
+        return equipment.drawn(scenario, Spread(self.entries, self.distribution), self.seed, first, count)
 
     def scenario(self, case: int = 0) -> Scenario:
         """The scenario of a case of the sweep, the airframe as published."""
@@ -111,8 +118,11 @@ class Definition(Config):
             "seed": self.seed,
             "number": number,
         }
-        uncertainty |= {"entries": [*self.entries], "parts": [*self.entries.values()], "distribution": self.distribution}
-        return self.scenario(case).vary(aircraft={"uncertainty": uncertainty})
+        entries, scenario = self.spread.entries, self.scenario(case)
+        uncertainty |= {"entries": [*entries], "parts": [*entries.values()], "distribution": self.distribution}
+        of_equipment = self.drawn_equipment(scenario, number, 1)
+        equipped = equipment.with_equipment(scenario, {name: float(value[0]) for name, value in of_equipment.items()})
+        return equipped.vary(aircraft={"uncertainty": uncertainty})
 
     @property
     def cases(self) -> int:
@@ -170,6 +180,7 @@ def define(
         missions.build(scenario, build_course(scenario))
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
+    spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
     outputs, own = scenario.controller.outputs, dict(units or {})
     for name, unit in own.items():
         require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
@@ -178,7 +189,9 @@ def define(
     if scenario.guidance is None:
         score_units(outputs, scenario.aircraft.channels().outputs, own)
     if not scenario.aircraft.is_jsbsim:
-        sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, spread)
+        of_matrices = {name: part for name, part in spread.entries.items() if not equipment.is_of_equipment(name)}
+        of_airframe = spread._replace(entries=of_matrices)
+        sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, of_airframe)
     values = {
         "name": scenario.name,
         "sections": {
@@ -219,6 +232,8 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
     aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
+    equipped = definition.drawn_equipment(scenario, first, definition.chunk)
+    vehicle = fleet.with_equipment(vehicle, scenario, equipped)
     result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
@@ -228,7 +243,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
         figures = {name: np.asarray(values)[:count] for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, rms), ("max", outputs, largest), ("slew", inputs, slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
-    entries = drawn_entries(airframe, A[:count], B[:count])
+    entries = drawn_entries(airframe, A[:count], B[:count]) | {name: value[:count] for name, value in equipped.items()}
     return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
 
 
@@ -323,11 +338,13 @@ class Campaign:
         import polars as pl  # noqa: PLC0415 - as above
 
         rows, airframe = self.rows(case), load_airframe(self.definition.scenario().aircraft.airframe)
-        published = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
+        matrices = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
+        published = {name: float(value[0]) for name, value in matrices.items()}
+        published |= equipment.published(self.definition.scenario())
         return influence(
             rows.head(RANKED).collect(),
             rows.filter(pl.col("number") == worst).collect(),
-            {name: float(value[0]) for name, value in published.items()},
+            published,
             {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published},
         )
 

@@ -23,6 +23,7 @@ from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_analysis.report.summary import NO_UNIT, NO_VALUE, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null
 from flight_analysis.report.tables import Table
+from flight_campaign import equipment
 from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
 from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.files import display_path, write_file, writing
@@ -93,8 +94,12 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
         return ranked | {"command": None}
     scenario, path = definition.scenario(case), _path(campaign, case, "corner")
     airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
-    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), corner, definition.wind)))
-    write_file(path, scenario_yaml(scenario.vary(aircraft={"airframe": str(airframe)})))
+    known = equipment.published(scenario)
+    of_equipment = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
+    of_matrices = {name: part for name, part in corner.items() if name not in known}
+    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), of_matrices, definition.wind)))
+    cornered = equipment.with_equipment(scenario, of_equipment).vary(aircraft={"airframe": str(airframe)})
+    write_file(path, scenario_yaml(cornered))
     return ranked | {"command": _command(path)}
 
 
@@ -227,7 +232,7 @@ def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def influence_table(label: str, case: Mapping[str, Any]) -> Table:
-    """The entries of A and B whose size goes most with the score, of a case of the summary."""
+    """The drawn entries whose size goes most with the score, of a case of the summary."""
     ranked = case["influence"]
     rows = [
         [of["entry"], f"{of['rank_correlation']:+.2f}", f"{100 * of['worst_aircraft']:+.0f} %", _corner(of["worst_corner"])]
@@ -242,7 +247,7 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
     if ranked["command"] is not None:
         legend += f". The worst corner flies by {ranked['command']}"
     columns = [Column("", head) for head in ("rank correlation", "worst aircraft", "worst corner")]
-    return Table(f"Entries of A and B: {label}", columns, rows, legend)
+    return Table(f"Drawn entries: {label}", columns, rows, legend)
 
 
 def _corner(value: float) -> str:

@@ -6,6 +6,7 @@ The last axis of every array is the aircraft, so that one line of a law or of th
 ticks of the controller an aircraft is linear up to a small remainder: all steps of its integration are one matrix product.
 """
 
+from collections.abc import Mapping
 from functools import partial
 from itertools import accumulate, chain, repeat
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.dynamics import Aircraft, Coupling
 from aircraft_sim.plant import DIVERGENCE_LIMIT, PlantParams, share
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign import fleet_allocation, missions
+from flight_campaign import equipment, fleet_allocation, missions
 from flight_campaign.benchmark_course import Course, Segments
 from flight_campaign.fleet_allocation import allocate
 from flight_campaign.missions import Mission
@@ -82,6 +83,7 @@ class Vehicle(NamedTuple):
     actuators: Actuators  # (p, 1), airframe's order
     limits: Limits  # (m, 1), law's order: of u, as the controller has them
     quantum: Array | None  # (m, 1), law's order
+    noisier: Array | None  # (m, N), law's order: noise in parts of the noise of the course, less 1; None: 0
     dt: float  # s, of a step of the integration
     vanes: tuple[int, ...] = ()  # indices in the state of what the vanes read
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
@@ -101,6 +103,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
         Actuators(*(None if values is None else values[:, None] for values in plant.actuators)),
         Limits(*(values[:, None] for values in guard.limits)),
         None if quantum is None else quantum[:, None],
+        None,
         seconds(plant.step_ns),
         tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
         None if guard.allocation is None else fleet_allocation.of_fleet(guard.allocation),
@@ -110,6 +113,24 @@ def vehicle(scenario: Scenario) -> Vehicle:
 def shared(params: Any) -> Any:
     """Parameters of a law for one aircraft, (m,), as those of a fleet, (m, 1); matrices stay, which all aircraft share."""
     return jax.tree.map(lambda value: np.asarray(value)[:, None] if np.ndim(value) == 1 else np.asarray(value), params)
+
+
+def with_equipment(vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]) -> Vehicle:
+    """The vehicle with the lags and the noise of N aircraft, by name as from `equipment.drawn`."""
+    channels, aircraft, actuators_of = scenario.aircraft.channels(), scenario.aircraft, vehicle.actuators
+    if any(name.startswith("lag[") for name in values):
+        lag = equipment.in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
+        actuators_of = actuators_of._replace(lag=jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, lag))))
+        vehicle = vehicle._replace(actuators=actuators_of)
+    if any(name.startswith("noise[") for name in values):
+        noise = aircraft.sensors.noise
+        drawn = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
+        ratios = [
+            np.asarray(value) / published if published else np.ones(1) for value, published in zip(drawn, noise, strict=True)
+        ]
+        order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
+        vehicle = vehicle._replace(noisier=jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, ratios)))[np.array(order)] - 1.0)
+    return vehicle
 
 
 class FleetResult(NamedTuple):
@@ -377,6 +398,8 @@ def _sense(
         flown, y_m, *reference = missions.reference(flown, mission)
     e = true - y_m
     y = true + segment.error[:, None]
+    if vehicle.noisier is not None:
+        y = y + vehicle.noisier * segment.noise[:, None]
     if vehicle.quantum is not None:
         y = sensors.quantised(y, vehicle.quantum)
     arriving = jnp.concatenate([y[None], now.y_before])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign as a table: a row an aircraft with its figures, its outcome, and the entries of A and B that were drawn."""
+"""A campaign as a table: a row an aircraft with its figures, its outcome, and the drawn entries."""
 
 import io
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,7 +21,7 @@ class Chunk(NamedTuple):
     first: int  # number of the first
     diverged: FloatArray  # (N,)
     figures: dict[str, FloatArray]  # (N,) each, by name
-    entries: dict[str, FloatArray]  # (N,) each, by name, of `uncertainty.drawn_entries`
+    entries: dict[str, FloatArray]  # (N,) each, by name, of `uncertainty.drawn_entries` and `equipment.drawn`
 
 
 def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
@@ -47,8 +47,8 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
 
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
-    """The columns with drawn entries of A and B."""
-    return [name for name in table.columns if name.startswith(("A[", "B["))]
+    """The columns with drawn entries: of A and B, lags and noise."""
+    return [name for name in table.columns if name.startswith(("A[", "B[", "lag[", "noise["))]
 
 
 def tally_of(table: "pl.DataFrame") -> Tally:

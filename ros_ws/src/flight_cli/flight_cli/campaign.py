@@ -62,7 +62,9 @@ def campaign(
     ] = None,
     entry: Annotated[
         list[str] | None,
-        typer.Option(help="An entry of A or B with a deviation of its own, as 'A[q,alpha]=0.6'; once for each entry."),
+        typer.Option(
+            help="An entry with a deviation of its own, once for each: 'A[q,alpha]=0.6', 'lag[elevator]=0.5', noise=0.5."
+        ),
     ] = None,
     distribution: Annotated[
         Distribution | None,
@@ -90,7 +92,7 @@ def campaign(
     runs: Annotated[Path, typer.Option(help="Folder that the campaign's folder is made in.")] = Path("runs"),
     resume: Annotated[Path | None, typer.Option(help="Folder of an interrupted campaign to continue.")] = None,
     rows: Annotated[
-        Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries of A and B.")
+        Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else.")] = False,
 ) -> None:

@@ -57,7 +57,7 @@ def _without_models(scenario: Scenario) -> Scenario:
 
 
 def _is_newest_last(scenario: Scenario) -> bool:
-    """Whether the last sample of a tick is the newest y in every tick, so that the samples before it need no measurement."""
+    """Whether the last sample of a tick is the newest y in every tick, so that earlier samples need no measurement."""
     aircraft = scenario.aircraft
     plain = aircraft.sensors.delay == 0.0 and aircraft.sensors.dropout == 0.0
     return plain and not scenario.controller.vanes and aircraft.drift is None and not aircraft.is_jsbsim

@@ -144,8 +144,8 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
     """The engaged law as a discrete system of python-control, with limits and anti-windup: `y_NAME`, `y_m_NAME` -> `u_NAME`.
 
     The period is that of the controller. The state is that of the law, then u and y_m of the last tick; from 0 the flight
-    starts in trim. With an allocation the outputs are the effectors, and the state ends with these. With `linear` the law near
-    e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins: inside the limits the effectors are T times its u.
+    starts in trim. With an allocation the outputs are the effectors, at the end of the state. With `linear` the law near
+    e = 0 as a StateSpace from `y_NAME`, for Bode plots and margins: inside the limits the effectors are T u.
     Raises ParameterError without python-control, for a controller with a feedforward, whose model is beside the law, and with
     `linear` for the literal sign.
     """

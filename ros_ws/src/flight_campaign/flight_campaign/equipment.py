@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Lags of the actuators and noise of the sensors of the aircraft of a campaign, drawn as the entries of A and B.
+
+An entry is lag[ELEVATOR], a time constant in s, or noise[OUTPUT], a standard deviation in SI; lag and noise alone mean all.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from aircraft_sim import random_streams
+from aircraft_sim.uncertainty import Spread, deviations
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.parameters import require
+from flight_core.vectors import FloatArray
+
+KINDS = ("lag", "noise")
+
+
+def is_of_equipment(entry: str) -> bool:
+    """Whether an entry is a lag or a noise, not an entry of A or B."""
+    return entry.partition("[")[0] in KINDS
+
+
+def published(scenario: Scenario) -> dict[str, float]:
+    """The lags above 0 and the noise above 0 of a scenario by name, SI."""
+    aircraft, channels = scenario.aircraft, scenario.aircraft.channels()
+    named = (("lag", channels.inputs, aircraft.actuators.lag), ("noise", channels.outputs, aircraft.sensors.noise))
+    return {
+        f"{kind}[{name}]": value
+        for kind, names, values in named
+        for name, value in zip(names, values, strict=False)
+        if value > 0.0
+    }
+
+
+def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
+    """The entries, with each channel in place of lag and noise. Raises ParameterError for an unknown entry."""
+    known, every = published(scenario), {}
+    for name, part in entries.items():
+        if not is_of_equipment(name):
+            every[name] = part
+            continue
+        chosen = [entry for entry in known if name in (entry, entry.partition("[")[0])]
+        require(bool(chosen), "uncertainty", f"entry {name}", f"a lag or a noise above 0: {', '.join(known) or 'none'}")
+        every |= dict.fromkeys(chosen, part)
+    return every
+
+
+def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int) -> dict[str, FloatArray]:
+    """Drawn lags and noise of the aircraft first, first + 1, ... of a seed by entry, (count,) each.
+
+    A value is multiplied by 1 + d, as an entry of A, and depends on seed and number alone.
+    """
+    known = published(scenario)
+    uniform = random_streams.uniform(first, count, max(len(known), 1), random_streams.EQUIPMENT, seed)
+    d = deviations(uniform, spread.distribution)
+    return {
+        name: value * (1.0 + spread.entries[name] * d[:, k])
+        for k, (name, value) in enumerate(known.items())
+        if name in spread.entries
+    }
+
+
+def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]) -> list[Any]:
+    """The values of a kind in the order of the channels, `otherwise` where a channel has no value."""
+    return [values.get(f"{kind}[{name}]", value) for name, value in zip(names, otherwise, strict=True)]
+
+
+def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
+    """The scenario with lags and noise by name."""
+    aircraft, channels, changes = scenario.aircraft, scenario.aircraft.channels(), {}
+    if any(name.startswith("lag[") for name in values):
+        lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
+        changes["actuators"] = aircraft.actuators.model_dump() | {"lag": lag}
+    if any(name.startswith("noise[") for name in values):
+        noise = in_order(values, "noise", tuple(channels.outputs), aircraft.sensors.noise)
+        changes["sensors"] = aircraft.sensors.model_dump() | {"noise": noise}
+    return scenario.vary(aircraft=changes)
