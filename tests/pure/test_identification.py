@@ -37,6 +37,7 @@ from flight_analysis.design.identification import (
     reference_parameters,
     steepest_tangent,
     step_responses,
+    that_learns,
 )
 from flight_analysis.design.requirement import Requirement
 from flight_bringup.scenarios import find_scenario
@@ -221,6 +222,16 @@ def test_shipped_scenario_is_what_command_writes(cessna: IdentifiedAircraft) -> 
             found = shipped[section]["ros__parameters"][key]
             numbers = isinstance(value, float) or (isinstance(value, list) and isinstance(value[0], float))
             assert found == (pytest.approx(value, rel=1e-3, abs=1e-6) if numbers else value), key
+
+
+def test_shipped_learner_begins_with_sketch(cessna: IdentifiedAircraft) -> None:
+    shipped, gains = find_scenario("jsbsim_c172p_learn").rise_di(), cessna.selection.chosen
+    learned = that_learns(cessna.selection, cessna.condition, cessna.responses.Omega, 0.015).chosen
+    assert shipped.feedforward is not None
+    assert learned.feedforward is not None
+    assert shipped.beta == pytest.approx(gains.beta, rel=1e-3)
+    for key in ("A", "B"):
+        assert getattr(shipped.feedforward, key) == pytest.approx(getattr(learned.feedforward, key), rel=1e-3, abs=1e-6)
 
 
 def test_airspeed_holds_wind_without_moving_throttle_from_stop_to_stop(cessna: IdentifiedAircraft) -> None:

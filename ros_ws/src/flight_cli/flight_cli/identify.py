@@ -83,6 +83,9 @@ def identify(
     guidance: Annotated[
         bool, typer.Option("--guidance", help="Without --log: fly and write guidance by rule in place of the pulses.")
     ] = False,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="Without --log: write a scenario that learns A and B in flight.")
+    ] = False,
     margin: Annotated[
         float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.")
     ] = None,
@@ -120,7 +123,7 @@ def identify(
             "--margin": margin,
         }
         of_others |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
-        of_others["--guidance"] = guidance or None
+        of_others |= {"--guidance": guidance or None, "--learn": learn or None}
         for name, value in (of_others | {"--namespace": namespace}).items():
             require(value is None, name, f"{value}", "none beside --bridge")
         if write is None:
@@ -137,12 +140,14 @@ def identify(
         "--output": output,
         "--observer": observer or None,
         "--guidance": guidance or None,
+        "--learn": learn or None,
         "--phase-margin": phase_margin,
         "--accept": accept or None,
     }
     of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
     of_log |= {"--refly": refly or None}
-    require(margin is None or refly or observer, "--margin", margin, "--refly or --observer beside it")
+    require(margin is None or refly or observer or learn, "--margin", margin, "--refly, --observer or --learn beside it")
+    require(not (observer and learn), "--observer", "--learn beside it", "one of the two: a learner designs its own observer")
     for name, value in (of_log if log is None else of_tests).items():
         require(value is None, name, f"{value}", "--log with it" if log is None else "none beside --log")
     if log is not None:
@@ -153,8 +158,17 @@ def identify(
     elif aircraft is None or speed is None or altitude is None:
         raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
     else:
-        observer_margin = (STEP_MARGIN if margin is None else margin) if observer else None
-        _identify_by_steps(aircraft, speed, altitude, output, observer_margin, guidance, as_json, needed, accept)
+        observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
+        flown = _Flown(observer_margin, guidance, learn)
+        _identify_by_steps(aircraft, speed, altitude, output, flown, as_json, needed, accept)
+
+
+class _Flown(NamedTuple):
+    """What the scenario has beside the gains."""
+
+    observer_margin: float | None  # s; None without an observer
+    guided: bool
+    learns: bool
 
 
 def _identify_by_steps(
@@ -162,8 +176,7 @@ def _identify_by_steps(
     speed: float,
     altitude: float,
     output: Path | None,
-    observer_margin: float | None,
-    guided: bool,
+    flown: _Flown,
     as_json: bool,
     needed: Requirement,
     accept: bool,
@@ -179,7 +192,16 @@ def _identify_by_steps(
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
-            found = identify_aircraft(name, speed, altitude, status.update, observer_margin, guided=guided, needed=needed)
+            found = identify_aircraft(
+                name,
+                speed,
+                altitude,
+                status.update,
+                flown.observer_margin,
+                guided=flown.guided,
+                learns=flown.learns,
+                needed=needed,
+            )
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None

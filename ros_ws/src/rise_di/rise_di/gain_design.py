@@ -15,7 +15,13 @@ from flight_analysis.design import gain_selection
 from flight_analysis.design.effectors import LAW_INPUT, Effectors, design_allocation
 from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
 from flight_analysis.design.nominal import sizes
-from flight_analysis.design.observer_selection import gains_by_rule, gains_of_search, model_for, with_aircraft_observer
+from flight_analysis.design.observer_selection import (
+    gains_beside_sketch,
+    gains_by_rule,
+    gains_of_search,
+    model_for,
+    with_aircraft_observer,
+)
 from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, PHASE_MARGIN, Requirement, requirement
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
@@ -267,14 +273,16 @@ def observed(
     needed: Requirement = OBSERVER_REQUIREMENT,
     *,
     uncertain: bool = True,
+    sketched: bool = False,
     speeds: tuple[float, float] | None = None,
 ) -> tuple[RiseDiConfig, str]:
     """A controller with feedforward and observer of a model, and a sentence on its gains.
 
     The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
     where the model has the same states; else they follow from the lags by a rule. Of several gain sets it is the one that the
-    margins change least, then the one of the least cost. `uncertain` counts the phase margin of uncertain aircraft too, and
-    `speeds` are two ratios to the trim speed, with models there.
+    margins change least, then the one of the least cost. `uncertain` counts the phase margin of uncertain aircraft too,
+    `sketched` takes the gains for a model from a sketch, and `speeds` are two ratios to the trim speed, with models
+    there.
     """
     channels = scenario.aircraft.channels().outputs
     by_name = dict(zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True))
@@ -286,11 +294,14 @@ def observed(
     noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
     nominal = model_for(model, controller, noise)
     tuned = _tuned_scenario(scenario)
-    results = {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    results = {} if sketched else {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
     searched = sorted(
         ((result.cost, law, result) for law, result in results.items() if result is not None), key=lambda row: row[0]
     )
-    candidates = [(gains_by_rule(nominal, tuple(model.gusts), model.speed), "gains by a rule from the lags, a start")]
+    axes, origin = tuple(model.gusts), "gains by a rule from the lags, a start"
+    candidates = [(gains_by_rule(nominal, axes, model.speed), origin)]
+    if sketched:
+        candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
     if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
         origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
         of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)

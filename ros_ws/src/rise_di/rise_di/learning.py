@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The learner of a scenario: its airframe file is the rough model, and its observers have the gains of `rise-di gains`."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,8 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.learner import Learner
+from flight_analysis.design.model_identification import KNOWN
+from flight_analysis.design.sketch import ROUGH, sketched
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
@@ -23,21 +26,26 @@ from rise_di_controller.rise_di import RiseDiConfig
 def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not learn.
 
-    The published airframe is the rough model, not the aircraft that flies. In real time the loop has the delay of the
-    controller's section; in one process and in lockstep u acts at once. Raises ParameterError for an aircraft of JSBSim.
+    The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim the rough model is the
+    controller's feedforward. In real time the loop has the delay of the controller's section; in one process and in lockstep u
+    acts at once. Raises ParameterError.
     """
     controller, aircraft = scenario.controller, scenario.aircraft
     if not isinstance(controller, RiseDiConfig) or controller.learn is None:
         return None
-    require(not aircraft.is_jsbsim, "controller.learn", "an aircraft of JSBSim", "an airframe file: it has the rough model")
-    airframe, margin = load_airframe(aircraft.airframe), 0.0 if controller.observer is None else controller.observer.margin
+    margin = 0.0 if controller.observer is None else controller.observer.margin
+    if aircraft.is_jsbsim:
+        condition = aircraft.flight_condition()
+        airframe, rough = sketched(Path(condition.name).stem, controller, condition.speed), ROUGH
+    else:
+        airframe, rough = load_airframe(aircraft.airframe), KNOWN
     if controller.learn.prior is not None:
         airframe = _prior(controller.learn.prior, airframe)
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        return observed(start, scenario, model, margin, uncertain=False)[0]
+        return observed(start, scenario, model, margin, uncertain=False, sketched=aircraft.is_jsbsim)[0]
 
-    return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0)
+    return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
 
 
 def _prior(path: str, flown: Airframe) -> Airframe:

@@ -703,7 +703,8 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     }
     if theorem:
         comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
-    if controller.observer is not None:
+    beside = controller.observer is not None and controller.observer.part > 0.0  # else the observer of a learner, later
+    if beside:
         unscaled = "units of u s / units of y; for a K of (22) that is above 1"
         comments |= {
             "Lambda": "1/s",
@@ -711,7 +712,7 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
             "omega": "abs(Omega_ii) in scaled inputs",
             "input_scale": unscaled,
         }
-    origin = "by Theorem 1" if theorem else "beside an observer" if controller.observer else "by the engineering procedure"
+    origin = "by Theorem 1" if theorem else "beside an observer" if beside else "by the engineering procedure"
     return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
 
 
@@ -722,7 +723,7 @@ def section_yaml(
     parameters = [
         (key, value, comments.get(key, type(controller).model_fields[key].description))
         for key, value in controller.model_dump(
-            exclude_defaults=True, exclude={"allocation", "feedforward", "observer", "schedule"}
+            exclude_defaults=True, exclude={"allocation", "feedforward", "observer", "schedule", "learn"}
         ).items()
     ]
     return CONTROLLER_YAML.render(
@@ -771,6 +772,10 @@ def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tup
                 values = (f"{key}: {yaml_flow(value, 10)}" for key, value in model.model_dump(exclude_none=True).items())
                 rows[name] = "{" + ",\n             ".join(values) + "}"
         sections["schedule"] = ("input_scale, and the models of the sections above, follow the airspeed; m/s, s", rows)
+    if isinstance(controller, RiseDiConfig) and controller.learn is not None:
+        settings = controller.learn.model_dump(exclude_none=True)
+        rows = {key: yaml_flow(value) for key, value in settings.items()}
+        sections["learn"] = ("A and B are identified in flight, and feedforward and observer designed again; s", rows)
     return sections
 
 

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identification of an unknown aircraft: step tests, signs, lags and gains, written as a scenario that flies it.
+"""Identification of an unknown aircraft: step tests, signs, lags and gains, written as a scenario.
 
-`identify` only needs to fly the aircraft. It steps each input; the steepest tangent of the paired output gives the column of
+`identify` only needs to fly the aircraft. Every input is stepped; the steepest tangent of the paired output gives the column of
 Omega and the lag of that input. The gains are those of the engineering procedure of `rise-di gains`, with the slew of the
 inputs measured in flight. No number in this module is specific to an aircraft.
 """
@@ -27,8 +27,14 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import gain_selection
 from flight_analysis.design.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
 from flight_analysis.design.nominal import sizes
-from flight_analysis.design.observer_selection import with_extended_state_observer
+from flight_analysis.design.observer_selection import (
+    gains_beside_sketch,
+    model_for,
+    with_aircraft_observer,
+    with_extended_state_observer,
+)
 from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, REQUIREMENT, Requirement
+from flight_analysis.design.sketch import sketch
 from flight_analysis.metrics import best_error, error_metrics, saturation_shares
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.rates import divide, nanoseconds
@@ -38,7 +44,7 @@ from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import coupling
 from rise_di_controller.law import total_lag
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
 # The step tests
 
@@ -57,12 +63,15 @@ DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 m
 
 NOISE_SHARE = 100.0  # of the unit of an output to the noise that an observer expects: 1 mrad/s, 0.01 m/s
 
+NOISE = {"q": 0.001, "V": 0.05, "p": 0.001, "r": 0.001}
+"""rad/s and m/s, rms a sample, of the sensors of an aircraft that learns, assumed: those of a first flight."""
+
 Fly = Callable[[FloatArray, float], FloatArray]
 """(constant u from trim, shape (m,); duration in s) -> y every `dt` from t = 0, shape (N + 1, m), deviations from trim."""
 
 
 class Tangent(NamedTuple):
-    """The steepest chord of a step response, an estimate of its steepest tangent: y = slope (t - lag)."""
+    """The steepest chord of a step response, an estimate of the steepest tangent: y = slope (t - lag)."""
 
     slope: float
     lag: float  # s
@@ -160,7 +169,7 @@ LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8
 
 
 def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
-    """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of its throttle (m/s^2).
+    """Parameters of the reference model for an aircraft of a trim speed (m/s) and an authority of the throttle (m/s^2).
 
         q   0.05 rad/s, or 1 g / speed if that is less, up and down for 1 s each: each pair restores the flight path
         V   2 m/s more for 20 s; its filter needs at most 2 m/s omega / e, a third of the authority, omega up to 1.2 rad/s
@@ -220,7 +229,7 @@ class ManoeuvreResult(NamedTuple):
 
 
 class IdentifiedAircraft(NamedTuple):
-    """An identified aircraft, and the scenario that flies it."""
+    """An identified aircraft with a scenario."""
 
     condition: FlightCondition
     trim: Trim
@@ -259,6 +268,7 @@ def identify(
     observer_margin: float | None = None,
     *,
     guided: bool = False,
+    learns: bool = False,
     needed: Requirement = REQUIREMENT,
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
@@ -271,7 +281,8 @@ def identify(
     meet `needed`, with 35 degrees of phase beside an observer. 6. Simulations of the result:
     in calm air, with a gust, in turbulence. With `guided` the scenario has guidance by rule in place of the pulses: a turn by
     90 degrees and a climb by 100 m. Its stall speed is that of `slowest_trim`, and its sideslip feedback flies an aircraft
-    whose `sideslip_zero` is positive, too.
+    whose `sideslip_zero` is positive, too. With `learns` the scenario learns in moderate turbulence: the gains
+    begin alone, `observer_margin` is the margin of the designs, and the rough model is the `sketch` of Omega and speed.
 
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
     paired, or if the speed is below guidance's speed floor.
@@ -313,10 +324,12 @@ def identify(
     sign = V_bandwidth**2 / 4.0 * LIGHT_SIGMA  # m/s^3
     slew[throttle] = sign / (gain_selection.BETA_TO_SLEW * abs(measured.Omega[throttle, throttle]))
     chosen = gain_selection.select_gains(studied._replace(slew=slew), setting)
-    if observer_margin is not None:
-        chosen = _with_observer(chosen, measured.Omega, observer_margin)
+    if observer_margin is not None and not learns:
+        chosen = with_observer(chosen, measured.Omega, observer_margin)
     text = scenario_text(chosen)
     flights = fly_all(_load(text), progress)
+    if observer_margin is not None and learns:
+        text = scenario_text(that_learns(chosen, condition, measured.Omega, observer_margin))
     return IdentifiedAircraft(condition, trim, measured, coupling(scaled), chosen, text, sideslip_zero(condition), flights)
 
 
@@ -336,7 +349,7 @@ def slowest_trim(condition: FlightCondition) -> float:
     return fast
 
 
-def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
+def with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Selection:
     """The selection with an extended-state observer in its engineering gains; Omega in the aircraft's order."""
     controller = selection.chosen
     rows = [list(OUTPUTS).index(name) for name in controller.outputs]
@@ -346,6 +359,22 @@ def _with_observer(selection: Selection, Omega: FloatArray, margin: float) -> Se
     needed = needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
     observed = with_extended_state_observer(controller, Omega[np.ix_(rows, columns)], size / NOISE_SHARE, size, margin, needed)
     return replace(selection, chosen=observed.controller)
+
+
+def that_learns(selection: Selection, condition: FlightCondition, Omega: FloatArray, margin: float) -> Selection:
+    """A selection with feedforward and observer of a sketch, not yet flying, and `learn`; Omega in the aircraft's order."""
+    start = selection.chosen
+    rows = [list(OUTPUTS).index(name) for name in start.outputs]
+    columns = [list(INPUTS).index(name) for name in start.inputs]
+    name = Path(condition.name).stem
+    rough = sketch(name, Omega[np.ix_(rows, columns)], start.outputs, start.inputs, condition.speed)
+    noise, axes = np.array([NOISE[output] for output in start.outputs]), tuple(rough.gusts)
+    gains = gains_beside_sketch(model_for(rough, start, noise), start.outputs, axes, condition.speed)
+    designed = with_aircraft_observer(start, rough, gains, noise, margin, uncertain=False).controller
+    assert designed.observer is not None  # noqa: S101 - it was designed
+    observer = designed.observer.model_copy(update={"part": 0.0})
+    sections = {"feedforward": designed.feedforward, "observer": observer, "learn": LearnConfig()}
+    return replace(selection, chosen=start.model_copy(update=sections))
 
 
 def fly_all(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> dict[str, ManoeuvreResult]:
@@ -407,7 +436,7 @@ def airspeed_bandwidth(authority: float, lag: float) -> float:
 
 
 def _setting(trim: Trim, lag: FloatArray, V_bandwidth: float) -> LoopSetting:
-    """The loop that the gains are selected for. The parameters to be selected are 1."""
+    """The loop of the gains. The parameters to be selected are 1."""
     inputs = list(INPUTS)
     ones = [1.0] * len(inputs)
     base = RiseDiConfig.validate_mapping(
@@ -443,9 +472,10 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 # SPDX-License-Identifier: Apache-2.0
 #
 # JSBSim's {{ condition.name }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
-{{ "guidance turns and climbs" if guided else "commands on every channel" }}, a gust from above.
+{{ "guidance turns and climbs" if guided else "commands on every channel" }}, \
+{{ "moderate turbulence. It learns A and B in flight: docs/learning.md" if learns else "a gust from above" }}.
 # Written by: rise-di identify {{ condition.title }} --speed {{ condition.speed | digits(6) }} \
---altitude {{ condition.altitude | digits(6) }}{{ " --guidance" if guided }}
+--altitude {{ condition.altitude | digits(6) }}{{ " --guidance" if guided }}{{ " --learn" if learns }}
 # Commands in trim: {% for name in inputs %}{{ name }} {{ trim.commands[loop.index0] | digits(3) }}\
 {{ ", " if not loop.last }}{% endfor %}.
 # Steepest response, in rad/s^2 and m/s^2 per unit of command: {% for name in outputs %}{{ name }} by \
@@ -462,9 +492,14 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
     altitude: {{ condition.altitude | flow }}  # m, above sea level
     rate: {{ rate | flow }}                # Hz, y and truth
     step: {{ step | flow }}                # s, of JSBSim
+{% if learns %}
+    turbulence: {{ turbulence | flow }}  # moderate
+    sensors: {noise: {{ noise | flow }}, seed: 1}  # q, V, p, r, rms a sample in SI, assumed
+{% else %}
     gusts:                     # 1-cosine; entry in s, peak speed in m/s (down), distance H to the peak in m
       vertical: {{ gust | flow }}
     # turbulence: {{ turbulence | flow }}  # moderate, to fly in instead
+{% endif %}
     actuators:                 # elevator, throttle, aileron, rudder: deviations of the normalised commands from trim
       lower: {{ trim.lower.tolist() | flow }}
       upper: {{ trim.upper.tolist() | flow }}
@@ -529,6 +564,8 @@ def _text(
         turbulence=moderate_turbulence(condition.altitude),
         commands=commands,
         guided=stall is not None,
+        learns=selection.chosen.learn is not None,
+        noise=[NOISE[name] for name in OUTPUTS],
         stall=stall,
         program={
             "heading": {"start": [TURN_START], "value": [TURN]},

@@ -210,13 +210,18 @@ def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArra
 
 
 def filter_bank(
-    model: NominalModel, names: Names, speed: float, strength: FloatArray, levels: NDArray[np.int64] | slice = slice(None)
+    model: NominalModel,
+    names: Names,
+    speed: float,
+    strength: FloatArray,
+    levels: NDArray[np.int64] | slice = slice(None),
+    drift: float = DRIFT,
 ) -> FilterBank:
     """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, rate, ..].
 
         w_dot = rate - w / wind_time + noise,  rate_dot = -rate / GUST_TIME + noise
 
-    The noises are of `levels` of LEVELS, times `strength` (N, G).
+    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`.
     """
     wind_time, noise = wind_model(names.winds, speed)
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
@@ -239,7 +244,7 @@ def filter_bank(
         strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
     )
     loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, gust_rate + LEAST_RATE], axis=-1)
-    weights = Weights(np.ones(m), np.full(m, DRIFT), np.zeros(0), np.zeros(0), loose)
+    weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
     L = observer_design.aircraft_correction(sampled, each, weights)
     # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
     covariance = np.linalg.solve(np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m)))

@@ -17,8 +17,9 @@ from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_analysis.design.gain_conditions import MIN_GAIN
 from flight_analysis.design.gain_selection import ChannelPairing
-from flight_analysis.design.innovation_filters import TRANSIENT, Actuation, Recording
+from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import (
+    KNOWN,
     MAX_WHITENESS,
     PRIOR,
     Entry,
@@ -55,16 +56,20 @@ class Learner:
     The parts of the aircraft that do not couple are learned one by one: one without a model flies the law of the start.
     """
 
-    def __init__(self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0) -> None:
+    def __init__(
+        self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0, rough: Unknown = KNOWN
+    ) -> None:
         """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling and lags.
 
+        `rough` has the deviation of B in the rough model, and the noise of the disturbances. With more noise than DRIFT the
+        aircraft is not tested for a change: the disturbances stand for a change, and for a dead input.
         Raises ParameterError for a controller that does not learn.
         """
         settings = controller.learn
         require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
         assert settings is not None  # noqa: S101 - for the type checker
         self._controller, self._rough, self._design = controller, airframe, design
-        self._period = 1.0 / controller.rate
+        self._period, self._believed = 1.0 / controller.rate, rough
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
         self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
         self._record: deque[tuple[int, FloatArray, FloatArray]] = deque()
@@ -144,7 +149,7 @@ class Learner:
             self._actuation,
             channels,
             at_bound=AT_BOUND,
-            unknown=Unknown(DELAY_DEVIATION, ANGLE),
+            unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE),
         )
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
@@ -186,7 +191,7 @@ class Learner:
         """Tests of the parts whose window ended RECORD ago or earlier."""
         tested = {part: known for part, known in self._known.items() if part not in self._changed}
         old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
-        if not old:
+        if not old or self._believed.drift > DRIFT:
             return []
         deviation = {name: value for known in old.values() for name, value in known.deviation.items()}
         recent = self.recording(end_ns - nanoseconds(RECORD))

@@ -20,6 +20,7 @@ from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import (
+    DRIFT,
     HOLD,
     LEVELS,
     TRANSIENT,
@@ -85,10 +86,12 @@ class Models(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """Standard deviations of what else is identified; 0: it is known."""
+    """Standard deviations of what else is identified, 0: known; of B; and the noise of the disturbances."""
 
     delay: float = 0.0  # s, of u
     angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
+    effect: float = PRIOR  # 1, of an entry of B before the flight
+    drift: float = DRIFT  # sizes/s per root s, of the disturbances
 
 
 KNOWN = Unknown()
@@ -141,7 +144,7 @@ class Search:
         unknown: Unknown = KNOWN,
         factor: int | None = None,
     ) -> None:
-        """The prior of each relative error is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known.
+        """The prior of each error of A is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known.
 
         The starts of the search take means of `factor` periods, by default of the shortest lag.
         """
@@ -152,6 +155,7 @@ class Search:
             self._coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1)
         self._period = recorded.period
         self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
+        self._drift = unknown.drift
         angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
         self._angles, self._angle_deviation = angles if unknown.angle else angles[:0], unknown.angle
         self._model, self._block, self._airframe = block.of(model), block, airframe
@@ -160,8 +164,9 @@ class Search:
         self._y, self._u = recorded.y[:, block.outputs], recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
-        self.count = sum(int(mask.sum()) for mask in uncertain(self._model))  # of the entries that are identified
-        self.believe(np.full(self.count, PRIOR))
+        of_A, of_B = (int(mask.sum()) for mask in uncertain(self._model))
+        self.count = of_A + of_B  # of the entries that are identified
+        self.believe(np.repeat([PRIOR, unknown.effect], [of_A, of_B]))
 
     def believe(self, deviation: FloatArray) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
@@ -196,7 +201,7 @@ class Search:
         """The filters of theta, (N, p), at the winds of some levels."""
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
-        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength, levels)
+        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength, levels, self._drift)
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]

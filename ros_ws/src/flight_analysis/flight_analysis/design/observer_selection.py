@@ -99,6 +99,20 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
     return ObserverGains(K, K / 4.0, K / T, np.full(len(T), 3.0), weights)
 
 
+BESIDE_SKETCH = {"effort": (0.25, 4.0), "K": (16.0, 1.0)}
+"""Factors on `gains_by_rule` beside a sketch, for a body rate and for V, found on the c172p and the 737 of JSBSim: the law of
+the rates keeps two thirds of its bandwidth, because a sketch leaves out more than a model does."""
+
+
+def gains_beside_sketch(model: NominalModel, outputs: tuple[str, ...], axes: tuple[str, ...], speed: float) -> ObserverGains:
+    """Gains from the lags for a model from a sketch: `gains_by_rule` times BESIDE_SKETCH."""
+    by_rule = gains_by_rule(model, axes, speed)
+    airspeed = [name == "V" for name in outputs]
+    effort, K = (np.where(airspeed, *reversed(BESIDE_SKETCH[key])) for key in ("effort", "K"))
+    weights = by_rule.weights._replace(effort=effort * by_rule.weights.effort)
+    return by_rule._replace(K=K * by_rule.K, Lambda=K * by_rule.Lambda, beta=K * by_rule.beta, weights=weights)
+
+
 def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> ObserverGains:
     """Gains as `rise-di compare --tune` finds them for rise_observer or pi_observer, by name; T the total lag, (m,), s.
 
