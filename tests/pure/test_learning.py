@@ -15,6 +15,7 @@ from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.learner import Learner
+from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.figures import learned_figure, plot_context
 from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
@@ -241,6 +242,15 @@ def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
     flight.update()
     shown = [event for event in flight.events if event.kind == "learning"]
     assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines
+
+
+def test_report_has_error_by_model(flown: Flown) -> None:
+    flight = read_flight(flown.run)
+    before, under = errors_by_model(flight.tape)
+    assert (before.stop, under.start) == (SWITCH, SWITCH)
+    truth = error(flight.tape, SWITCH, 23.0)
+    assert [under.rms[name] for name in NAMES] == pytest.approx(truth, rel=1e-2)
+    assert [span["rms"] for span in flight.summary["models"]] == [before.rms, under.rms]
 
 
 def test_report_draws_what_was_identified_with_its_deviations(flown: Flown) -> None:

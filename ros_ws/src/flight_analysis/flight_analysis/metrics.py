@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from operator import attrgetter
 from typing import NamedTuple
 
@@ -70,6 +71,15 @@ class ErrorMetrics(NamedTuple):
 
     rms: float
     max: float
+
+
+class ModelSpan(NamedTuple):
+    """A span of a flight under the same parameters of the controller."""
+
+    model: int  # 0: the parameters of the start
+    start: float  # s
+    stop: float  # s
+    rms: dict[str, float]  # of `best_error` by channel
 
 
 class InputMetrics(NamedTuple):
@@ -289,6 +299,22 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
     weighted = times is not None and np.ptp(times) > 0.0
     square = np.average(e**2, weights=times) if weighted else np.mean(e**2)
     return ErrorMetrics(float(np.sqrt(square)), float(np.max(np.abs(e))))
+
+
+def errors_by_model(tape: Tape) -> list[ModelSpan]:
+    """Rms of `best_error` before the first model of a learner and under each model; empty for a tape without a learner."""
+    if "learned" not in tape or "internals" not in tape:
+        return []
+    _, error = best_error(tape)
+    t, ticks, flown = (error.stamp_ns - tape.start_ns) / 1e9, tape.time("internals"), tape["internals"]["parameters"]
+    changes = np.flatnonzero(np.diff(flown, prepend=np.nan) != 0.0)
+    digests = list(dict.fromkeys(flown[changes].tolist()))
+    spans = []
+    for digest, (start, stop) in zip(flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True):
+        within = (t >= start) & (t < stop)
+        rms = {name: error_metrics(error[name][within]).rms for name in error.names}
+        spans.append(ModelSpan(digests.index(digest), start, stop, rms))
+    return spans
 
 
 def errors_by_part(

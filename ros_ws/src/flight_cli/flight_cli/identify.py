@@ -12,7 +12,6 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 from rich.console import Console
-from rich.markup import escape
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
@@ -35,7 +34,16 @@ from flight_analysis.report.summary import DisplayUnit, display_unit
 from flight_cli.bridge_experiment import identify_behind_bridge
 from flight_cli.gains import speed_of_margin
 from flight_cli.log_options import scenario_file, warn_of_lacks
-from flight_cli.output import COUNT_COLUMNS, new_table, options, print_json, progress_bar, write_text
+from flight_cli.output import (
+    COUNT_COLUMNS,
+    entries_as_json,
+    entry_table,
+    new_table,
+    options,
+    print_json,
+    progress_bar,
+    write_text,
+)
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -301,12 +309,7 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
 
 
 def _show_model(console: Console, found: Identification) -> None:
-    headings = ("entry", "nominal", "identified", "change %", "deviation %")
-    table = new_table(f"A and B of {found.airframe.name}, SI; deviation: of the change, standard", headings, left=("entry",))
-    for entry in found.entries:
-        values = f"{entry.nominal:.4g}", f"{entry.nominal * (1.0 + entry.error):.4g}"
-        table.add_row(escape(entry.name), *values, f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}")
-    console.print(table)
+    console.print(entry_table(f"A and B of {found.airframe.name}", found.entries))
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
     table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left=("output",))
     for i, (name, unit) in enumerate(_units(found).items()):
@@ -339,10 +342,7 @@ def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
     outputs = found.airframe.outputs
     return {
         "airframe": found.airframe.name,
-        "entries": {
-            entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation}
-            for entry in found.entries
-        },
+        "entries": entries_as_json(found.entries),
         "held_out": {
             model: {
                 "rms": dict(zip(outputs, innovations.rms.tolist(), strict=True)),

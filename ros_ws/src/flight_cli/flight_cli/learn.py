@@ -9,8 +9,10 @@ import typer
 from rich.console import Console
 
 from flight_analysis.closed_loop.replay import recorded_scenario
+from flight_analysis.metrics import errors_by_model
+from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
-from flight_cli.output import LATEST, print_json, write_text
+from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, print_json, write_text
 from flight_core.arguments import as_numbers
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -58,10 +60,15 @@ def learn(
             markup=False,
             soft_wrap=True,
         )
+    if result.entries:
+        console.print(entry_table("A and B of the last identification", result.entries))
+    if models := [span._asdict() for span in errors_by_model(recorded.tape)]:
+        console.print(model_table(models, display_units(flown)))
     if result.model is not None and write is not None:
         write_text("--write", write, learned_yaml(result, str(run)))
         console.print(f"model: {display_path(write)}", highlight=False, markup=False, soft_wrap=True)
     if as_json:
         steps = [step._asdict() for step in result.steps]
-        print_json({"steps": steps, "model": None if result.model is None or write is None else str(write)})
+        path = None if result.model is None or write is None else str(write)
+        print_json({"steps": steps, "entries": entries_as_json(result.entries), "models": models, "model": path})
     raise typer.Exit(NOTHING_LEARNED if result.model is None else 0)

@@ -10,9 +10,11 @@ from typing import Any, Literal
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from flight_analysis.closed_loop.learning import Entry
 from flight_analysis.report.guided import leg_results
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,
@@ -20,6 +22,7 @@ from flight_analysis.report.summary import (
     QUANTITY_UNITS,
     SATURATION_COLUMN,
     Column,
+    DisplayUnit,
     RecordedFlight,
     columns_of,
     command_results,
@@ -27,6 +30,7 @@ from flight_analysis.report.summary import (
     format_seconds,
     format_value,
     input_rows,
+    model_rows,
     parts_legend,
     table_rows,
     taken_over,
@@ -58,6 +62,8 @@ def show_flight(console: Console, flight: RecordedFlight) -> None:
         console.print(_guidance_table(summary["guidance"]["segments"], taken_over(summary, "guidance")))
         if legs := leg_results(summary["guidance"]["legs"]):
             console.print(legs, highlight=False, soft_wrap=True)
+    if summary["models"]:
+        console.print(model_table(summary["models"], units))
     if commands := command_results(summary):
         console.print(commands, highlight=False, soft_wrap=True)
     console.print(f"{parts_legend(summary)}. ultimate bound: the largest undisturbed error", style="dim", highlight=False)
@@ -90,6 +96,30 @@ def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
         leg = "" if segment["leg"] is None else f"leg {segment['leg']}: "
         table.add_row(leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"]))
     return table
+
+
+def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]) -> Table:
+    """The rms of the error before the first learned model and under each."""
+    headings, rows = model_rows(models, units)
+    table = new_table("Rms of the error by model", ["", *(heading.replace(" ", "\n") for heading in headings)], left=("",))
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def entry_table(title: str, entries: Iterable[Entry]) -> Table:
+    """Entries of A and B, nominal and identified, with the standard deviation of the change."""
+    headings = ("entry", "nominal", "identified", "change %", "deviation %")
+    table = new_table(f"{title}, SI; deviation: of the change, standard", headings, left=("entry",))
+    for entry in entries:
+        values = f"{entry.nominal:.4g}", f"{entry.nominal * (1.0 + entry.error):.4g}"
+        table.add_row(escape(entry.name), *values, f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}")
+    return table
+
+
+def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
+    """Entries of A and B by name."""
+    return {entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation} for entry in entries}
 
 
 def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wrapped: Container[str] = ()) -> Table:

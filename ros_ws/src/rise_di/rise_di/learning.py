@@ -12,7 +12,7 @@ from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.learning import Learn
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.learner import Learner
-from flight_analysis.design.model_identification import KNOWN
+from flight_analysis.design.model_identification import KNOWN, Entry
 from flight_analysis.design.sketch import ROUGH, sketched
 from flight_core.modes import Mode
 from flight_core.parameters import require
@@ -70,6 +70,7 @@ class LearnResult(NamedTuple):
 
     steps: tuple[LearnStep, ...]
     model: Airframe | None
+    entries: tuple[Entry, ...]  # of the last identification
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
@@ -90,7 +91,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposal = learned.propose()
             t = (stamp_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
-    return LearnResult(tuple(steps), learned.model)
+    last = learned.identification
+    return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
 
 
 def learned_yaml(result: LearnResult, origin: str) -> str:

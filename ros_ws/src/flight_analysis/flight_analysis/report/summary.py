@@ -20,6 +20,7 @@ from flight_analysis.metrics import (
     age_metrics,
     best_error,
     engagements,
+    errors_by_model,
     errors_by_part,
     guided_transients,
     inputs_by_part,
@@ -173,6 +174,7 @@ def summarise(
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
         "guidance": guidance_summary(tape),
+        "models": [span._asdict() for span in errors_by_model(tape)],
         "account": of.as_json(),
         "notes": [*notes, *late_u(scenario, age), *tape.notes, *vane_notes(tape), *guidance_notices(tape, scenario.guidance)],
     }
@@ -314,6 +316,7 @@ def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
         "latency": None,
         "age_of_u": None,
         "guidance": None,
+        "models": [],
         "account": None,
         "notes": [],
     }
@@ -420,6 +423,18 @@ def format_value(value: float | None, factor: float = 1.0) -> str:
 def format_seconds(time: float | None) -> str:
     """A time in s with a digit, or that it is not known."""
     return "an unknown time" if time is None else f"{time:.1f} s"
+
+
+def model_rows(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]) -> tuple[list[str], list[list[str]]]:
+    """Headings and rows for "models" of a summary: model, times and rms of the errors."""
+    channels = list(models[0]["rms"]) if models else []
+    headings = ["from (s)", "to (s)", *(f"{name} ({units[name].unit})" for name in channels)]
+    rows = []
+    for span in models:
+        errors = (format_value(span["rms"][name], units[name].factor) for name in channels)
+        name = f"model {span['model']}" if span["model"] else "start"
+        rows.append([name, f"{span['start']:.1f}", f"{span['stop']:.1f}", *errors])
+    return headings, rows
 
 
 def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:

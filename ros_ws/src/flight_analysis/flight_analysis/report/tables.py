@@ -27,6 +27,7 @@ from flight_analysis.report.summary import (
     columns_of,
     format_value,
     input_rows,
+    model_rows,
     parts_legend,
     slowest_settling,
     table_rows,
@@ -51,6 +52,7 @@ GUIDANCE_LEGEND = (
     + ", ".join(f"{band * QUANTITY_UNITS[name].factor:g} {QUANTITY_UNITS[name].unit} of {name}" for name, band in BANDS.items())
     + f" for {SETTLING_DWELL:g} s; both where it begins outside"
 )
+MODEL_LEGEND = "start: the law of the start. Commands and wind of the spans differ"
 SATURATION_LEGEND = "; saturated: ticks with saturation by magnitude / by rate"
 
 
@@ -132,6 +134,7 @@ def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], 
         Table(f"Inputs{taken_over(summary, 'inputs')}", inputs, input_rows(summary, units), INPUT_LEGEND + SATURATION_LEGEND),
         Table("Events", times, [(event.name, f"{event.start:.2f}", f"{event.stop:.2f}", event.extent) for event in event_list]),
         _guidance_table(summary),
+        _model_table(summary, units),
         _tick_table(summary),
         _process_table(summary),
     )
@@ -183,6 +186,11 @@ def _guidance_table(summary: Mapping[str, Any]) -> Table:
         rows.append([*row, *(format_value(segment["V"][name]) for name in metrics[:2])])
     legend = "; ".join(filter(None, [leg_results(guidance["legs"]), GUIDANCE_LEGEND])) if rows else ""
     return Table(f"Guidance by segment{taken_over(summary, 'guidance')}", columns, rows, legend)
+
+
+def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
+    headings, rows = model_rows(summary["models"], units)
+    return Table("Rms of the error by model", [Column("", head) for head in headings], rows, MODEL_LEGEND)
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
