@@ -250,6 +250,13 @@ def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
         assert density[name] == pytest.approx(np.sqrt(column), rel=1e-9)  # rounding
 
 
+def test_a_spectrum_is_as_long_as_its_samples_over_a_gap_of_days() -> None:
+    """At 100 Hz: 64 samples, a gap of 1e6 s that counts for 1 s, and 64 samples: 227 instants in one window."""
+    stamps = np.concatenate([np.arange(64), 100_000_000 + np.arange(64)]) * 10 * MS
+    frequency, _ = metrics.spectra(Signal(EPOCH + stamps, ("u",), np.ones((128, 1))), 10 * MS)
+    assert len(frequency) == 227 // 2
+
+
 def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
     frequency, density = metrics.spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)

@@ -199,7 +199,8 @@ MISSING = "bag_1.mcap: named in metadata.yaml and missing"
         (["bag_0.mcap", "bag_1.mcap", ""], True, MISSING.replace("_1", "_2")),
         (["", "bag_1.mcap", "bag_2.mcap"], True, MISSING.replace("_1", "_0")),
         (["flight_0.mcap", "", "flight_2.mcap"], True, MISSING),
-        (["bag_0.mcap", "", "bag_2.mcap"], False, "bag_1.mcap: a number between those there and missing"),
+        (["bag_0.mcap", "", "bag_2.mcap"], False, "bag_1.mcap: a number before the last and missing"),
+        (["", "bag_1.mcap", "bag_2.mcap"], False, "bag_0.mcap: a number before the last and missing"),
     ],
 )
 def test_missing_part_stays_named_after_repair(

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flight_core.modes import Mode
 from flight_core.parameters import require
-from flight_core.rates import seconds
+from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape, as_tape
 from flight_core.vectors import FloatArray, as_array
 from rise_di_controller.internals import Saturation
@@ -451,9 +451,12 @@ def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, Float
     """Amplitude spectral density of the channels by Welch's method: frequencies in Hz, and values in unit / sqrt(Hz).
 
     The Hann windows span a tenth of the flight, overlap by half, without the mean. A missing sample repeats the last
-    sample. The square of the density, integrated over the frequencies, is the variance. Source: Welch 1967.
+    sample, for LONGEST_INTERVAL at most: a gap of the log may be of any length. The square of the density, integrated over the
+    frequencies, is the variance. Source: Welch 1967.
     """
     places = np.round((signal.stamp_ns - signal.stamp_ns[0]) / period_ns).astype(np.int64)
+    longest = max(round(LONGEST_INTERVAL * NANOSECONDS / period_ns), 1)
+    places = np.cumsum(np.minimum(np.diff(places, prepend=0), longest))
     grid = np.arange(places[-1] + 1)
     held = signal.values[np.searchsorted(places, grid, side="right") - 1]
     window = max(len(grid) // 10, min(len(grid), 256))

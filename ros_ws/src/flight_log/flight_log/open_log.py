@@ -78,16 +78,16 @@ def _some(names: Sequence[str]) -> str:
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
     """Names of the files of a bag that metadata.yaml names and the folder lacks.
 
-    Without metadata.yaml: the names of the numbers between the first and the last file. Renamed files are compared by number.
+    Without metadata.yaml: those of the numbers from 0, where rosbag2 begins, to the last. Renamed files are compared by number.
     """
     paths = information.get("relative_file_paths")
     named = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
     there = {plain_name(file.name) for file in files}
     numbers = {number for file in files if (number := part_number(file.name)) is not None}
-    if not named and len(numbers) == len(files) > 1 and max(numbers) - min(numbers) < 2 * len(files) + 100:
+    if not named and len(numbers) == len(files) > 1 and max(numbers) < 2 * len(files) + 100:
         stem = re.sub(r"\d+$", "", Path(plain_name(files[0].name)).stem)
         suffix = files[0].name.removeprefix(Path(plain_name(files[0].name)).stem)
-        named = [f"{stem}{number}{suffix}" for number in range(min(numbers), max(numbers) + 1)]
+        named = [f"{stem}{number}{suffix}" for number in range(max(numbers) + 1)]
     if len(files) >= len(named):
         return []
     if any(plain_name(name) in there for name in named):

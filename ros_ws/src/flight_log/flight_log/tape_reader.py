@@ -423,7 +423,7 @@ def _add_metadata(folder: Path, log: _Log) -> None:
         mend = {".mcap": "rise-di repair", ".db3": "ros2 bag reindex"}.get(bag_files(folder)[0].suffix)
         log.notes.append(f"{METADATA} {fault}{f': {mend} {shlex.quote(str(folder))}' if mend else ''}")
     if missing := missing_parts(bag_files(folder), information):
-        known = f"named in {METADATA}" if information else "a number between those there"
+        known = f"named in {METADATA}" if information else "a number before the last"
         log.notes.append(f"{', '.join(missing)}: {known} and missing; the log is a part of the recording")
 
 

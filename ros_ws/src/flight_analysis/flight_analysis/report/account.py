@@ -24,6 +24,7 @@ REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all 
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
+PARTS = (" and missing", " is truncated: ")  # in notes of a log on its parts
 RESTART = 10  # a number of a tick that is less by more
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
@@ -103,7 +104,8 @@ class Account(NamedTuple):
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user of a log."""
-        return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in self.lacks))
+        lacks = [lack for lack in self.lacks if not lack.endswith(PARTS[0]) and PARTS[1] not in lack]  # which notes tell of
+        return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
         """The account for `summary.json`, which has the legs in `guidance`."""
@@ -250,7 +252,7 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
     """Parts of a bag that are missing. A truncated end counts where no planned end does."""
-    kinds = ["and missing; the log is a part", *([] if planned else [" is truncated: "])]
+    kinds = PARTS if not planned else PARTS[:1]
     return [note.partition(";")[0] for note in notes if any(kind in note for kind in kinds)]
 
 
@@ -317,10 +319,15 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
         return 0
     held_ns = signal.until(end_ns).stamp_ns
-    rest_ns = np.arange(int(held_ns[-1]) + step_ns, end_ns + 1, step_ns) if len(held_ns) else held_ns
+    if not len(held_ns):
+        return 0
+    last_ns = int(held_ns[-1])
+    rest = max((end_ns - last_ns) // step_ns, 0)
     goes_on = len(signal.stamp_ns) > len(held_ns)
-    as_y = name in OF_AIRCRAFT and "y" in tape and tape.recording.get("y", Recording(0)).lost == 0
-    return len(rest_ns) if goes_on or (as_y and not np.isin(rest_ns, tape["y"].stamp_ns).any()) else 0
+    if not goes_on and name in OF_AIRCRAFT and "y" in tape and tape.recording.get("y", Recording(0)).lost == 0:
+        later_ns = tape["y"].until(end_ns).stamp_ns - last_ns
+        goes_on = not np.any((later_ns > 0) & (later_ns % step_ns == 0))
+    return rest if goes_on else 0
 
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
