@@ -134,8 +134,8 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
 
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
-    """One entry at its own limits, lags and noise too, the others at theirs, and a score with a unit of its own."""
-    units, spread = {"V": 0.2}, Spread({"B[V,thrust]": 0.6, "lag": 0.5, "noise[q]": 0.9}, "corners")
+    """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score with a unit of its own."""
+    units, spread = {"V": 0.2}, Spread({"B[V,thrust]": 0.6, "lag": 0.5, "noise[q]": 0.9, "delay": 0.03}, "corners")
     of = define(SHORT, 4, 0.2, 7, 4, spread=spread, units=units)
     campaign = fly_campaign(tmp_path / "own", of)
     rows = campaign.rows().collect()
@@ -151,7 +151,9 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
         assert np.abs(rows[name].to_numpy() / published - 1.0) == pytest.approx(part)
     worst = campaign.tally(0).worst[0]
     again = campaign.definition.aircraft_scenario(worst.number)
+    assert set(rows["delay"].to_list()) == {0.0, 0.03}
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
+    assert again.aircraft.actuators.delay == rows["delay"][worst.number] == 0.03
     true, outputs = error(simulate(again)), again.controller.outputs
     at_ticks = true.stamp_ns % 10_000_000 == 0
     rms = np.array([[np.sqrt(np.mean(true[name][at_ticks] ** 2))] for name in outputs])
@@ -165,6 +167,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
         ({"spread": Spread({"A[q,gamma]": 0.5})}, r"entry A\[q,gamma\], expected an entry of the airframe"),
         ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
         ({"spread": Spread({"lag[flap]": 0.5})}, r"entry lag\[flap\], expected a lag or a noise above 0: lag\[elevator\]"),
+        ({"spread": Spread({"delay": 0.004})}, "delay 0.004 s, expected at least a period of the controller, 0.01 s"),
         ({"units": {"theta": 0.1}}, "expected an output of the controller"),
         ({"units": {"V": 0.0}}, r"^score\.V: found 0, expected a unit"),
     ],

@@ -170,6 +170,9 @@ class ActuatorConfig(Config):
     loose_play: NonNegativesOrNone = Field(
         default=(), description="half-widths of the backlash from `loose_at` on, SI; none: 0.01 each"
     )
+    delay: float = Field(
+        default=0.0, ge=0, le=1e3, description="transport delay of u before the actuators, s; whole periods of the aircraft"
+    )
 
 
 EFFECTOR_FAULTS = {"stuck_at": None, "lost_at": None, "weak_at": "weak_effect", "slow_at": "slow_lag", "loose_at": "loose_play"}
@@ -312,7 +315,7 @@ class AircraftConfig(NodeConfig):
         for axis, gust in self.gusts.items():
             least = f"at least {2.0 * gust.length / channels.speed:.6g} s, which the gust takes at {channels.speed:g} m/s"
             require(gust.every * channels.speed >= 2.0 * gust.length, f"gusts.{axis}.every", f"{gust.every:g} s", least)
-        for key, values in self.actuators.model_dump().items():
+        for key, values in self.actuators.model_dump(exclude={"delay"}).items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
         for key in ("bias", "drift", "noise", "quantisation"):
@@ -323,7 +326,8 @@ class AircraftConfig(NodeConfig):
             require(not unknown, f"pose.{key}", ", ".join(unknown), f"some of {', '.join(POSE)}")
         if self.pose.rate is not None:
             divide(period_ns(self.pose.rate, "pose.rate"), period, "rate", "1 / pose.rate")
-        for name, delay in (("sensors", self.sensors.delay), ("pose", self.pose.delay)):
+        for name in ("actuators", "sensors", "pose"):
+            delay = getattr(self, name).delay
             whole = f"a whole multiple of 1 / rate ({seconds(period):g} s)"
             require(nanoseconds(delay) % period == 0, f"{name}.delay", f"{delay:g} s", whole)
 
@@ -441,7 +445,8 @@ class AircraftConfig(NodeConfig):
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""
-        arrays = {key: _array(values, key in {"lag", "dead_zone"}) for key, values in self.actuators.model_dump().items()}
+        lists = self.actuators.model_dump(exclude={"delay"})
+        arrays = {key: _array(values, key in {"lag", "dead_zone"}) for key, values in lists.items()}
         for key, severity in EFFECTOR_FAULTS.items():
             times = arrays[key]
             if times is None or np.isinf(times).all():

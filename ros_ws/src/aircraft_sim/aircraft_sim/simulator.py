@@ -6,6 +6,7 @@ The node and the loop in one process use this simulator, for every kind of aircr
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -19,7 +20,7 @@ from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
-from flight_core.rates import divide, period_ns, seconds
+from flight_core.rates import divide, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
 
 BLOCK = 100  # steps
@@ -190,6 +191,8 @@ class Simulator:
         self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
         self._number = 0
+        late = nanoseconds(parameters.actuators.delay) // self.period_ns
+        self._commands = deque([np.zeros(len(self.inputs))] * late)  # on the way to the actuators
 
     def retune(self, parameters: AircraftConfig) -> None:
         """Take faults and gusts of these parameters from now on. Raises ParameterError where one would change the past."""
@@ -218,9 +221,8 @@ class Simulator:
         Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
         has diverged.
         """
-        t_ns, before_ns = number * self.period_ns, self._number * self.period_ns
-        if number > self._number:
-            self._model.advance(before_ns, u, t_ns - before_ns)
+        t_ns = number * self.period_ns
+        self._advance(number, u)
         self._number = number
         if self._model.diverged():
             raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
@@ -237,6 +239,15 @@ class Simulator:
         y = measured if sensors.arrives(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived
+
+    def _advance(self, number: int, u: FloatArray) -> None:
+        """The model to a sample, period by period where u is late."""
+        begin, end = self._number, number
+        for k in range(begin, end) if self._commands else ():
+            self._commands.append(u)
+            self._model.advance(k * self.period_ns, self._commands.popleft(), self.period_ns)
+        if end > begin and not self._commands:
+            self._model.advance(begin * self.period_ns, u, (end - begin) * self.period_ns)
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""

@@ -55,6 +55,7 @@ class Course(NamedTuple):
     basis: FloatArray  # (n, r - g) orthonormal directions in x_dot of f_time without wind: biases and sines
     order: NDArray[np.int64]  # (m,) indices of the law's outputs in y
     late: int  # delay of y, ticks
+    u_late: int  # delay of u, ticks
     period: float  # s, of the ticks
     steps: int  # of the integration from tick to tick
 
@@ -62,8 +63,8 @@ class Course(NamedTuple):
 def build_course(scenario: Scenario) -> Course:
     """The course of a scenario, with the feedforward of the controller.
 
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y by a part of a tick, dropouts
-    of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u by a part of a tick,
+    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
     """
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
@@ -84,6 +85,8 @@ def build_course(scenario: Scenario) -> Course:
     lossless = errors.dropout == 0.0 or tick_ns == sample_ns
     require(lossless, "aircraft.rate", f"{aircraft.rate:g} Hz", f"controller.rate ({controller.rate:g} Hz) with dropouts")
     vanes = [outputs.index(name) for name in controller.vanes]
+    u_delay_ns = nanoseconds(aircraft.actuators.delay)
+    u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
     _require_plain_vanes(scenario, late)
     error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
     noise, bias = np.zeros_like(error), 0.0 if errors.bias is None else errors.bias
@@ -126,7 +129,7 @@ def build_course(scenario: Scenario) -> Course:
         x_m[:, guard.vanes],
         error[:, vanes],
     )
-    return Course(segments, axes, basis, order, late, seconds(tick_ns), steps)
+    return Course(segments, axes, basis, order, late, u_late, seconds(tick_ns), steps)
 
 
 def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[bool]) -> tuple[NDArray[np.int32], FloatArray]:

@@ -98,7 +98,7 @@ class Definition(Config):
         return Spread(own, self.distribution)
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
-        """The lags and the noise of aircraft of a case, as `equipment.drawn`."""
+        """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
         return equipment.drawn(scenario, Spread(self.entries, self.distribution), self.seed, first, count)
 
     def scenario(self, case: int = 0) -> Scenario:
@@ -231,8 +231,9 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, definition.chunk, definition.spread)
     directions = gust_directions(airframe, A, definition.wind)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
     equipped = definition.drawn_equipment(scenario, first, definition.chunk)
+    late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
+    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
     vehicle = fleet.with_equipment(vehicle, scenario, equipped)
     result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
@@ -341,12 +342,10 @@ class Campaign:
         matrices = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
         published = {name: float(value[0]) for name, value in matrices.items()}
         published |= equipment.published(self.definition.scenario())
-        return influence(
-            rows.head(RANKED).collect(),
-            rows.filter(pl.col("number") == worst).collect(),
-            published,
-            {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published},
-        )
+        parts = {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published}
+        if (largest := self.definition.entries.get(equipment.DELAY)) is not None:  # half of it, within +-100 %
+            published[equipment.DELAY], parts[equipment.DELAY] = largest / 2.0, 1.0
+        return influence(rows.head(RANKED).collect(), rows.filter(pl.col("number") == worst).collect(), published, parts)
 
     def _read(self, job: Job) -> "pl.DataFrame":
         import polars as pl  # noqa: PLC0415 - as above

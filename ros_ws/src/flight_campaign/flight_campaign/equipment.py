@@ -1,12 +1,16 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lags of the actuators and noise of the sensors of the aircraft of a campaign, drawn as the entries of A and B.
+"""Lags of the actuators, noise of the sensors and delay of u of the aircraft of a campaign, drawn as the entries of A and B.
 
-An entry is lag[ELEVATOR], a time constant in s, or noise[OUTPUT], a standard deviation in SI; lag and noise alone mean all.
+An entry is lag[INPUT], a time constant in s, noise[OUTPUT], a standard deviation in SI, or delay, s; lag and noise alone mean
+all. The entry delay is the largest delay of u beyond that of the scenario, drawn in whole periods of the controller.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
+
+import numpy as np
 
 from aircraft_sim import random_streams
 from aircraft_sim.uncertainty import Spread, deviations
@@ -14,11 +18,12 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-KINDS = ("lag", "noise")
+DELAY = "delay"
+KINDS = ("lag", "noise", DELAY)
 
 
 def is_of_equipment(entry: str) -> bool:
-    """Whether an entry is a lag or a noise, not an entry of A or B."""
+    """Whether an entry is a lag, a noise or the delay, not an entry of A or B."""
     return entry.partition("[")[0] in KINDS
 
 
@@ -38,6 +43,11 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
     """The entries, with each channel in place of lag and noise. Raises ParameterError for an unknown entry."""
     known, every = published(scenario), {}
     for name, part in entries.items():
+        if name == DELAY:
+            period = 1.0 / scenario.controller.rate
+            require(part >= period, "uncertainty", f"delay {part:g} s", f"at least a period of the controller, {period:g} s")
+            every[name] = part
+            continue
         if not is_of_equipment(name):
             every[name] = part
             continue
@@ -48,18 +58,28 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 
 
 def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int) -> dict[str, FloatArray]:
-    """Drawn lags and noise of the aircraft first, first + 1, ... of a seed by entry, (count,) each.
+    """Drawn lags, noise and delays of the aircraft first, first + 1, ... of a seed by entry, (count,) each.
 
-    A value is multiplied by 1 + d, as an entry of A, and depends on seed and number alone.
+    A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
+    value depends on seed and number alone.
     """
-    known = published(scenario)
-    uniform = random_streams.uniform(first, count, max(len(known), 1), random_streams.EQUIPMENT, seed)
+    known, period = published(scenario), 1.0 / scenario.controller.rate
+    uniform = random_streams.uniform(first, count, len(known) + 1, random_streams.EQUIPMENT, seed)
     d = deviations(uniform, spread.distribution)
-    return {
+    values = {
         name: value * (1.0 + spread.entries[name] * d[:, k])
         for k, (name, value) in enumerate(known.items())
         if name in spread.entries
     }
+    if DELAY in spread.entries:
+        most = round(whole_periods(spread.entries[DELAY], scenario) / period)
+        values[DELAY] = period * np.minimum(np.floor((1.0 + d[:, -1]) / 2.0 * (most + 1)), most)
+    return values
+
+
+def whole_periods(delay: float, scenario: Scenario) -> float:
+    """The whole periods of the controller in a delay, s."""
+    return math.floor(delay * scenario.controller.rate + 1e-9) / scenario.controller.rate
 
 
 def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]) -> list[Any]:
@@ -68,11 +88,12 @@ def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], other
 
 
 def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
-    """The scenario with lags and noise by name."""
+    """The scenario with lags, noise and a further delay of u by name."""
     aircraft, channels, changes = scenario.aircraft, scenario.aircraft.channels(), {}
-    if any(name.startswith("lag[") for name in values):
-        lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
-        changes["actuators"] = aircraft.actuators.model_dump() | {"lag": lag}
+    delay = aircraft.actuators.delay + values.get(DELAY, 0.0)
+    if any(name.startswith("lag[") or name == DELAY for name in values):
+        lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag) if aircraft.actuators.lag else []
+        changes["actuators"] = aircraft.actuators.model_dump() | {"lag": lag, "delay": delay}
     if any(name.startswith("noise[") for name in values):
         noise = in_order(values, "noise", tuple(channels.outputs), aircraft.sensors.noise)
         changes["sensors"] = aircraft.sensors.model_dump() | {"noise": noise}

@@ -161,8 +161,9 @@ def assemble(
         forced = [Phi^(K-1) Gamma F, ..., Gamma F],    F = [gust_directions[course.axes], course.basis]
 
     The steps, and the actuators' mean positions in them, are those of `plant.advance`. The remainder is held over a tick, and
-    the forcing over a step. `wind` and `late` are those of Fleet, one value for all or one each. `gust_directions` of shape
-    (N, n, G) are the effects of wind on x_dot, of `uncertainty.gust_directions`; None: those of the plant, for all aircraft.
+    the forcing over a step. `wind` and `late` have a value for all or N; `late` is beyond the delay of the course.
+    `gust_directions` of shape (N, n, G) are the effects of wind on x_dot, of `uncertainty.gust_directions`; None: the plant's,
+    for all aircraft.
     The drift of the plant multiplies the entries of all aircraft alike; the matrices above are then interpolated.
     """
     directions = plant.aircraft.gust_direction if gust_directions is None else gust_directions
@@ -184,7 +185,7 @@ def assemble(
         _last(rate),
         _last(forced_rate),
         jnp.broadcast_to(jnp.asarray(wind, dtype=np.float64), (count,)),
-        jnp.broadcast_to(jnp.asarray(late), (count,)),
+        jnp.broadcast_to(jnp.asarray(late) + course.u_late, (count,)),
         change,
     )
 

@@ -47,8 +47,8 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
 
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
-    """The columns with drawn entries: of A and B, lags and noise."""
-    return [name for name in table.columns if name.startswith(("A[", "B[", "lag[", "noise["))]
+    """The columns with drawn entries: of A and B, lags, noise and the delay of u."""
+    return [name for name in table.columns if name.startswith(("A[", "B[", "lag[", "noise[")) or name == "delay"]
 
 
 def tally_of(table: "pl.DataFrame") -> Tally:
