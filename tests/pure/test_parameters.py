@@ -87,6 +87,8 @@ BAD = {
     ("step: 0.002", "step: 1.0e-9"): "aircraft.step: found 1e-09, expected greater than or equal to 1e-05",
     ("k_g: 1.0", "k_g: 1.0e+308"): "controller.k_g: found 1e+308, expected less than or equal to 1000000000",
     ("omega: [1.0,", "omega: [5.0e-324,"): "controller.omega[0]: found 5e-324, expected greater than or equal to 1e-09",
+    ("delay: 0.003", "delay: 1.0e+9"): "controller.delay: found 1e+09 s, expected at most 1 s, 100 periods of rate",
+    ("delay: 0.003", "delay: 1.01"): "controller.delay: found 1.01 s, expected at most 1 s",
     (
         "input_scale: [0.0178096,",
         "input_scale: [5.0e-324,",

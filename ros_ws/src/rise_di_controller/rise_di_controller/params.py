@@ -47,6 +47,9 @@ from rise_di_controller.saturation import Limits
 
 MARGIN_PARTS = (0.0, 0.5, 1.0)  # of the delay margin, where the nominal loop with an observer has to be stable
 
+MAX_DELAY_PERIODS = 100
+"""The linear loop has m states a period of the delay: 100 of four channels take 3 s of processor time, 1000 half a minute."""
+
 MAX_INVERSE_ERROR = 1e-6  # 1, of an entry of effect T: that of numbers with ten digits is 1e-9
 
 OF_NODE = frozenset({"lockstep", "y_rate", "autostart", "start_active"})
@@ -252,6 +255,10 @@ class ControllerConfig(NodeConfig):
         if self.lockstep:
             require(self.y_rate > 0, "y_rate", "0 Hz", "the rate of y in lockstep")
             divide(period, period_ns(self.y_rate, "y_rate"), "y_rate", "1 / rate")
+        longest = MAX_DELAY_PERIODS / self.rate
+        require(
+            self.delay <= longest, "delay", f"{self.delay:g} s", f"at most {longest:g} s, {MAX_DELAY_PERIODS} periods of rate"
+        )
         require_length("inputs", self.inputs, self.outputs)
         for key in ("D", "input_scale", "lag"):
             require_length(key, getattr(self, key), self.outputs)
