@@ -14,6 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import dask
 import numpy as np
@@ -39,7 +40,7 @@ from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
-from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk_figures
+from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
 from flight_campaign.campaign_report import overview, write_page
 from flight_campaign.influence import chance_level, rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
@@ -604,6 +605,20 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
     with cluster(int(address.rsplit(":", 1)[1])):
         results += list(flown)
     assert sorted(results) == [((k,), k**2) for k in range(20)]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")])
+def test_chunk_beyond_memory_is_one_sentence(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second is the text of an error of JAX."""
+    monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=error))
+    with pytest.raises(ParameterError, match=r"--chunk: found 20 aircraft at once, which need more memory .* expected fewer"):
+        fly_chunk(definition().model_dump_json(), (0, 0))
+
+
+def test_other_error_of_a_chunk_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=RuntimeError("INTERNAL")))
+    with pytest.raises(RuntimeError, match="INTERNAL"):
+        fly_chunk(definition().model_dump_json(), (0, 0))
 
 
 def test_chunk_that_ends_workers_is_one_sentence() -> None:

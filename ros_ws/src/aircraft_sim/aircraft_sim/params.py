@@ -193,7 +193,7 @@ class SensorConfig(Config):
         default=(), description="steps of the measured values, one an output, SI, 0 for none"
     )
     delay: float = Field(
-        default=0.0, ge=0, le=1e6, description="transport delay from measurement to arrival, s; whole periods of `rate`"
+        default=0.0, ge=0, le=10, description="transport delay from measurement to arrival, s; whole periods of `rate`"
     )
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is dropped")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
@@ -224,7 +224,7 @@ class PoseConfig(Config):
         default=None, description="the rate of pose, Hz, a whole fraction of the aircraft's; none: 50 Hz"
     )
     delay: float = Field(
-        default=0.0, ge=0, le=1e6, description="from measurement to arrival, s; whole periods of the aircraft. A stamp stays"
+        default=0.0, ge=0, le=10, description="from measurement to arrival, s; whole periods of the aircraft. A stamp stays"
     )
     bias: PerPose = Field(default={}, description="constant errors by channel of `pose`, SI")
     drift: dict[str, NonNegative] = Field(default={}, description="random walks by channel: standard deviation, SI per sqrt(s)")

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from flight_campaign.missions import Mission
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
+OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
 CHUNK = 1000  # aircraft computed at once
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
 
@@ -214,9 +215,19 @@ def define(
 
 
 def fly_chunk(text: str, job: Job) -> bytes:
-    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no other inputs."""
+    """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no other inputs.
+
+    Raises ParameterError for a chunk that does not fit into memory.
+    """
     definition = Definition.model_validate_json(text)
-    return encode(fly_chunk_figures(text, job), definition.seed, definition.factor(job[0]))
+    try:
+        figures = fly_chunk_figures(text, job)
+    except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
+        if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
+            raise
+        found = f"{definition.chunk} aircraft at once, which need more memory than there is"
+        raise ParameterError(f"--chunk: found {found}, expected fewer, or a shorter aircraft.sensors.delay") from None
+    return encode(figures, definition.seed, definition.factor(job[0]))
 
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
