@@ -349,6 +349,21 @@ def test_dataflash_log_with_damaged_format_is_one_sentence(
     assert capsys.readouterr().out == ""
 
 
+def test_damaged_bytes_cost_what_they_hold_and_print_nothing(
+    flight: Flight, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight)
+    whole = sum(len(table.stamp_ns) for table in read_vehicle_log(path).tables.values())
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 40] = bytes(40)
+    path.write_bytes(content)
+    assert 0 < whole - sum(len(table.stamp_ns) for table in read_vehicle_log(path).tables.values()) < 5
+    path = ulog(tmp_path / "flight.ulg", flight)
+    path.write_bytes(path.read_bytes().replace(b"float FW_AIRSPD_TRIM", b"fl0at FW_AIRSPD_TRIM"))
+    assert read_vehicle_log(path).parameters == {}
+    assert capfd.readouterr() == ("", "")
+
+
 def test_package_that_is_missing_is_named_alone(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = dataflash(tmp_path / "flight.bin", flight)
     monkeypatch.setattr(installation, "find_spec", lambda name: None)

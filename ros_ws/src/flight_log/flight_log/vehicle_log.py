@@ -7,9 +7,10 @@ and PX4's msg/*.msg. pymavlink and pyulog decode the files.
 """
 
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from types import MappingProxyType
@@ -203,7 +204,7 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     if read is None:
         raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
     try:
-        with redirect_stdout(StringIO()):  # pymavlink and pyulog print that a file is damaged
+        with _silent():
             log = read(path, kind)
     except ParameterError:  # of a package that is missing
         raise
@@ -211,6 +212,20 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         raise ParameterError(f"{path}: found {kind} that cannot be decoded ({error}), expected {EXPECTED}") from None
     require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
     return log
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a message, from C too."""
+    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
+    try:
+        with redirect_stdout(StringIO()) as text, redirect_stderr(text):
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
 
 
 def _read_dataflash(path: Path, kind: str) -> VehicleLog:
@@ -317,7 +332,10 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
             "psi": np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z),
         }
         tables["vehicle_attitude"] = Table(attitude.stamp_ns, {**attitude.fields, **angles})
-    return VehicleLog(kind, tables, {name: float(value) for name, value in log.initial_parameters.items()}, None)
+    parameters = {
+        name: float(value) for name, value in log.initial_parameters.items() if _is_number(value)
+    }  # else it is damaged
+    return VehicleLog(kind, tables, parameters, None)
 
 
 def _wanted(of: Format) -> dict[str, set[str]]:
