@@ -40,6 +40,7 @@ PROFILE = REPOSITORY / "ros_ws" / "src" / "flight_ros" / "flight_ros" / "loopbac
 PILOT_PYTHON = os.environ.get("PILOT_PYTHON", "python3")
 OWN_MAP, OWN_SCENARIO = os.environ.get("RISE_DI_MAP"), os.environ.get("RISE_DI_SCENARIO")  # of a rehearsal
 POLL = 0.1  # s, between two questions to the autopilot
+ENGAGEMENTS = 4  # attempts: some seconds of level flight end the climb that a fault before has left
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
 BRIDGE = 254  # system of the bridge over MAVLink, and MAV_GCS_SYSID: the ground station of the kit is 255
@@ -199,15 +200,24 @@ class Autopilot:
         flight = self.fly(scenario, channel_map, duration, "--send")
         try:
             flight.wait_for("DISENGAGED")
-            self.hand_over()
             blind = ("--blind",) if duration > BOUNDED else self.engage_options
-            self.start("engage", *(() if transmitter else blind)).succeed()
+            self._engage_level(*(() if transmitter else blind))
             yield flight
         finally:
             if flight.popen.poll() is None:
                 flight.interrupt()
                 flight.end()
             self.level()
+
+    def _engage_level(self, *options: str) -> None:
+        """Engage, again from level flight where the aircraft climbs or sinks at the hand-over, as after a jammed surface."""
+        for _ in range(ENGAGEMENTS):
+            self.hand_over()
+            engaged = self.start("engage", *options)
+            if engaged.end() == 0 or "engage_if" not in engaged.output:
+                break
+            self.level()
+        engaged.succeed()
 
     def experiment(self, *command: str) -> Process:
         """Fly the experiment of `identify --bridge`, with the arguments of the command, to its end in the air."""
