@@ -138,6 +138,7 @@ def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path)
     [
         (lambda task: PI | {"rate": 50.0}, "own: controller.rate: found 50.0, expected 100.0, as every law of gusts has it"),
         (lambda task: 3, "own: found 3, expected a section"),
+        (lambda: 3, "own: found TypeError: .* takes 0 positional arguments .*, for gusts, expected a function of a task"),
         (lambda task: lambda t, y, y_m: [0.0], r"u in gusts at t = 0 s: found \[0.0\], expected 4 finite numbers: elevator"),
         (lambda task: lambda t, y, y_m: y + np.nan, "u in gusts at t = 0 s: .* expected 4 finite numbers"),
         (lambda task: lambda t, y, y_m: 1 / 0, "u in gusts at t = 0 s: found ZeroDivisionError: division by zero"),

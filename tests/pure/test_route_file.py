@@ -410,7 +410,7 @@ def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> Non
     assert route.notes == ("1 further lines and 3 wpt beside the trk: no part of the route",)
     with pytest.raises(ParameterError, match=r"found 2 trk, expected one, or --line 1 \(morning\), 2 \(evening\)"):
         read_route_file(path, ZURICH)
-    with pytest.raises(ParameterError, match=r"--line: found '3' for 0 lines, expected --line 1 \(morning\)"):
+    with pytest.raises(ParameterError, match=r"--line: found '3', which names 0 lines, expected --line 1 \(morning\)"):
         read_route_file(path, ZURICH, line="3")
     path = tmp_path / "r.plan"
     path.write_text(json.dumps(plan([])), encoding="utf-8")

@@ -66,8 +66,14 @@ def task_of(name: str, sets: Sets) -> Task:
 
 
 def entered(entry: Entry, task: Task) -> ControllerConfig | Step | None:
-    """What flies a task. Raises ParameterError for a section that is none, or that changes the frame."""
-    law = entry.enter(task)
+    """What flies a task. Raises ParameterError for a function that raises, a section that is none or changes the frame."""
+    try:
+        law = entry.enter(task)
+    except ParameterError:
+        raise
+    except Exception as error:
+        raised = f"{type(error).__name__}: {error}, for {task.set}"
+        raise ParameterError(f"{entry.name}: found {raised}, expected a function of a task that returns a law") from error
     if law is None or not isinstance(law, Mapping):
         require(law is None or callable(law), entry.name, law, "a section `controller`, a function of t, y, y_m, or None")
         return law
