@@ -18,13 +18,14 @@ from flight_analysis.report.guided import guidance_notices, unflown_legs
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, missions
 from flight_campaign.benchmark_course import build_course
+from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.fence import HOME, LEFT, RIGHT, SHARES, Fence, Motion, Zone, clearance, last_safe_turn, turn_clearance
 from flight_guidance.guidance import Guidance, GuidanceOutput
-from flight_guidance.modes import Lateral
+from flight_guidance.modes import Lateral, holding, motion_of
 from flight_guidance.params import GuidanceConfig
 
 pytestmark = [pytest.mark.package("flight_guidance"), pytest.mark.slow]
@@ -93,6 +94,17 @@ def test_turn_begins_at_last_moment() -> None:
     assert left > right
     right, left = turn_clearance(fence, motion(1000.0, -350.0))
     assert right > left
+
+
+def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
+    """A roll of the reference model, second order, gains p 2 zeta / w once p = 0 is commanded."""
+    scenario = find_scenario("osprey_route")
+    assert scenario.guidance is not None
+    params = scenario.guidance.params()
+    pose, y = dict.fromkeys(POSE, 0.0), {"q": 0.0, "V": 0.0, "p": 0.3, "r": 0.0}
+    level = holding(0, pose, 25.0, params)
+    assert motion_of(level, pose, y, 25.0, params).phi == pytest.approx(0.3 * 2.0 * 0.9 / 5.0, rel=0.15)
+    assert motion_of(level, pose, y | {"p": 9.0}, 25.0, params).phi <= params.limits.bank
 
 
 def calm(duration: float, wind: tuple[float, float] = (0.0, 0.0), **section: Any) -> Scenario:

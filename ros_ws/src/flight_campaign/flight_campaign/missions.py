@@ -296,7 +296,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             state.fence != 0.0,
         )
         if params.fence is not None:
-            escape = last_safe_turn(params.fence, state.fence, modes.motion_of(before, pose, speed, params))
+            escape = last_safe_turn(params.fence, state.fence, modes.motion_of(before, pose, y_of, speed, params))
             homing = escape.action != 0.0
             home = modes.home(pose, params)
             home_altitude = jnp.where(escape.begins, home["altitude"], state.home_altitude)

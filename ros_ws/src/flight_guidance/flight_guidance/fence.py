@@ -55,7 +55,7 @@ class Motion(NamedTuple):
 
     north: Scalar  # m
     east: Scalar  # m
-    phi: Scalar  # rad
+    phi: Scalar  # rad, once a roll that has begun ends
     heading: Scalar  # rad, psi + beta
     speed: Scalar  # airspeed, m/s
     wind: tuple[Scalar, Scalar]  # where the air moves to: north, east, m/s

@@ -369,7 +369,7 @@ def step(
     state = _with_attitude(state, inputs, dt, params)
     pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
     state, missed = _with_commands(state, inputs.given, pose, dt, route)
-    state, escape = _within_fence(state, pose, airspeed(inputs.y, params), params)
+    state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
     if abs(state.fence) == RIGHT and state.mode is Mode.ENGAGED:
         wanted = math.copysign(params.limits.bank, state.fence)
@@ -464,28 +464,33 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
     return state._replace(phi=math.remainder(phi, 2.0 * math.pi), theta=theta, psi=psi)
 
 
-def motion_of(state: GuidanceState, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Motion:
-    """What the fence predicts a turn from."""
+def motion_of(
+    state: GuidanceState, pose: Mapping[str, Scalar], y: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams
+) -> Motion:
+    """What the fence predicts a turn from. A roll that has begun goes on for the lag of the bank, 1 / (2 k_phi)."""
+    bank = protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed)
+    lag = 0.5 / params.attitude.k_phi
+    phi_dot, _ = euler_rates(state.phi, state.theta, y["p"], y["q"], y["r"])
     return Motion(
         pose["north"],
         pose["east"],
-        state.phi,
+        clip(state.phi + lag * phi_dot, bank),
         pose["psi"] + pose["beta"],
         speed,
         state.wind,
-        protection.bank_limit(params.limits.bank, params.limits.stall_speed, speed),
+        bank,
         params.attitude.roll_rate,
-        0.5 / params.attitude.k_phi + params.turn_lag,
+        lag + params.turn_lag,
     )
 
 
 def _within_fence(
-    state: GuidanceState, pose: Mapping[str, float], speed: float, params: GuidanceParams
+    state: GuidanceState, pose: Mapping[str, float], y: Mapping[str, float], speed: float, params: GuidanceParams
 ) -> tuple[GuidanceState, Escape]:
     """The state with the turn away from the fence; home is the target from the begin of the turn on."""
     if params.fence is None or state.mode is not Mode.ENGAGED:
         return state, Escape(state.fence, False, LARGEST, LARGEST)
-    escape = last_safe_turn(params.fence, state.fence, motion_of(state, pose, speed, params))
+    escape = last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params))
     if escape.begins:
         target = state.target._replace(**home(pose, params))
         state = state._replace(lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0)
