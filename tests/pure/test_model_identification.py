@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from aircraft_sim.airframe import Airframe, load_airframe
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
+from control_laws.riccati import correction_of, corrections_near
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import innovation_filters, model_identification
@@ -223,6 +224,18 @@ def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     # 19000 samples: the standard deviation of a variance is 1 %; states and disturbances have almost no noise here
     np.testing.assert_allclose(np.cov(e.T), np.eye(2), atol=0.04)
     assert whiteness(e, np.ones(len(e), dtype=bool)).max() < 2.0
+
+
+def test_gains_near_first_model_are_those_of_whole_equation() -> None:
+    generator = np.random.default_rng(1)
+    F, H = generator.standard_normal((6, 6)), generator.standard_normal((2, 6))
+    F *= 0.99 / np.abs(np.linalg.eigvals(F)).max()
+    several = F + 1e-4 * np.concatenate([np.zeros((1, 6, 6)), generator.standard_normal((3, 6, 6))])
+    process, noise = np.broadcast_to(np.eye(6), several.shape), np.eye(2)
+    near, whole = (solve(several, H, process, noise) for solve in (corrections_near, correction_of))
+    # the error is of second order in the differences: some 1e-8 beside the change of the gains of 1e-4
+    np.testing.assert_allclose(near, whole, atol=1e-6)
+    assert np.abs(whole - whole[0]).max() > 1e-4
 
 
 def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_coloured_noise() -> None:

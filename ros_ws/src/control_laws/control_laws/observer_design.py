@@ -7,6 +7,7 @@ A, B, wind and the weights may have leading axes, broadcast together: N aircraft
 Gamma, H, L, F are the matrices of the observer of `rise_di_controller.observer`.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,9 @@ from control_laws.nominal_model import NominalModel
 from control_laws.riccati import correction_of, diagonal, gain_of, transpose
 from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import zero_order_hold
+
+Correction = Callable[[FloatArray, FloatArray, FloatArray, FloatArray], FloatArray]
+"""`riccati.correction_of`, or another function for the same gain."""
 
 LEAK = 0.01  # 1/s, decay of angles and disturbances in the model: every mode is then observable or stable
 MIN_LAG = 1e-4  # s, lag of an ideal actuator in the model
@@ -130,11 +134,13 @@ def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> Ob
     return ObserverDesign(*sampled, aircraft_correction(sampled, model, weights), feedback_gain(sampled, model, weights.effort))
 
 
-def aircraft_correction(sampled: ObserverModel, model: NominalModel, weights: Weights) -> FloatArray:
+def aircraft_correction(
+    sampled: ObserverModel, model: NominalModel, weights: Weights, correction: Correction = correction_of
+) -> FloatArray:
     """L of `aircraft_observer`, shape (.., s, m)."""
     positions = np.full(len(model.lag), ACTUATOR_NOISE)
     intensities = [weights.loose * model.size, positions, weights.gust, weights.drift * (model.C @ model.size)]
-    return _correction(sampled, model, intensities)
+    return _correction(sampled, model, intensities, correction)
 
 
 def vane_correction(
@@ -166,8 +172,10 @@ def feedback_gain(sampled: ObserverModel, model: NominalModel, effort: FloatArra
     return gain_of(sampled.Phi, sampled.Gamma, Q, diagonal((effort / model.input_scale / size) ** 2))
 
 
-def _correction(sampled: ObserverModel, model: NominalModel, intensities: list[FloatArray]) -> FloatArray:
+def _correction(
+    sampled: ObserverModel, model: NominalModel, intensities: list[FloatArray], correction: Correction = correction_of
+) -> FloatArray:
     """L for white noise of these intensities, shapes (.., k), on the states in order, SI per root s."""
     batch = np.broadcast_shapes(*(intensity.shape[:-1] for intensity in intensities))
     process = np.concatenate([np.broadcast_to(intensity, (*batch, intensity.shape[-1])) for intensity in intensities], axis=-1)
-    return correction_of(sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2))
+    return correction(sampled.Phi, sampled.H, diagonal(process**2 * model.period), np.diag(model.noise**2))

@@ -62,3 +62,27 @@ def correction_of(F: FloatArray, H: FloatArray, process: FloatArray, noise: Floa
     """
     S = riccati(transpose(F), transpose(H), process, noise)
     return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
+
+
+def corrections_near(F: FloatArray, H: FloatArray, process: FloatArray, noise: FloatArray) -> FloatArray:
+    """Gains of `correction_of` for models that differ little from the first one, exact to first order in the difference.
+
+    With the gain K of the first model and A = F (I - K H), the covariance of a model with F_i is S + dS,
+
+        dS = A dS A' + F_i (I - K H) S (I - K H)'F_i' + F_i K noise K'F_i' + process_i - S
+
+    because S is the least one over the gains: a change of the gain is of second order. The first axis of F and process is that
+    of the models. Source: D. L. Kleinman, IEEE TAC 13(1), 1968.
+    """
+    S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)
+    K = transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
+    kept = np.eye(F.shape[-1]) - K @ H
+    change = F @ (kept @ S @ transpose(kept) + K @ noise @ transpose(K)) @ transpose(F) + process - S
+    A = F[:1] @ kept
+    for _ in range(MAX_DOUBLINGS):
+        more = A @ change @ transpose(A)
+        change, A = change + more, A @ A
+        if np.all(np.abs(more) <= 1e-10 * np.max(np.abs(change), axis=(-1, -2), keepdims=True)):
+            break
+    S = S + change
+    return transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))

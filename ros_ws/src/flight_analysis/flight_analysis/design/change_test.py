@@ -17,7 +17,6 @@ RECORD = 10.0  # s, of the flight that is tested
 LEAST_DEVIATION, FREE_DEVIATION = 0.03, 0.3  # 1, of an entry if the aircraft is the same, and if it has changed
 MAX_GAIN = 15.0  # of log-likelihood: without a change 1 is usual and 10 was the largest of 80 tests; with a change 40 is usual
 ANGLE = 0.3  # rad, standard deviation of pitch and bank at the begin of the record, which may lie in a turn
-EXACT = 1e-4  # 1, standard deviation of an entry that is what it is
 NO_EFFECT = 1e-6  # 1, of the effect of an input: 0 would have no input scale
 DEAD_WITHIN = MAX_GAIN / 2.0  # of log-likelihood: so close to the refit a dead input explains the flight as well
 
@@ -47,8 +46,8 @@ def change_test(
         J(theta; s) = -sum log p(y_k | y_1 .. y_k-1, theta) + |theta / s|^2 / 2,    theta relative to the flown model
         G = min J(theta; max(deviation, LEAST_DEVIATION)) - min J(theta; FREE_DEVIATION)
 
-    Where G > MAX_GAIN, the input j is dead if B[:, j] = 0 in the flown model has a J that is lower by more than MAX_GAIN, and
-    at most DEAD_WITHIN above that of the refit. Winds, and the angles at the begin of the record, are free in each J.
+    Where G > MAX_GAIN, the input j is dead if the flown model with B[:, j] = 0 has a first J lower by more than MAX_GAIN, and a
+    -sum log p at most DEAD_WITHIN above the changed one. Winds, and the angles at the begin of the record, are free in each J.
     Arguments: `deviation` of the entries by name, 1; `delays` of u by the outputs of a part, s, where it is not that of
     `actuation`.
     """
@@ -58,37 +57,44 @@ def change_test(
         delay = (delays or {}).get(outputs, actuation.delay)
         search = _search(recorded, flown, actuation, block, delay)
         near = np.array([max(deviation.get(entry.name, 0.0), LEAST_DEVIATION) for entry in search.nominal_entries()])
-        changed, changed_cost, levels = _least(search, np.full(search.count, FREE_DEVIATION), STARTS)
-        same, _, _ = _least(search, near, levels=levels)
-        dead = ""
-        if same - changed > MAX_GAIN:
-            _, flown_cost, _ = _least(search, np.full(search.count, EXACT), levels=levels)
-            for name in search.names.inputs:
-                B = flown.matrix_b() * np.array([NO_EFFECT if column == name else 1.0 for column in flown.inputs])
-                without = flown.with_matrices(flown.matrix_a(), B, np.ones((len(B), len(flown.gusts))))
-                of_dead = _search(recorded, without, actuation, block, delay)
-                _, cost, _ = _least(of_dead, np.full(of_dead.count, EXACT), levels=levels)
-                if flown_cost - cost > MAX_GAIN and cost < changed_cost + DEAD_WITHIN:
-                    dead = name
-        found.append(Change(outputs, same - changed, dead))
+        free = np.full(search.count, FREE_DEVIATION)
+        same, changed = _least(search, near), _least(search, free, starts=STARTS)
+        if not np.array_equal(same.levels, changed.levels):
+            # what another wind explains is no change: both hypotheses have the winds of both
+            winds = same.levels, changed.levels
+            same, changed = _less(same, _least(search, near, winds[1])), _less(changed, _least(search, free, winds[0]))
+        dead, least = "", same.J - MAX_GAIN
+        for name in search.names.inputs if least > changed.J else ():
+            B = flown.matrix_b() * np.array([NO_EFFECT if column == name else 1.0 for column in flown.inputs])
+            without = flown.with_matrices(flown.matrix_a(), B, np.ones((len(B), len(flown.gusts))))
+            of_dead = _search(recorded, without, actuation, block, delay)
+            held = _less(_least(of_dead, near), _least(of_dead, near, changed.levels))
+            if least > held.J and held.cost < changed.cost + DEAD_WITHIN:
+                dead, least = name, held.J
+        found.append(Change(outputs, same.J - changed.J, dead))
     return tuple(found)
+
+
+class Least(NamedTuple):
+    """The least J of a hypothesis."""
+
+    J: float
+    cost: float  # -sum log p there
+    levels: NDArray[np.int64]  # (spans,) of the wind
 
 
 def _search(recorded: Recording, flown: Airframe, actuation: Actuation, block: Block, delay: float) -> Search:
     return Search(recorded, filter_model(flown, actuation, recorded), block, flown, delay, Unknown(angle=ANGLE))
 
 
-def _least(
-    search: Search, deviation: FloatArray, starts: Sequence[int] = (), levels: NDArray[np.int64] | None = None
-) -> tuple[float, float, NDArray[np.int64]]:
-    """The least J with these standard deviations of the entries, the -sum log p there, and the levels of the wind.
-
-    Also with `levels`, of an alternative hypothesis: another wind is no change.
-    """
+def _least(search: Search, deviation: FloatArray, levels: NDArray[np.int64] | None = None, starts: Sequence[int] = ()) -> Least:
+    """The least J with these standard deviations of the entries, in winds by theta or with `levels`."""
     search.believe(deviation)
-    known, found = search.known(), []
-    for each in (None,) if levels is None else (None, levels):
-        fit = search.fit(known, starts=starts, levels=each)
-        cost = -float(np.sum(fit.after.log_likelihood[known]))
-        found.append((cost + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0, cost, fit.levels))
-    return min(found, key=lambda least: least[0])
+    known = search.known()
+    fit = search.fit(known, starts=starts, levels=levels)
+    cost = -float(np.sum(fit.after.log_likelihood[known]))
+    return Least(cost + float(np.sum((fit.theta / search.prior) ** 2)) / 2.0, cost, fit.levels)
+
+
+def _less(first: Least, second: Least) -> Least:
+    return min(first, second, key=lambda least: least.J)

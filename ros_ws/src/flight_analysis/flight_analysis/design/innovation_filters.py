@@ -15,6 +15,7 @@ from aircraft_sim.turbulence import MODERATE, dryden
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names, ObserverModel, Weights
+from control_laws.riccati import correction_of, corrections_near
 from flight_analysis.design.nominal import nominal_model, sizes
 from flight_core.parameters import require, require_channels
 from flight_core.rates import NANOSECONDS
@@ -216,12 +217,15 @@ def filter_bank(
     strength: FloatArray,
     levels: NDArray[np.int64] | slice = slice(None),
     drift: float = DRIFT,
+    *,
+    near: bool = False,
 ) -> FilterBank:
     """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, rate, ..].
 
         w_dot = rate - w / wind_time + noise,  rate_dot = -rate / GUST_TIME + noise
 
-    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`.
+    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`. Models `near` the
+    first one have gains exact to first order.
     """
     wind_time, noise = wind_model(names.winds, speed)
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
@@ -245,7 +249,7 @@ def filter_bank(
     )
     loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, gust_rate + LEAST_RATE], axis=-1)
     weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
-    L = observer_design.aircraft_correction(sampled, each, weights)
+    L = observer_design.aircraft_correction(sampled, each, weights, corrections_near if near else correction_of)
     # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
     covariance = np.linalg.solve(np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m)))
     return FilterBank(sampled, L, np.asarray(covariance), gravity, model.period)

@@ -43,6 +43,7 @@ MAX_ERROR = 0.6  # 1, bound of a relative error: two standard deviations
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
+GOOD = 0.7  # of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
 STARTS = (0, 3, 4, 9)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
 START_STEPS, STEPS = 8, 12  # at most, of each start, and of the search from the best one
 START_PROGRESS, PROGRESS = 5.0, 0.3  # of the cost, a log-likelihood, in a step: a start ends, or the search
@@ -149,10 +150,10 @@ class Search:
         The starts of the search take means of `factor` periods, by default of the shortest lag.
         """
         factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1) if factor is None else factor
-        self._coarse = self
+        self.coarse = self
         if factor > 1:
             slow = model._replace(noise=model.noise / np.sqrt(factor), period=factor * recorded.period)
-            self._coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1)
+            self.coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1)
         self._period = recorded.period
         self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
         self._drift = unknown.drift
@@ -172,8 +173,8 @@ class Search:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
         of_delay = np.ones(1 if self._delay_deviation else 0)
         of_winds = np.full(len(self._block.winds), WIND_PRIOR)
-        if self._coarse is not self:
-            self._coarse.believe(deviation)
+        if self.coarse is not self:
+            self.coarse.believe(deviation)
         self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
         self.bound = MAX_ERROR / PRIOR * self.prior
         self._lower = -self.bound
@@ -197,11 +198,12 @@ class Search:
         wind = gust_directions(self._airframe, whole, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
-    def models(self, thetas: FloatArray, levels: NDArray[np.int64]) -> Models:
-        """The filters of theta, (N, p), at the winds of some levels."""
+    def models(self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False) -> Models:
+        """The filters of theta, (N, p), at the winds of some levels; all may be `near` the first theta."""
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
-        bank = filter_bank(self.with_errors(thetas), self.names, self._airframe.speed, strength, levels, self._drift)
+        airframe, drift = self._airframe, self._drift
+        bank = filter_bank(self.with_errors(thetas), self.names, airframe.speed, strength, levels, drift, near=near)
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
         begin[:, self._angles] = self._angle_deviation * thetas[:, self._begin]
@@ -266,19 +268,19 @@ class Search:
         `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
         a few gusts.
         """
-        coarse = self._coarse
+        coarse = self.coarse
         fitted = coarse.known() & ~held_out(len(coarse._y), coarse._spans[0].stop)
         fixed = np.ones(len(self.prior), dtype=bool)
         fixed[self._winds] = False
-        found = [(self.cost(np.zeros(len(self.prior)), used), np.zeros(len(self.prior)))]
+        found = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
         for level in starts:
-            theta, calm = np.zeros(len(self.prior)), np.full(len(coarse._spans), level)
+            theta, uniform = np.zeros(len(self.prior)), np.full(len(coarse._spans), level)
             for _ in range(START_STEPS):
                 progress()
-                theta, _, progressed = coarse._step(theta, calm, fitted, fixed)
+                theta, _, progressed = coarse._step(theta, uniform, fitted, fixed)
                 if progressed < START_PROGRESS:
                     break
-            found.append((self.cost(theta, used), theta))
+            found.append((coarse.cost(theta, fitted), theta))
         _, theta = min(found, key=lambda start: start[0])
         for iteration in range(STEPS):
             progress()
@@ -307,16 +309,20 @@ class Search:
         derivatives of the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
         size, moving = len(theta), np.flatnonzero(free)
-        models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels)
+        models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels, near=True)
         costs, e, half_log_det = self._costs(models, levels, used, theta[None])
         rms, J = np.sqrt(np.mean(e[0] ** 2, axis=0)), np.zeros((size, e[0].size))
         J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
         hessian, slope = J @ J.T + np.diag(self.prior**-2), J @ (e[0] / rms).ravel() + theta / self.prior**2
         slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
         tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self.bound, free), self._lower, self.bound)
-        lower, _, _ = self._costs(self.models(tried, levels), levels, used, tried)
-        progressed = float(costs[0] - lower.min())
-        return (tried[int(lower.argmin())] if progressed > 0.0 else theta), hessian, progressed
+        expected = -float(slope @ (tried[0] - theta)) / 2.0
+        for several in (tried[:1], tried[1:]):
+            lower, _, _ = self._costs(self.models(several, levels), levels, used, several)
+            progressed = float(costs[0] - lower.min())
+            if progressed >= GOOD * expected:
+                break
+        return (several[int(lower.argmin())] if progressed > 0.0 else theta), hessian, progressed
 
     def nominal_entries(self) -> list[Entry]:
         """The entries of A and B that are identified, before the flight."""
