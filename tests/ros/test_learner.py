@@ -122,7 +122,11 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     chosen = scenario(tmp_path, updates=[1.0, 4.0])
     command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
     command.wait_for("no model: record: found")
-    command.child("flight_learner.main").kill()
+    learning = command.child("flight_learner.main")
+    learning.suspend()
+    logged = sum(path.stat().st_size for path in (tmp_path / "runs").rglob("*.mcap"))
+    command.wait_for_log(tmp_path / "runs", logged + 100_000)  # the flight goes on beside the stopped learner: half a second
+    learning.kill()
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")
     start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
