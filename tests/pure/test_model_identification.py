@@ -180,6 +180,18 @@ def test_y_taken_at_stamps_of_u() -> None:
     assert recorded.period == 0.01
 
 
+def test_log_that_shows_no_model_is_refused() -> None:
+    """An output that never changes, and a gap of twelve days, which must not be filled with samples."""
+    tape = flight("calm", 0.5)
+    y, u = tape["y"], tape["u"]
+    still = Signal(y.stamp_ns, y.names, y.values * [name != "p" for name in y.names])
+    with pytest.raises(ParameterError, match=r"^the log: found no change of p, expected a flight that excites each output$"):
+        innovation_filters.recording(replace(tape, signals={"y": still, "u": u}), OSPREY)
+    late = [Signal(of.stamp_ns + 10**15 * (of.stamp_ns > of.stamp_ns.mean()), of.names, of.values) for of in (y, u)]
+    with pytest.raises(ParameterError, match=r"^the log: found .* s of u in 1e\+06 s, expected a log without long gaps$"):
+        innovation_filters.recording(replace(tape, signals={"y": late[0], "u": late[1]}), OSPREY)
+
+
 def test_late_input_is_mean_that_acts_in_period() -> None:
     u = np.array([[0.0], [1.0], [3.0], [3.0]])
     np.testing.assert_allclose(innovation_filters.delayed(u, 0.25), [[0.0], [0.75], [2.5], [3.0]])

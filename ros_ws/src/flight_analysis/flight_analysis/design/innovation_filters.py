@@ -24,6 +24,7 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.linear_loop import Loop
 
 TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count: the filter starts from y alone
+MOST_GAPS = 10.0  # span of a log, times that of the samples of u: the gaps are filled
 DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observer_design.Weights` has them: small
 MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
@@ -69,7 +70,8 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     """Y and u of a tape at the rate of u, from the first u on.
 
     y is the sample nearest to the instant, within half a period; u is the last one. Raises ParameterError for a log without
-    the channels of the airframe, or one shorter than ten times the transient.
+    the channels of the airframe, or one shorter than ten times the transient, with gaps beyond MOST_GAPS, or with an output
+    that never changes.
     """
     y, u = tape["y"], tape["u"]
     for topic, names, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
@@ -77,7 +79,11 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
     period_ns = round(float(np.median(np.diff(u.stamp_ns))))
     require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")
-    instants = np.arange(u.stamp_ns[0], min(u.stamp_ns[-1], y.stamp_ns[-1]) + 1, period_ns)
+    end_ns = min(u.stamp_ns[-1], y.stamp_ns[-1])
+    seconds = (end_ns - u.stamp_ns[0]) / NANOSECONDS
+    held = len(u.stamp_ns) * period_ns / NANOSECONDS
+    require(seconds < MOST_GAPS * held, "the log", f"{held:.3g} s of u in {seconds:.3g} s", "a log without long gaps")
+    instants = np.arange(u.stamp_ns[0], end_ns + 1, period_ns)
     seconds = len(instants) * period_ns / NANOSECONDS
     require(seconds > 10.0 * TRANSIENT, "the log", f"{seconds:.3g} s with y and u", f"more than {10.0 * TRANSIENT:g} s")
     after = np.clip(np.searchsorted(y.stamp_ns, instants), 1, len(y.stamp_ns) - 1)
@@ -85,8 +91,11 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
     measured = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
     measured[lost] = np.nan
-    held = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
-    commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[held]
+    moves = np.ptp(measured[~lost], axis=0) > 0.0 if not lost.all() else np.zeros(len(airframe.outputs), dtype=bool)
+    still = ", ".join(name for name, moved in zip(airframe.outputs, moves, strict=True) if not moved)
+    require(not still, "the log", f"no change of {still}", "a flight that excites each output")
+    places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
+    commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
     return Recording(period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded)
 
 
