@@ -367,7 +367,7 @@ PLAN_FENCE: dict[str, Any] = {
     "rallyPoints": {"points": [[47.5, 8.5, 50.0], [47.401, 8.5, 40.0]]},
     "mission": {"plannedHomePosition": [47.40, 8.50, 450.0], "items": []},
 }
-GEOJSON_FENCE = {
+GEOJSON_FENCE: dict[str, Any] = {
     "type": "FeatureCollection",
     "features": [
         {
@@ -471,6 +471,22 @@ def test_zone_that_is_not_told_to_keep_in_or_out_refused(tmp_path: Path) -> None
     path.write_text(json.dumps(PLAN_FENCE).replace('"inclusion"', '"Inclusion"'), encoding="utf-8")
     with pytest.raises(ParameterError, match="inclusion: None, expected true or false"):
         read_fence_file(path)
+
+
+def test_fence_is_read_wherever_a_geojson_may_have_it(tmp_path: Path) -> None:
+    """RFC 7946, sections 3.1.8 and 3.2: a collection of geometries, and a Feature without one."""
+    path = tmp_path / "fence.geojson"
+    polygon = GEOJSON_FENCE["features"][0]["geometry"]
+    tree = {"features": [{"geometry": None}, {"geometry": {"type": "GeometryCollection", "geometries": [polygon]}}]}
+    path.write_text(json.dumps(tree), encoding="utf-8")
+    assert len(read_fence_file(path, ZURICH)["fence"]["zone_0"]["north"]) == 3
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": []}), encoding="utf-8")
+    with pytest.raises(ParameterError, match="found no zone"):
+        read_fence_file(path, ZURICH)
+    exchanged = polygon | {"coordinates": [[position[::-1] for position in polygon["coordinates"][0]]]}
+    path.write_text(json.dumps(exchanged), encoding="utf-8")
+    with pytest.raises(ParameterError, match="latitude and longitude exchanged, by the origin"):
+        read_fence_file(path, ZURICH)
 
 
 def test_file_without_fence_refused(tmp_path: Path) -> None:

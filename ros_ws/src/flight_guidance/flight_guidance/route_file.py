@@ -205,6 +205,7 @@ def read_fence_file(
     read = route_formats.read_fence(read_file(path, str(path), "a fence file"), str(path), suffix)
     if origin is None and read.home is not None:
         origin = Origin(read.home.latitude, read.home.longitude)
+    _require_order([place._replace(key=str(path)) for area in read.zones for place in area.places], origin)
     zones: dict[str, Any] = {}
     for k, area in enumerate(read.zones):
         key = f"zone_{k}"

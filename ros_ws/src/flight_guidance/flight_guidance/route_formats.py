@@ -97,9 +97,8 @@ def _one_route(key: str, geometries: Sequence[_Geometry], others: Sequence[str] 
         raise ParameterError(f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}")
     if line is not None:
         chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
-        require(
-            len(chosen) == 1, "--line", f"{short_repr(line)} for {len(chosen)} lines", _choice(lines) if lines else "a line"
-        )
+        found = f"{short_repr(line)}, which names {len(chosen)} lines"
+        require(len(chosen) == 1, "--line", found, _choice(lines) if lines else "a file with several lines")
         if len(lines) > 1:
             beside = " and ".join([f"{len(lines) - 1} further lines", *[beside] * bool(points)])
         lines = chosen
@@ -633,10 +632,12 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
     """Polygons, whose holes are excluded, and Points with the property `radius`; the property `exclude` excludes a zone."""
     _require_wgs84(tree, key)
     zones: list[Area] = []
-    for feature in _entries(tree, "features", key) or [tree]:
-        node, properties = _member(feature, "geometry") or feature, _member(feature, "properties")
-        kind, coordinates = _member(node, "type"), _listed(_member(node, "coordinates"), key)
+    for node, properties in _nodes(tree):
+        if node is None:
+            continue
+        kind = _member(node, "type")
         require(kind in ("Polygon", "MultiPolygon", "Point"), key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
+        coordinates = _listed(_member(node, "coordinates"), key)
         exclude, radius = _flag(properties, "exclude", False, key), _member(properties, "radius")
         if kind == "Point":
             require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
