@@ -63,7 +63,7 @@ def campaign(
     entry: Annotated[
         list[str] | None,
         typer.Option(
-            help="An entry with a deviation of its own, once for each: 'A[q,alpha]=0.6', 'lag[elevator]=0.5', noise=0.5."
+            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', lag=0.5, noise=0.5, delay=0.02 (s)."
         ),
     ] = None,
     distribution: Annotated[
