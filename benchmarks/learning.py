@@ -136,10 +136,10 @@ class Timed:
         """Of the learner."""
         self._own.take(stamp_ns, y, u)
 
-    def propose(self) -> Proposal:
+    def propose(self, flown: int) -> Proposal:
         """Of the learner."""
         begin = time.process_time()
-        proposal = self._own.propose()
+        proposal = self._own.propose(flown)
         self.longest = max(self.longest, time.process_time() - begin)
         return proposal
 

@@ -3,7 +3,9 @@
 """Learning in the air: a flight that learns beside the law alone, its replay, proposals that are wrong, and the fallback."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design import learner as design_learner
 from flight_analysis.design.learner import Learner
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.figures import learned_figure, plot_context
@@ -91,7 +94,7 @@ class Fixed:
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
         """Nothing is learned."""
 
-    def propose(self) -> Proposal:
+    def propose(self, flown: int) -> Proposal:
         """The next one."""
         return Proposal(self._proposals.pop(0), "given")
 
@@ -158,10 +161,21 @@ def test_lost_ticks_are_unknown_in_record() -> None:
 
 def test_short_record_is_refused() -> None:
     made = made_learner(scenario())
-    assert made.propose() == Proposal(None, "record: found 0 s, expected 10 s")
+    assert made.propose(0) == Proposal(None, "record: found 0 s, expected 10 s")
     for t in (0, 5):  # the ticks between them are lost
         made.take(t * NANOSECONDS, np.zeros(4), np.zeros(4))
-    assert made.propose() == Proposal(None, "record: found 5.01 s, expected 10 s")
+    assert made.propose(0) == Proposal(None, "record: found 5.01 s, expected 10 s")
+
+
+def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, identified = made_learner(scenario(learn={"updates": [15.0]})), Mock(return_value=SimpleNamespace(parts=()))
+    monkeypatch.setattr(design_learner, "identify", identified)
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+    assert "has not changed" in made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
+    identified.assert_not_called()
+    made.propose(0)  # other parameters fly: the proposal was refused, or the controller fell back
+    identified.assert_called_once()
 
 
 def test_flight_without_learner_is_refused() -> None:

@@ -126,7 +126,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         if not self.parameters.lockstep:
             os.nice(NICE)  # Linux: of this thread alone
         try:
-            self._proposal = self._learner.propose()
+            self._proposal = self._learner.propose(self._flown)
         except Exception as error:  # the flight goes on, and in lockstep waits for a proposal
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
             self._proposal = Proposal(None, f"the identification failed: {' '.join(str(error).split())}")

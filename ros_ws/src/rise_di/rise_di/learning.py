@@ -84,11 +84,12 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
     ticks, updates, steps = tape["internals"], Updates(controller.learn), list[LearnStep]()
     y, u, engaged = ticks.group("y").values, ticks.group("u").values, ticks["mode"] == Mode.ENGAGED
+    flown = ticks["parameters"]
     for k, stamp_ns in enumerate(ticks.stamp_ns.tolist()):
         if engaged[k]:
             learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
         if updates.due(stamp_ns):
-            proposal = learned.propose()
+            proposal = learned.propose(int(flown[k]))
             t = (stamp_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     last = learned.identification

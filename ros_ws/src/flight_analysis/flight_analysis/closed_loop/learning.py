@@ -28,8 +28,8 @@ class Learner(Protocol):
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
         """Take y and u, after its limits, of a tick of the engaged law, (m,)."""
 
-    def propose(self) -> Proposal:
-        """Parameters from the record so far."""
+    def propose(self, flown: int) -> Proposal:
+        """Parameters from the record so far; `flown` is the digest of the parameters at its end."""
 
 
 Learn = Callable[[RiseDiConfig], Learner]
@@ -115,6 +115,6 @@ class LearningLoop:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u)
         if not self._learning.ticked(now_ns):
             return None
-        proposal = self._learner.propose()
+        proposal = self._learner.propose(controller.digest)
         self._learning.receive(as_received(proposal, self._parameters, now_ns, controller.digest), controller, now_ns)
         return self._identifications.next(proposal)

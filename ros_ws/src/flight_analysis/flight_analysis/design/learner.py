@@ -80,6 +80,7 @@ class Learner:
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
         self._dead: dict[tuple[str, ...], str] = {}  # inputs without effect by the outputs of their part
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
+        self._proposed = controller.digest()  # of what was proposed last
         self.identification: Identification | None = None  # the last one
 
     @property
@@ -113,12 +114,15 @@ class Learner:
         )
         return Recording(self._period, t, y, u)
 
-    def propose(self) -> Proposal:
+    def propose(self, flown: int) -> Proposal:
         """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
 
         The last RECORD seconds are tested for a change of what flies. After one the older record is left out, and the model
         that flew is the prior. A part with an input without effect flies the law of the start, without this input. Before the
         first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
+
+        Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
+        controller fell back.
         """
         end_ns = self._record[-1][0] if self._record else 0
         length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
@@ -127,7 +131,8 @@ class Learner:
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
         found = [change for change in changes if change.found]
-        due = self._is_due(end_ns)
+        lost = flown != self._proposed
+        due = self._is_due(end_ns) or lost
         if not (due or found or self._changed):
             gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes) or "none tested"
             return Proposal(None, f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}")
@@ -135,13 +140,14 @@ class Learner:
             self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
             self._prior = self._model
             self._changed |= {change.outputs for change in found}
+        gone = self._dead | dead
         sentences = [
-            f"{name} has no effect: {' and '.join(part)} without it, by the law of the start" for part, name in dead.items()
+            f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
+            for part, name in (gone if lost else dead).items()
         ]
         sentences += [
             f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}" for change in found if not change.dead
         ]
-        gone = self._dead | dead
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         identified = self.identification = identify(
             self.recording(),
@@ -175,6 +181,7 @@ class Learner:
             return Proposal(None, str(error))
         learned = {part for part, value in known.items() if value.end_ns == end_ns}
         self._known, self._model, self._dead, self._changed = known, model, gone, self._changed - learned - gone.keys()
+        self._proposed = proposed.digest()
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
     def _is_due(self, end_ns: int) -> bool:
