@@ -23,7 +23,7 @@ from flight_analysis.report import comparison, figures, html, plotting, summary
 from flight_analysis.report.figures import input_limits
 from flight_analysis.report.html import Page, TableGroup, page_html, write_page
 from flight_analysis.report.plotting import Figure, Interval, PlotContext, SampleStore
-from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
+from flight_analysis.report.summary import DisplayUnit, RecordedFlight, mode_notes, summarise
 from flight_analysis.report.tables import events
 from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
@@ -202,6 +202,15 @@ def test_every_mode_but_engaged_is_interval_with_name() -> None:
     assert {interval.label: (round(interval.start, 3), round(interval.stop, 3)) for interval in intervals} == {
         "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
     }  # fmt: skip
+
+
+def test_note_on_the_part_of_a_flight_without_the_law() -> None:
+    """Any process of the host may deactivate a controller; the time before the first engagement does not count."""
+    modes = [Mode.WAITING] * 50 + [Mode.ENGAGED] * 25 + [Mode.HOLD] * 5 + [Mode.INACTIVE] * 20
+    (note,) = mode_notes(flight(100, internals=ticks(100, mode=modes)))
+    assert note.startswith("the controller was HOLD in 10%, INACTIVE in 40% of the ticks: the figures are of the whole flight")
+    for whole in ([Mode.WAITING] * 50 + [Mode.ENGAGED] * 50, [Mode.ENGAGED] * 99 + [Mode.HOLD]):
+        assert mode_notes(flight(100, internals=ticks(100, mode=whole))) == []
 
 
 def test_intervals_shaded_over_whole_height_of_figure() -> None:

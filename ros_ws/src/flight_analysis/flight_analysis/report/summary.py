@@ -33,8 +33,9 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
-from flight_analysis.report.account import Account, Commands, account, account_of_json, final_outcome
+from flight_analysis.report.account import WHOLE, Account, Commands, account, account_of_json, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
+from flight_core.modes import Mode
 from flight_core.outcome import IMPORT
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
@@ -176,7 +177,14 @@ def summarise(
         "guidance": guidance_summary(tape),
         "models": [span._asdict() for span in errors_by_model(tape)],
         "account": of.as_json(),
-        "notes": [*notes, *late_u(scenario, age), *tape.notes, *vane_notes(tape), *guidance_notices(tape, scenario.guidance)],
+        "notes": [
+            *notes,
+            *late_u(scenario, age),
+            *tape.notes,
+            *mode_notes(tape),
+            *vane_notes(tape),
+            *guidance_notices(tape, scenario.guidance),
+        ],
     }
     return {key: finite_or_null(value) for key, value in summary.items()}
 
@@ -287,6 +295,19 @@ def engagement_notes(flown: Sequence[Mapping[str, Any]], *, has_figures: bool) -
         end = "the end of the log" if engagement["stop"] is None else f"{engagement['stop']:.1f} s: {engagement['reason']}"
         sentences.append(f"engaged from {engagement['start']:.1f} s to {end}")
     return [*sentences, f"the figures are of the {'engaged time alone' if has_figures else 'whole flight: no y while engaged'}"]
+
+
+def mode_notes(tape: Tape) -> list[str]:
+    """A sentence on a controller that did not fly the law for more than 1 % of the ticks from its first engagement on."""
+    if "internals" not in tape:
+        return []
+    engaged = (mode := tape["internals"]["mode"]) == Mode.ENGAGED
+    ticks = mode[np.argmax(engaged) :]
+    if not engaged.any() or np.mean(ticks == Mode.ENGAGED) >= WHOLE:
+        return []
+    absent = [state for state in Mode if state is not Mode.ENGAGED and state in ticks]
+    parts = ", ".join(f"{state.name} in {np.mean(ticks == state):.0%}" for state in absent)
+    return [f"the controller was {parts} of the ticks: the figures are of the whole flight, with u held or at trim"]
 
 
 def vane_notes(tape: Tape) -> list[str]:
