@@ -29,6 +29,15 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.Co
     return where, rise_di("fly", "osprey_gust", "--in-process", "--duration", "4", cwd=where)
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+def test_full_disk_behind_standard_output_is_one_sentence() -> None:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        command = [sys.executable, "-m", "flight_cli.cli", "--help"]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    sentence = "error: output: cannot be written (No space left on device), expected a disk with space\n"
+    assert (result.returncode, result.stderr) == (1, sentence)
+
+
 def test_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
     where, shown = flown
     assert shown.returncode == 0, shown.stderr

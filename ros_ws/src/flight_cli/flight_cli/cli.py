@@ -7,6 +7,7 @@ import signal
 # Until the command runs, Ctrl-C ends it without a word: its imports may take a second.
 signal.signal(signal.SIGINT, signal.SIG_DFL)
 
+import errno
 import gc
 import os
 import sys
@@ -18,7 +19,7 @@ from typing import Annotated
 
 import typer
 
-BAD_INPUT, INTERRUPTED = 2, 130
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 NICE = 10  # of a command that may run beside a flight
 GARBAGE_THRESHOLD = 100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
@@ -124,6 +125,12 @@ def main() -> None:
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    except OSError as error:
+        if error.errno not in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
+            raise
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Python writes the rest at its end
+        print(f"error: output: cannot be written ({error.strerror}), expected a disk with space", file=sys.stderr)
+        sys.exit(FAILED)
 
 
 if __name__ == "__main__":

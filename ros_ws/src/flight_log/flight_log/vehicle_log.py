@@ -217,15 +217,18 @@ def read_vehicle_log(path: Path) -> VehicleLog:
 @contextmanager
 def _silent() -> Iterator[None]:
     """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a message, from C too."""
-    kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 2)
-    try:
-        with redirect_stdout(StringIO()) as text, redirect_stderr(text):
+    with redirect_stdout(StringIO()) as text, redirect_stderr(text), Path(os.devnull).open("wb") as null:
+        try:
+            kept = os.dup(2)
+        except OSError:  # it is closed
             yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(null)
+            return
+        os.dup2(null.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
 
 
 def _read_dataflash(path: Path, kind: str) -> VehicleLog:
