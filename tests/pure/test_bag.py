@@ -569,6 +569,16 @@ def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> Non
     assert set(tape.notes) == {f"y: 2 {why}", f"u: 4 {why}"}
 
 
+@pytest.mark.parametrize(("numbers", "lost"), [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)])
+def test_lost_messages_are_known_of_one_publisher_alone(numbers: list[int], lost: int | None, tmp_path: Path) -> None:
+    """A restarted publisher counts from the begin again: nobody knows what was not sent between."""
+    with BagWriter(tmp_path) as bag:
+        channel = bag.add_topic("/y", JOINT_STATE, "")
+        for k, number in enumerate(numbers):
+            bag.write(channel, k, k, number, vector(k + 1, ("q",), (0.0,)))
+    assert read_run(tmp_path).tape.recording["y"].lost == lost
+
+
 def test_samples_of_two_publishers_at_same_time_noted(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "run")
     spans = {

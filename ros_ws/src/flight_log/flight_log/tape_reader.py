@@ -212,7 +212,7 @@ class _TopicSamples:
         self._batched = 0  # messages
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
-        self._numbered, self._lost = False, 0
+        self._numbered, self._restarted, self._lost = False, False, 0
         self._unset = 0  # samples with a zero stamp that `signal` left out
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
         self.spans: dict[str, Span] = {}  # by publisher
@@ -222,6 +222,7 @@ class _TopicSamples:
         steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
         self._lost += int((steps[steps > 1] - 1).sum())
         self._numbered, self._number = self._numbered or bool(sequence.any()), int(sequence[-1])
+        self._restarted = self._restarted or bool(np.any(steps < 0))  # another publisher, or a restarted one
         alike = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not alike:
             self._decode_batch(more=alike)
@@ -309,7 +310,7 @@ class _TopicSamples:
 
     def recording(self) -> Recording:
         """The stamps in the order of the recording; after `signal`."""
-        return self._clock.recording(self._unset)._replace(lost=self._lost if self._numbered else None)
+        return self._clock.recording(self._unset)._replace(lost=self._lost if self._numbered and not self._restarted else None)
 
     def note(self, name: str) -> str:
         """The note on refused samples; empty without any."""
