@@ -305,6 +305,13 @@ def test_mission_that_is_no_route_is_refused_by_item(rows: Any, sentence: str, t
         flown(tmp_path / "r.waypoints", wpl(*rows))
 
 
+def test_item_after_which_an_autopilot_waits_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "r.plan"
+    items = [mission_item(47.4, 8.52, 50.0) | {"autoContinue": False}, mission_item(47.41, 8.52, 50.0)]
+    path.write_text(json.dumps(plan(items)), encoding="utf-8")
+    assert read_route_file(path).notes == ("flown on without autocontinue: NAV_WAYPOINT (item 1)",)
+
+
 def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
     """A survey takes an id for each of its items, so that positions in the list and ids differ."""
     items = [survey([{**mission_item(47.4 + 0.01 * k, 8.52, 50.0), "doJumpId": 3 + k} for k in range(3)])]

@@ -461,6 +461,7 @@ class _Item(NamedTuple):
     command: int
     params: Sequence[Any]  # seven
     number: Any  # by which a DO_JUMP names the item
+    goes_on: bool = True  # autocontinue: without it an autopilot waits for the pilot after the item
 
 
 def _named(command: int, number: int) -> str:
@@ -482,7 +483,7 @@ def _in_order(key: str, items: Sequence[_Item]) -> list[int]:
     order: list[int] = []
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
-        (name, _, command, params, _), here = items[k], k
+        (name, _, command, params, *_), here = items[k], k
         k, steps = k + 1, steps + 1
         require(steps <= MOST_ITEMS, key, f"more than {MOST_ITEMS} items by the repetitions of {name}", "fewer")
         if command != JUMP:
@@ -524,6 +525,8 @@ def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequenc
         flown.add(k)
     skipped = [item.name for k, item in enumerate(items) if k not in flown]
     told = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
+    waits = [item.name for k, item in enumerate(items) if k in flown and not item.goes_on]
+    told += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
     own = "circles are clockwise, of the radius of the route"
     told += [f"{own}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
     return Places(places, (*notes, *told), home)
@@ -564,7 +567,8 @@ def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         numbers = isinstance(params, list) and all(value is None or isinstance(value, int | float) for value in params)
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
         require(fits, f"{key}: item {number}", short_repr(entry), "frame, command and seven params")
-        items.append(_Item(_named(command, number), frame, command, params, number if jump is None else jump))
+        goes_on = _flag(entry, "autoContinue", True, key)
+        items.append(_Item(_named(command, number), frame, command, params, number if jump is None else jump, goes_on))
     fence = _plan_fence(tree, key)
     notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
     return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
@@ -749,7 +753,7 @@ def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
         if index == 0 and frame == 0 and command == WAYPOINT and not items:  # ArduPilot's item 0 is the home
             home = Home(*params[4:7]) if params[4] or params[5] else None
             continue
-        items.append(_Item(_named(int(command), int(index)), int(frame), int(command), params, index))
+        items.append(_Item(_named(int(command), int(index)), int(frame), int(command), params, index, numbers[-1] != 0.0))
     return items, home
 
 
