@@ -74,6 +74,7 @@ class _RecordedTopic:
     channel: BagChannel
     next_sequence: int = 0  # 0 before the first message
     publisher: str | None = None  # of the last message
+    shared: bool = False  # the sequence of one name went back: of a second publisher under that name, or of a new one
     publishers: int = 0  # number of publishers at the last check
     first_ns: int = 0  # monotonic time of the first and the last message
     heard_ns: int = 0
@@ -232,11 +233,13 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         write, channel = self._bag.write, topic.channel
         # The sequences of several publishers interleave: a gap between publishers is no loss. Foreign topics name no publisher.
-        counted = not topic.foreign
+        counted = not topic.foreign and not topic.shared
         for message, sent_ns, received_ns, sequence in received:
             write(channel, received_ns, sent_ns, sequence, message)
             if counted and sequence != topic.next_sequence:
                 publisher = sender_of(message)
+                topic.shared = publisher == topic.publisher and sequence < topic.next_sequence
+                counted = not topic.shared
                 if publisher == topic.publisher and sequence > topic.next_sequence:
                     count = sequence - topic.next_sequence
                     self.lost[topic.name] += count
