@@ -626,6 +626,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.kml", kml("<Point><coordinates>a,b,c</coordinates></Point>"), r"route\[0\]\.latitude: found 'b'"),
         ("r.kml", kml("<Point><coordinates>1,2,3 4,5,6</coordinates></Point>"), "found a Point with 2 positions, expected one"),
         ("r.kml", kml("<Point><coordinates>&a;</coordinates></Point>", head=ENTITY), "found a document type, expected the XML"),
+        ("r.yaml", "route: []", "found no waypoint, expected two or more"),
         # A line that holds nothing is not replaced by marks.
         (
             "r.geojson",

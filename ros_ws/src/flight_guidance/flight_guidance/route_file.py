@@ -323,6 +323,7 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
     tree = parse_yaml(content, key, "a route file")
     points = tree.get("route") if isinstance(tree, Mapping) and set(tree) == {"route"} else None
     require(isinstance(points, list), key, "another content", "the key route alone, with a list of waypoints")
+    require(bool(points), key, "no waypoint", "two or more")
     for k, point in enumerate(points or ()):
         name = f"route[{k}]"
         if isinstance(point, Mapping):
