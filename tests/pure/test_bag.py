@@ -571,7 +571,7 @@ def test_samples_that_nodes_refuse_are_left_out_and_noted(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(("numbers", "lost"), [([1, 2, 5, 6], 2), ([1, 2, 1, 6], None), ([0, 0, 0, 0], None)])
 def test_lost_messages_are_known_of_one_publisher_alone(numbers: list[int], lost: int | None, tmp_path: Path) -> None:
-    """A restarted publisher counts from the begin again: nobody knows what was not sent between."""
+    """A restarted publisher counts from the begin again: what was not sent between is unknown."""
     with BagWriter(tmp_path) as bag:
         channel = bag.add_topic("/y", JOINT_STATE, "")
         for k, number in enumerate(numbers):
