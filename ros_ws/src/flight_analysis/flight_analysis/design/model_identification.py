@@ -45,7 +45,8 @@ DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
 GOOD = 0.7  # of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
 STARTS = (0, 3, 4, 9)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
-START_STEPS, STEPS = 8, 12  # at most, of each start, and of the search from the best one
+START_STEPS, STEPS = 8, 12  # at most, of each start, and of the search from one of the best
+REFINED, CLOSE = 2, 100.0  # starts from which the search goes on, at most, and of cost above that of the best one
 START_PROGRESS, PROGRESS = 5.0, 0.3  # of the cost, a log-likelihood, in a step: a start ends, or the search
 
 CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
@@ -264,7 +265,7 @@ class Search:
 
         r are the normalised innovations, S their covariance, N the number of samples. The cost has further minima: a wrong
         wind explains a wrong model. So the search begins several times, with a level of `starts` in a span, on means over
-        the shortest lag. From the theta of the least cost, or 0, the search goes on with the level of a span by theta, or with
+        the shortest lag. From the REFINED best starts, or 0, the search goes on with the level of a span by theta, or with
         `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
         a few gusts.
         """
@@ -281,7 +282,22 @@ class Search:
                 if progressed < START_PROGRESS:
                     break
             found.append((coarse.cost(theta, fitted), theta))
-        _, theta = min(found, key=lambda start: start[0])
+        best = sorted(found, key=lambda start: start[0])[:REFINED]
+        refined = [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
+        _, theta, hessian = min(refined, key=lambda end: end[0])
+        deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
+        nominal = np.where(self._errors, 0.0, theta)
+        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
+        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+
+    def _refined(
+        self,
+        theta: FloatArray,
+        levels: NDArray[np.int64] | None,
+        used: NDArray[np.bool_],
+        progress: Callable[[], None],
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, theta and Hessian at the end of the search from a start."""
         for iteration in range(STEPS):
             progress()
             flown = self.levels(theta) if levels is None else levels
@@ -289,10 +305,7 @@ class Search:
             theta, hessian, progressed = self._step(theta, flown, counted, np.ones(len(theta), dtype=bool))
             if iteration > 1 and progressed < PROGRESS:
                 break
-        deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
-        nominal = np.where(self._errors, 0.0, theta)
-        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
-        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+        return self.cost(theta, used), theta, hessian
 
     def cost(self, theta: FloatArray, used: NDArray[np.bool_]) -> float:
         """The cost of `fit` for the best levels of a theta, (p,)."""
@@ -456,7 +469,7 @@ def identify(
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every, done = blocks(model), count(1)
-    total = len(every) * (len(STARTS) * START_STEPS + STEPS)
+    total = len(every) * (len(STARTS) * START_STEPS + REFINED * STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
     parts, before, after = [], [], []
     for block in every:
