@@ -19,7 +19,6 @@ from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
@@ -46,6 +45,7 @@ from flight_core.vectors import FloatArray
 from flight_log.scan import Scan
 from flight_ros.event_loop import LATE_REQUEST_PAUSE
 from flight_ros.messages import to_message
+from flight_view.server import TOKEN_HEADER
 
 SLACK = 0.05
 """s. From a node's tick to the probe, over the threads of the middleware: some milliseconds each. Host scheduling delays
@@ -263,10 +263,11 @@ class Page(NamedTuple):
     address: str
 
     def state(self) -> str:
-        """What the page says of the recording, by one request of a browser that knows nothing; empty without an answer."""
-        parts = urlsplit(self.address)
+        """What the page says of the recording, by one request of a browser that has just loaded it; empty without an answer."""
+        base, _, token = self.address.partition("#token=")
+        request = urllib.request.Request(f"{base}data/0", headers={TOKEN_HEADER: token})  # noqa: S310 - http of this host
         try:
-            with urllib.request.urlopen(f"http://{parts.netloc}/data/0?{parts.query}", timeout=10.0) as response:
+            with urllib.request.urlopen(request, timeout=10.0) as response:  # noqa: S310 - as above
                 content = response.read()
         except OSError:
             return ""

@@ -128,7 +128,8 @@ def clients(address: str, count: int, duration: float) -> None:
     Each sends its requests for all samples as fast as the server reads them, and reads no answer.
     """
     parts = urlsplit(address)
-    request = f"GET /data/0?{parts.query} HTTP/1.1\r\nHost: {parts.netloc}\r\n\r\n".encode()
+    token = parts.fragment.removeprefix("token=")
+    request = f"GET /data/0 HTTP/1.1\r\nHost: {parts.netloc}\r\nX-Page-Token: {token}\r\n\r\n".encode()
     print(f"begins at {time.time():.6f}", flush=True)
     until, sent, opened = time.monotonic() + duration, 0, 0
     connections: list[socket.socket] = []
