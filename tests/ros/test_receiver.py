@@ -51,7 +51,7 @@ class Topic(PolledSubscription):
 class Setup:
     """A receiver with what it decoded and took."""
 
-    def __init__(self, *, locked: bool = True, max_age: int | None = None) -> None:
+    def __init__(self, *, locked: bool = True, max_age: int | None = None, max_size: int | None = None) -> None:
         self.topic = Topic()
         self.refusals = Refusals(self.topic)
         self.decoded: list[bytes] = []
@@ -59,7 +59,9 @@ class Setup:
         self._decoder = Decoder(NAMES)
         lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER)) if locked else None
         max_age_ns = None if max_age is None else lambda: max_age
-        self.receiver = Receiver(self.topic, self.refusals, self.decode, self.take, lock=lock, max_age_ns=max_age_ns)
+        self.receiver = Receiver(
+            self.topic, self.refusals, self.decode, self.take, lock=lock, max_age_ns=max_age_ns, max_size=max_size
+        )
 
     def decode(self, raw: bytes) -> StampedVector | None:
         """Decode a message and remember the bytes."""
@@ -130,6 +132,13 @@ def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
     wide = message(names=(*NAMES, *(f"c{k}" for k in range(40))))
     assert setup.poll(wide, now_ns=MAX_AGE) == [False]
     assert setup.poll(wide, now_ns=MAX_AGE + 1) == [True]
+
+
+def test_report_may_be_much_longer_than_the_one_before() -> None:
+    """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout later."""
+    right, long = message(), message(names=(*NAMES, *(f"c{k}" for k in range(800))))
+    setup = Setup(max_size=len(long))
+    assert setup.poll(right, long, long + bytes(1)) == [True, True, False]
 
 
 def test_size_limit_is_inclusive() -> None:

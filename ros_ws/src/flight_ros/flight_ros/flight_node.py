@@ -24,7 +24,7 @@ from flight_core.text import bounded
 from flight_ros.clocks import PeerClocks
 from flight_ros.endpoints import EndpointMonitor, type_name
 from flight_ros.liveliness import LivelinessMonitor
-from flight_ros.messages import MAX_SIZE, Encoder, stamp_of
+from flight_ros.messages import Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.rclpy_private import refuse_foreign_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
@@ -166,7 +166,7 @@ class FlightNode(Node, Generic[P]):
         max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
         qos: QoSProfile | None = None,
-        max_size: int = MAX_SIZE,
+        max_size: int | None = None,
     ) -> Receiver[S]:
         """Create a subscription with its `Receiver`. Overruns of this node are no silence of the publisher."""
         subscription = self.subscribe(topic, qos)

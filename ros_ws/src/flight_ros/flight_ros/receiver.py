@@ -95,8 +95,8 @@ class Receiver(Generic[S]):
     messages costs no more than as many right ones. Under the name of the locked publisher, too long is GROWTH times its longest
     valid message, until the publisher times out. `decode` returns None for a vector without channels. `take` gets a sample
     and the present instant. `lock` admits one publisher at a time; None admits each. `max_age_ns` limits the age of a stamp and
-    the lead over the clock; None is for a sender without the clock of the flight. `max_size` is in bytes. Refusals are raised
-    as ChannelError.
+    the lead over the clock; None is for a sender without the clock of the flight. `max_size` in bytes is for a topic of
+    reports, whose lengths differ by more than GROWTH; None is for one of samples. Refusals are raised as ChannelError.
     """
 
     def __init__(
@@ -108,10 +108,10 @@ class Receiver(Generic[S]):
         *,
         max_age_ns: Callable[[], int] | None,
         lock: PublisherLock | None = None,
-        max_size: int = MAX_SIZE,
+        max_size: int | None = None,
     ) -> None:
         self.subscription, self.lock = subscription, lock
-        self._max_size = max_size
+        self._max_size, self._grows = max_size or MAX_SIZE, max_size is not None
         self._longest = 0  # bytes, of the valid messages
         self._refusals, self._decode, self._take = refusals, decode, take
         self._max_age_ns = max_age_ns
@@ -133,7 +133,7 @@ class Receiver(Generic[S]):
                 if (sender := sender_of(raw)) is None:
                     raise ChannelError("malformed", "a message without a header in plain CDR")
                 self.lock.check(sender, now_ns)
-                if len(raw) > GROWTH * self._longest and self.lock.holds(sender, now_ns):
+                if not self._grows and len(raw) > GROWTH * self._longest and self.lock.holds(sender, now_ns):
                     require_size(raw, GROWTH * self._longest)
             if (sample := self._decode(raw)) is not None:
                 self._accept(sample, now_ns)
