@@ -324,6 +324,15 @@ def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: 
     assert (clock.recording().unset, clock.recording().step_ns) == (len(damaged), 0)
 
 
+def test_damaged_stamps_on_both_sides_of_the_first_samples_are_left_out() -> None:
+    """The clock begins behind the second one; the first one would be the start of the flight."""
+    (log_ns,) = stamps(range(1000, 1200))
+    stamp_ns = log_ns.copy()
+    stamp_ns[[0, 6]] += np.array([-5 * NANOSECONDS, 5 * NANOSECONDS])
+    keep, _ = StampClock().usable(stamp_ns, log_ns, more=False, end=True)
+    assert np.flatnonzero(~keep).tolist() == [0, 6]
+
+
 def test_sample_that_comes_late_keeps_its_place() -> None:
     """A sample that the network held back by 0.3 s has a right stamp."""
     (stamp_ns,) = stamps(range(1000, 1200))

@@ -62,8 +62,8 @@ class StampClock:
                 keep[known[first] :] = False
                 break
             if self._last_ns is None:  # the messages before are too few to be the begin of the clock
-                away_ns = stamps[first] - stamps[:first]
-                keep[known[:first]] &= (away_ns >= -STEP_NS) & ((away_ns <= STRAY_NS) | ~leads[first])
+                away_ns, lead_ns = stamps[first] - stamps[:first], offsets[first] - offsets[:first]
+                keep[known[:first]] &= (away_ns >= -STEP_NS) & ((away_ns <= STRAY_NS) | (lead_ns <= STEP_NS))
             self._last_ns, self._last_offset_ns = int(stamps[after - 1]), int(offsets[after - 1])
             self._offset_ns = max(self._offset_ns, int(offsets[first:after].max()))
         return self._taken(stamp_ns, keep, len(stamp_ns))

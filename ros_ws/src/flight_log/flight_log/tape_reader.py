@@ -131,7 +131,8 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
         if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
-    without = [f"no stamp of {topic}" for topic, samples in log.topics.items() if samples.recording().unset]
+    unset = {topic: of.unset for topic, samples in log.topics.items() if (of := samples.recording()).unset}
+    without = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
     without += filter(None, (samples.note(topic) for topic, samples in log.topics.items()))
     require(bool(filled), str(run), "; ".join([nothing, *without, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
