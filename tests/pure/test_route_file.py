@@ -325,6 +325,20 @@ def test_jump_of_plan_names_the_id_of_an_item(tmp_path: Path) -> None:
     ] == [*(0, 1, 2, 1, 2, 5)]
 
 
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"doJumpId": [1]}, r"item 1: found doJumpId: \[1\], expected a number"),
+        ({"frame": 10**400}, r"item 1: found .*, expected frame, command and seven params"),
+        ({"params": [0, 0, 0, None, 10**400, 8.5, 50.0]}, r"route\[0\]"),
+    ],
+)
+def test_item_of_plan_that_is_no_number_is_refused(changes: dict[str, Any], sentence: str, tmp_path: Path) -> None:
+    """JSON has whole numbers of any size, which Python does not compare with a float."""
+    with pytest.raises(ParameterError, match=sentence):
+        flown(tmp_path / "r.plan", plan([mission_item(47.4, 8.52, 50.0) | changes]))
+
+
 def test_radius_of_loiter_is_named(tmp_path: Path) -> None:
     """Of NAV_LOITER_TO_ALT the second parameter is the radius, of the other loiters the third; negative to the left."""
     climb, turns = mission_item(47.4, 8.52, 50.0, command=31), mission_item(47.41, 8.52, 50.0, command=18)

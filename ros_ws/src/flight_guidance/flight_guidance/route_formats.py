@@ -159,9 +159,14 @@ def _meets(end: Place, begin: Place) -> bool:
 
 def _parsed_json(content: bytes, key: str) -> Any:
     try:
-        return json.loads(content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members)
+        return json.loads(content.removeprefix(b"\xef\xbb\xbf"), object_pairs_hook=_members, parse_int=_whole)
     except (ValueError, RecursionError) as error:
         raise ParameterError(f"{key}: not valid JSON ({error}), expected {A_ROUTE}") from None
+
+
+def _whole(digits: str) -> int | float:
+    """A whole number; one of more digits than a float holds is a float, infinite beyond its range."""
+    return int(digits) if len(digits) < 16 else float(digits)
 
 
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -556,7 +561,9 @@ def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
     require(isinstance(listed, list), key, "no mission with items", "a plan of QGroundControl")
     items = []
     for number, entry in _plan_items(listed or (), key):
-        kind, jump = _member(entry, "complexItemType") or _member(entry, "type"), _member(entry, "doJumpId")
+        kind = _member(entry, "complexItemType") or _member(entry, "type")
+        jump = number if (given := _member(entry, "doJumpId")) is None else given
+        require(isinstance(jump, int | float), f"{key}: item {number}", f"doJumpId: {short_repr(jump)}", "a number")
         if kind in LANDINGS:
             items.append(_Item(f"{kind} (item {number})", 0, LAND, [None] * 7, jump))
             continue
@@ -568,7 +575,7 @@ def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
         require(fits, f"{key}: item {number}", short_repr(entry), "frame, command and seven params")
         goes_on = _flag(entry, "autoContinue", True, key)
-        items.append(_Item(_named(command, number), frame, command, params, number if jump is None else jump, goes_on))
+        items.append(_Item(_named(command, number), frame, command, params, jump, goes_on))
     fence = _plan_fence(tree, key)
     notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
     return _mission(key, items, _home(_member(mission, "plannedHomePosition")), notes)
