@@ -4,7 +4,7 @@
 
 The figures of a page share the time axis and the margins, so the subplots line up. A figure holds short curves. `SampleStore`
 holds the samples of longer curves: the page decimates the samples to the view. A figure also holds the extremes of a very
-long curve, since the page takes long to unpack the samples. Of a curve of MAX_STORED samples or more the page has the
+long curve, since the page takes long to unpack the samples. Of a curve of more than MAX_STORED samples the page has the
 smallest and the largest value of each bin of time alone; the figures in numbers are of all samples.
 """
 
