@@ -12,8 +12,7 @@ from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
-from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, print_json, write_text
-from flight_core.arguments import as_numbers
+from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, parse_numbers, print_json, write_text
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -44,7 +43,8 @@ def learn(
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
     changed: dict[str, Any] = {"window": window, "prior": prior}
     if updates is not None:
-        changed["updates"] = as_numbers(updates.split(","), "--updates", "seconds with commas, as 10,15,30")
+        changed["updates"] = times = parse_numbers(updates)
+        require(bool(times), "--updates", repr(updates), "seconds with commas, as 10,15,30")
     recorded = read_run(run, namespace, scenario_file(scenario))
     recorded.require()
     flown = recorded_scenario(recorded)

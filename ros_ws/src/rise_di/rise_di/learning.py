@@ -74,7 +74,10 @@ class LearnResult(NamedTuple):
 
 
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
-    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError."""
+    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError.
+
+    Where the log has other settings of the learner than the scenario, or none, each proposal is taken as flown.
+    """
     make, controller = learner(scenario, real_time=tape.start_ns > 0), scenario.rise_di()  # simulated time begins at 0
     require(make is not None, "controller.learn", "no section", "one")
     assert make is not None  # noqa: S101 - for the type checker
@@ -84,12 +87,14 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
     ticks, updates, steps = tape["internals"], Updates(controller.learn), list[LearnStep]()
     y, u, engaged = ticks.group("y").values, ticks.group("u").values, ticks["mode"] == Mode.ENGAGED
-    flown = ticks["parameters"]
+    flown, proposed = ticks["parameters"], controller.digest()
+    is_of_log = bool(np.any(flown == proposed))
     for k, stamp_ns in enumerate(ticks.stamp_ns.tolist()):
         if engaged[k]:
             learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
         if updates.due(stamp_ns):
-            proposal = learned.propose(int(flown[k]))
+            proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
+            proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (stamp_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     last = learned.identification
