@@ -180,7 +180,8 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     monkeypatch.setattr(design_learner, "identify", identified)
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
-    assert "has not changed" in made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
+    sentence = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
+    assert sentence == "no identification is due, and no part is tested for a change"
     identified.assert_not_called()
     made.propose(0)  # other parameters fly: the proposal was refused, or the controller fell back
     identified.assert_called_once()

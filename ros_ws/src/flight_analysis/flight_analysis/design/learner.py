@@ -134,7 +134,9 @@ class Learner:
         lost = flown != self._proposed
         due = self._is_due(end_ns) or lost
         if not (due or found or self._changed):
-            gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes) or "none tested"
+            if not changes:
+                return Proposal(None, "no identification is due, and no part is tested for a change")
+            gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes)
             return Proposal(None, f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}")
         if found:
             self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
