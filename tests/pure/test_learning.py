@@ -31,7 +31,7 @@ from flight_core.vectors import FloatArray
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
-from rise_di.learning import learner
+from rise_di.learning import learn_again, learner
 from rise_di_controller import divergence
 from rise_di_controller.learning import changes
 from rise_di_controller.observer import PastTick, estimates_after
@@ -146,6 +146,13 @@ def test_log_teaches_with_other_settings(flown: Flown) -> None:
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
     assert first.startswith("t = 10.00 s: B["), result.output
     assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
+
+
+def test_log_that_ends_before_first_update_is_refused(flown: Flown) -> None:
+    with pytest.raises(
+        ParameterError, match=r"^the log: found 22 s of ticks, expected 30 s or more, the first of learn\.updates$"
+    ):
+        learn_again(read_run(flown.run).tape, scenario(learn={"updates": [30.0]}))
 
 
 def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:

@@ -11,7 +11,7 @@ from rich.console import Console
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.summary import display_units
-from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
+from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
 from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, parse_numbers, print_json, write_text
 from flight_core.files import display_path
 from flight_core.parameters import require
@@ -47,6 +47,7 @@ def learn(
         require(bool(times), "--updates", repr(updates), "seconds with commas, as 10,15,30")
     recorded = read_run(run, namespace, scenario_file(scenario))
     recorded.require()
+    warn_of_lacks(recorded)
     flown = recorded_scenario(recorded)
     settings = flown.controller.model_dump().get("learn") or {}
     settings |= {name: value for name, value in changed.items() if value is not None}

@@ -97,6 +97,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (stamp_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
+    first = f"{controller.learn.updates[0]:g} s or more, the first of learn.updates"
+    require(bool(steps), "the log", f"{(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) / NANOSECONDS:.3g} s of ticks", first)
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
 
