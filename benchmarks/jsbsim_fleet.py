@@ -93,7 +93,7 @@ def _learn(names: list[str]) -> None:
     print("| aircraft | the gains alone | extended-state observer | learner | first model | parts that learned |")
     print("|---|---|---|---|---|---|", flush=True)
     for name in names:
-        speed, altitude = (FLEET | OTHERS)[name]
+        speed, altitude = (FLEET | OTHERS).get(name, DEFAULT)
         condition = f"{name}, {speed} kt, {altitude} ft"
         try:
             aircraft = identify(name, speed * KNOT, altitude * FOOT, observer_margin=MARGIN, learns=True)
