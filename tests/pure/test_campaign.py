@@ -39,7 +39,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_bringup.scenarios import find_scenario
-from flight_campaign import engines
+from flight_campaign import engines, equipment
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
 from flight_campaign.campaign_report import overview, write_page
 from flight_campaign.influence import chance_level, rank_correlations
@@ -136,8 +136,8 @@ def test_aircraft_of_campaign_has_same_score_in_single_process_simulation(tmp_pa
 
 def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: Path) -> None:
     """One entry at its own limits, lags, noise and u late too, the others at theirs, and a score with a unit of its own."""
-    units, spread = {"V": 0.2}, Spread({"B[V,thrust]": 0.6, "lag": 0.5, "noise[q]": 0.9, "delay": 0.03}, "corners")
-    of = define(SHORT, 4, 0.2, 7, 4, spread=spread, units=units)
+    units, entries = {"V": 0.2}, {"B[V,thrust]": 0.6, "lag[thrust]": 0.2, "lag": 0.5, "noise[q]": 0.9, "delay": 0.035}
+    of = define(SHORT, 4, 0.2, 7, 4, spread=Spread(entries, "corners"), units=units)
     campaign = fly_campaign(tmp_path / "own", of)
     rows = campaign.rows().collect()
     airframe = load_airframe(SHORT.aircraft.airframe)
@@ -148,11 +148,12 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     assert np.abs(
         rows["A[q,q]"].to_numpy() / airframe.matrix_a()[airframe.index("q"), airframe.index("q")] - 1.0
     ) == pytest.approx(0.2)
-    for name, published, part in zip(("lag[rudder]", "noise[q]"), (0.02, 0.0017), (0.5, 0.9), strict=True):
+    for name, published, part in (("lag[rudder]", 0.02, 0.5), ("lag[thrust]", 0.1, 0.2), ("noise[q]", 0.0017, 0.9)):
         assert np.abs(rows[name].to_numpy() / published - 1.0) == pytest.approx(part)
     worst = campaign.tally(0).worst[0]
     again = campaign.definition.aircraft_scenario(worst.number)
-    assert set(rows["delay"].to_list()) == {0.0, 0.03}
+    assert set(rows["delay"].to_list()) == {0.0, 0.03}  # whole periods; +100 % of the reference is the largest
+    assert 2.0 * equipment.references(SHORT, of.entries)["delay"] == 0.03
     assert again.aircraft.actuators.lag[-1] == rows["lag[rudder]"][worst.number]
     assert again.aircraft.actuators.delay == rows["delay"][worst.number] == 0.03
     true, outputs = error(simulate(again)), again.controller.outputs
@@ -167,6 +168,7 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     [
         ({"spread": Spread({"A[q,gamma]": 0.5})}, r"entry A\[q,gamma\], expected an entry of the airframe"),
         ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
+        ({"spread": Spread({"lagg": 0.5})}, r"entry lagg, expected a lag or a noise above 0: .*; delay, or an entry of A or B"),
         ({"spread": Spread({"lag[flap]": 0.5})}, r"entry lag\[flap\], expected a lag or a noise above 0: lag\[elevator\]"),
         ({"spread": Spread({"delay": 0.004})}, "delay 0.004 s, expected at least a period of the controller, 0.01 s"),
         ({"units": {"theta": 0.1}}, "expected an output of the controller"),

@@ -95,8 +95,7 @@ class Definition(Config):
     @property
     def spread(self) -> Spread:
         """How the entries of A and B are drawn."""
-        own = {name: part for name, part in self.entries.items() if not equipment.is_of_equipment(name)}
-        return Spread(own, self.distribution)
+        return Spread(equipment.of_matrices(self.entries), self.distribution)
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
         """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
@@ -190,8 +189,7 @@ def define(
     if scenario.guidance is None:
         score_units(outputs, scenario.aircraft.channels().outputs, own)
     if not scenario.aircraft.is_jsbsim:
-        of_matrices = {name: part for name, part in spread.entries.items() if not equipment.is_of_equipment(name)}
-        of_airframe = spread._replace(entries=of_matrices)
+        of_airframe = spread._replace(entries=equipment.of_matrices(spread.entries))
         sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, of_airframe)
     values = {
         "name": scenario.name,
@@ -226,7 +224,7 @@ def fly_chunk(text: str, job: Job) -> bytes:
         if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
             raise
         found = f"{definition.chunk} aircraft at once, which need more memory than there is"
-        raise ParameterError(f"--chunk: found {found}, expected fewer, or a shorter aircraft.sensors.delay") from None
+        raise ParameterError(f"--chunk: found {found}, expected fewer, or shorter delays of the aircraft") from None
     return encode(figures, definition.seed, definition.factor(job[0]))
 
 
@@ -352,10 +350,9 @@ class Campaign:
         rows, airframe = self.rows(case), load_airframe(self.definition.scenario().aircraft.airframe)
         matrices = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
         published = {name: float(value[0]) for name, value in matrices.items()}
-        published |= equipment.published(self.definition.scenario())
+        published |= equipment.references(self.definition.scenario(), self.definition.entries)
         parts = {name: self.definition.entries.get(name, self.definition.uncertainty) for name in published}
-        if (largest := self.definition.entries.get(equipment.DELAY)) is not None:  # half of it, within +-100 %
-            published[equipment.DELAY], parts[equipment.DELAY] = largest / 2.0, 1.0
+        parts |= {equipment.DELAY: 1.0}
         return influence(rows.head(RANKED).collect(), rows.filter(pl.col("number") == worst).collect(), published, parts)
 
     def _read(self, job: Job) -> "pl.DataFrame":

@@ -94,9 +94,7 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
         return ranked | {"command": None}
     scenario, path = definition.scenario(case), _path(campaign, case, "corner")
     airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
-    known = equipment.published(scenario)
-    if (largest := definition.entries.get(equipment.DELAY)) is not None:
-        known[equipment.DELAY] = equipment.whole_periods(largest, scenario) / 2.0
+    known = equipment.references(scenario, definition.entries)
     of_equipment = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
     of_matrices = {name: part for name, part in corner.items() if name not in known}
     write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), of_matrices, definition.wind)))

@@ -27,6 +27,11 @@ def is_of_equipment(entry: str) -> bool:
     return entry.partition("[")[0] in KINDS
 
 
+def of_matrices(entries: Mapping[str, float]) -> dict[str, float]:
+    """The entries of A and B alone."""
+    return {name: part for name, part in entries.items() if not is_of_equipment(name)}
+
+
 def published(scenario: Scenario) -> dict[str, float]:
     """The lags above 0 and the noise above 0 of a scenario by name, SI."""
     aircraft, channels = scenario.aircraft, scenario.aircraft.channels()
@@ -40,20 +45,25 @@ def published(scenario: Scenario) -> dict[str, float]:
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:
-    """The entries, with each channel in place of lag and noise. Raises ParameterError for an unknown entry."""
-    known, every = published(scenario), {}
+    """The entries, with each channel in place of lag and noise, whose own entry counts, and the delay in whole periods.
+
+    Raises ParameterError for an unknown entry.
+    """
+    known, every = published(scenario), dict[str, float]()
     for name, part in entries.items():
         if name == DELAY:
-            period = 1.0 / scenario.controller.rate
-            require(part >= period, "uncertainty", f"delay {part:g} s", f"at least a period of the controller, {period:g} s")
-            every[name] = part
+            rate = scenario.controller.rate
+            expected = f"at least a period of the controller, {1.0 / rate:g} s"
+            require(part >= 1.0 / rate, "uncertainty", f"delay {part:g} s", expected)
+            every[name] = math.floor(part * rate + 1e-9) / rate if math.isfinite(part) else part
             continue
-        if not is_of_equipment(name):
+        if name.startswith(("A[", "B[")):
             every[name] = part
             continue
         chosen = [entry for entry in known if name in (entry, entry.partition("[")[0])]
-        require(bool(chosen), "uncertainty", f"entry {name}", f"a lag or a noise above 0: {', '.join(known) or 'none'}")
-        every |= dict.fromkeys(chosen, part)
+        expected = f"a lag or a noise above 0: {', '.join(known) or 'none'}; delay, or an entry of A or B, as A[q,q]"
+        require(bool(chosen), "uncertainty", f"entry {name}", expected)
+        every |= {entry: entries.get(entry, part) for entry in chosen}
     return every
 
 
@@ -61,9 +71,9 @@ def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int)
     """Drawn lags, noise and delays of the aircraft first, first + 1, ... of a seed by entry, (count,) each.
 
     A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
-    value depends on seed and number alone.
+    value depends on seed and number alone. The entries of `spread` are those of `expanded`.
     """
-    known, period = published(scenario), 1.0 / scenario.controller.rate
+    known, rate = published(scenario), scenario.controller.rate
     uniform = random_streams.uniform(first, count, len(known) + 1, random_streams.EQUIPMENT, seed)
     d = deviations(uniform, spread.distribution)
     values = {
@@ -72,14 +82,14 @@ def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int)
         if name in spread.entries
     }
     if DELAY in spread.entries:
-        most = round(whole_periods(spread.entries[DELAY], scenario) / period)
-        values[DELAY] = period * np.minimum(np.floor((1.0 + d[:, -1]) / 2.0 * (most + 1)), most)
+        most = round(spread.entries[DELAY] * rate)
+        values[DELAY] = np.minimum(np.floor((1.0 + d[:, -1]) / 2.0 * (most + 1)), most) / rate
     return values
 
 
-def whole_periods(delay: float, scenario: Scenario) -> float:
-    """The whole periods of the controller in a delay, s."""
-    return math.floor(delay * scenario.controller.rate + 1e-9) / scenario.controller.rate
+def references(scenario: Scenario, entries: Mapping[str, float]) -> dict[str, float]:
+    """Values of which a deviation is a part: `published`, and half of the largest delay, which is drawn within +-100 %."""
+    return published(scenario) | ({DELAY: entries[DELAY] / 2.0} if DELAY in entries else {})
 
 
 def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], otherwise: tuple[float, ...]) -> list[Any]:

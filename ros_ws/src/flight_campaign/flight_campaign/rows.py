@@ -5,6 +5,7 @@
 import io
 from typing import TYPE_CHECKING, NamedTuple
 
+from flight_campaign.equipment import is_of_equipment
 from flight_campaign.statistics import Tally, lost_track
 from flight_core.vectors import FloatArray
 
@@ -48,7 +49,7 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
 
 def entry_names(table: "pl.DataFrame") -> list[str]:
     """The columns with drawn entries: of A and B, lags, noise and the delay of u."""
-    return [name for name in table.columns if name.startswith(("A[", "B[", "lag[", "noise[")) or name == "delay"]
+    return [name for name in table.columns if name.startswith(("A[", "B[")) or is_of_equipment(name)]
 
 
 def tally_of(table: "pl.DataFrame") -> Tally:

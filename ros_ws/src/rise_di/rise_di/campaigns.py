@@ -36,8 +36,8 @@ class CampaignResult(NamedTuple):
     def rows(self) -> "pl.DataFrame":
         """A row an aircraft, SI: seed, number, factor of the sweep, whether it diverged or lost track, figures, drawn entries.
 
-        The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]" and "noise[q]". The figures of a diverged
-        aircraft are null.
+        The entries have names as "A[q,alpha]", "B[V,thrust]", "lag[elevator]", "noise[q]" and "delay". The figures of
+        a diverged aircraft are null.
         """
         return Campaign.resume(self.folder).rows().collect()
 
@@ -66,7 +66,8 @@ def fly_campaign(
         aircraft: How many uncertain aircraft.
         uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
         entries: Entries with a deviation of their own: {"A[q,alpha]": 0.6, "lag[elevator]": 0.5, "noise[q]": 0.5}; "lag" and
-            "noise" mean all. Lags and noise without an entry are those of the scenario.
+            "noise" mean all without their own. {"delay": 0.02} is the largest further delay of u, s. Lags, noise and delay
+            without an entry are those of the scenario.
         distribution: Of the deviations: "uniform", "normal" with three standard deviations at the limit, or "corners".
         score: Units of the rms errors in the score by output, SI: {"q": 0.02}.
         wind: Effect of wind: "air_relative", by the A of each aircraft, or "published", by the airframe; None: the scenario's.
