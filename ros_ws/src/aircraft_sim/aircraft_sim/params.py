@@ -171,7 +171,7 @@ class ActuatorConfig(Config):
         default=(), description="half-widths of the backlash from `loose_at` on, SI; none: 0.01 each"
     )
     delay: float = Field(
-        default=0.0, ge=0, le=1e3, description="transport delay of u before the actuators, s; whole periods of the aircraft"
+        default=0.0, ge=0, le=10, description="transport delay of u before the actuators, s; whole periods of the aircraft"
     )
 
 
