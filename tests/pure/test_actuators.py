@@ -18,6 +18,7 @@ from aircraft_sim import plant
 from aircraft_sim.actuators import Actuators, move, step
 from aircraft_sim.dynamics import x_dot
 from aircraft_sim.plant import AircraftState, PlantParams, advance
+from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
@@ -215,6 +216,19 @@ def test_scenario_without_actuators_integrates_command_to_last_bit() -> None:
         x = rk4(x_dot, k * 2 * MS / NANOSECONDS, x, u, params.aircraft, 0.002)
     assert (state.x == x).all()
     assert (state.position == u).all()
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_late_command_acts_as_that_command_given_later(every: int) -> None:
+    """To the last bit, also where every second sample is left out: u is then held over two periods."""
+    scenario, periods = find_scenario("osprey_servo"), 3
+    late = {"actuators": scenario.aircraft.actuators.model_dump() | {"delay": 0.006}}
+    delayed, at_once = Simulator(scenario.vary(aircraft=late).aircraft), Simulator(scenario.aircraft)
+    held = np.repeat(0.1 * np.random.default_rng(1).normal(size=(20, 4)), 2, axis=0)  # over the periods 0 and 1, 2 and 3, ...
+    shifted = np.vstack([np.zeros((periods, 4)), held])
+    y = {k: at_once.sample(k, shifted[k - 1])[0].value for k in range(1, 41)}
+    for k in range(every, 41, every):
+        np.testing.assert_array_equal(delayed.sample(k, held[k - 1])[0].value, y[k])
 
 
 # Mean positions, against the continuous actuator p_dot = clip((input - p) / lag, -rate, rate) between its end stops.

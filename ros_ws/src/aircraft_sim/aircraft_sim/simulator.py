@@ -242,12 +242,10 @@ class Simulator:
 
     def _advance(self, number: int, u: FloatArray) -> None:
         """The model to a sample, period by period where u is late."""
-        begin, end = self._number, number
-        for k in range(begin, end) if self._commands else ():
+        step = 1 if self._commands else max(number - self._number, 1)
+        for k in range(self._number, number, step):
             self._commands.append(u)
-            self._model.advance(k * self.period_ns, self._commands.popleft(), self.period_ns)
-        if end > begin and not self._commands:
-            self._model.advance(begin * self.period_ns, u, (end - begin) * self.period_ns)
+            self._model.advance(k * self.period_ns, self._commands.popleft(), step * self.period_ns)
 
     def pose(self) -> FloatArray:
         """The true pose at the instant of the last sample, in the order of `channels.POSE`."""
