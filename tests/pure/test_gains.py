@@ -324,6 +324,12 @@ def test_pairing_without_decomposition_or_with_strong_coupling_refused(inputs: t
         selection.require_channels(*osprey_channels(inputs))
 
 
+def test_refusal_of_many_channels_says_that_few_orders_were_tried() -> None:
+    names = tuple("abcdef")
+    with pytest.raises(ParameterError, match=r"none of three orders that were tried can$"):
+        selection.require_channels(np.ones((6, 6)), selection.ChannelPairing(names, names))
+
+
 def test_gains_can_be_selected_for_pairing_that_refusal_proposes(osprey_gust: Scenario) -> None:
     airframe = load_airframe("aerosonde_first_edition_lateral")
     manoeuvre = selection.manoeuvre(osprey_gust.vary(flight={"duration": 1.0}), airframe)

@@ -112,14 +112,14 @@ def coupling(Omega: FloatArray) -> float:
 
 
 def search(Omega: FloatArray, largest_U: float = math.inf) -> Pairing | None:
-    """The smallest change of the channels to D = I, or None where no change gives D = I.
+    """The smallest change of the channels to D = I, or None where no order that was tried gives D = I.
 
     Up to MANY channels, every order of the outputs is combined with every order of the inputs: (m!)^2. Of more channels three
-    orders are tried: the given one, the inputs by the largest responses, and that of complete pivoting, so that the change
-    may not be the smallest. A combination has a single choice of input signs, namely D, because a change of the sign of
-    input k changes D_k only. The preference is, in this order: most outputs with the same input, most outputs in the same
-    place, most inputs with the same sign, the smallest max abs(U - I) in inputs of unit response. Orders with a zero on the
-    diagonal, or with max abs(U - I) above `largest_U`, are excluded.
+    orders are tried: the given one, the inputs by the largest responses, and that of complete pivoting, so that a smaller
+    change may exist, or one where None is returned. A combination has a single choice of input signs, namely D, because a
+    change of the sign of input k changes D_k only. The preference is, in this order: most outputs with the same input, most
+    outputs in the same place, most inputs with the same sign, the smallest max abs(U - I) in inputs of unit response. Orders
+    with a zero on the diagonal, or with max abs(U - I) above `largest_U`, are excluded.
 
     Raises DecompositionError if Omega is not square or not finite.
     """
@@ -144,11 +144,11 @@ def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
 
     rows, columns = _sizes(matrix)
-    rest, m = np.abs(matrix) / rows[:, None] / columns, len(matrix)
+    rest, m = matrix / rows[:, None] / columns, len(matrix)
     places = tuple(range(m))
-    assigned = linear_sum_assignment(np.log(np.maximum(rest, np.finfo(float).tiny)), maximize=True)[1]
+    assigned = linear_sum_assignment(np.log(np.maximum(np.abs(rest), np.finfo(float).tiny)), maximize=True)[1]
     orders = {(places, places), (places, tuple(assigned.tolist()))}
-    rest, outputs, inputs = matrix / rows[:, None] / columns, [], []
+    outputs, inputs = list[int](), list[int]()
     while rest.any():
         i, j = (int(place) for place in np.unravel_index(np.argmax(np.abs(rest)), rest.shape))
         rest = rest - np.outer(rest[:, j], rest[i] / rest[i, j])

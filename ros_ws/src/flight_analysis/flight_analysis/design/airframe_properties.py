@@ -19,7 +19,7 @@ from flight_analysis.design.effectors import LAW_INPUT
 from flight_core.arguments import FilePath
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from rise_di_controller.decomposition import DecompositionError, Pairing, coupling, leading_minors, search, signs
+from rise_di_controller.decomposition import MANY, DecompositionError, Pairing, coupling, leading_minors, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 
 ComplexArray = NDArray[np.complex128]
@@ -54,7 +54,7 @@ class AirframeFacts(NamedTuple):
     coupling: float | None  # max abs(U - I) in inputs of unit response, None if D is None
     outputs: tuple[str, ...]
     inputs: tuple[str, ...]
-    pairing: Pairing | None  # the smallest change that gives D = I
+    pairing: Pairing | None  # `search`: a change to D = I, None where no order that was tried has one
     zero_dynamics: ZeroDynamics
     controllable: bool  # Assumption 1
     integrated: tuple[str, ...]  # states that integrate outputs only: each gives a zero at the origin
@@ -68,7 +68,7 @@ class AirframeFacts(NamedTuple):
     def remedy(self) -> str:
         """Change for D = I, as text: "none needed", "flip rudder", "pair p-rudder, r-aileron, flip rudder", "none"."""
         if self.pairing is None:
-            return "none"
+            return "none" if self.m <= MANY else "none of three orders tried"
         outputs, inputs, input_signs, _ = self.pairing
         in_place = outputs == inputs == tuple(range(self.m))
         pairs = ", ".join(f"{self.outputs[i]}-{self.inputs[j]}" for i, j in zip(outputs, inputs, strict=True))

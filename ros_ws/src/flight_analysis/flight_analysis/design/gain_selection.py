@@ -52,7 +52,7 @@ from flight_core.vectors import Array, FloatArray
 from reference_model import model
 from reference_model.command import command
 from reference_model.params import ReferenceModelConfig
-from rise_di_controller.decomposition import DecompositionError, coupling, search, signs
+from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
 from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
@@ -349,7 +349,7 @@ def require_channels(
         problem = f"no D, for leading minor {error.minor} is zero"
     if problem:
         found = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
-        fits = "inputs that can be paired: no order of these can"
+        fits = f"inputs that can be paired: {'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
         if better := search(Omega, MAX_COUPLING):
             pairs = (f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True))
             fits = f"another pairing: {', '.join(pairs)}"
