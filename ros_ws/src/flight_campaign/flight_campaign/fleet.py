@@ -6,7 +6,7 @@ The last axis of every array is the aircraft, so that one line of a law or of th
 ticks of the controller an aircraft is linear up to a small remainder: all steps of its integration are one matrix product.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import accumulate, chain, repeat
 from typing import Any, NamedTuple
@@ -117,20 +117,22 @@ def shared(params: Any) -> Any:
 
 def with_equipment(vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]) -> Vehicle:
     """The vehicle with the lags and the noise of N aircraft, by name as from `equipment.drawn`."""
-    channels, aircraft, actuators_of = scenario.aircraft.channels(), scenario.aircraft, vehicle.actuators
+    channels, aircraft = scenario.aircraft.channels(), scenario.aircraft
     if any(name.startswith("lag[") for name in values):
         lag = equipment.in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
-        actuators_of = actuators_of._replace(lag=jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, lag))))
-        vehicle = vehicle._replace(actuators=actuators_of)
+        vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lag=_rows(lag)))
     if any(name.startswith("noise[") for name in values):
         noise = aircraft.sensors.noise
         drawn = equipment.in_order(values, "noise", tuple(channels.outputs), noise)
-        ratios = [
-            np.asarray(value) / published if published else np.ones(1) for value, published in zip(drawn, noise, strict=True)
-        ]
-        order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
-        vehicle = vehicle._replace(noisier=jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, ratios)))[np.array(order)] - 1.0)
+        more = [value / published - 1.0 if published else 0.0 for value, published in zip(drawn, noise, strict=True)]
+        by_name = dict(zip(channels.outputs, more, strict=True))
+        vehicle = vehicle._replace(noisier=_rows([by_name[name] for name in scenario.controller.outputs]))
     return vehicle
+
+
+def _rows(values: Sequence[Any]) -> Array:
+    """Numbers, and arrays of shape (N,), as rows."""
+    return jnp.stack(jnp.broadcast_arrays(*map(jnp.asarray, values)))
 
 
 class FleetResult(NamedTuple):
