@@ -287,8 +287,8 @@ def test_search_pairs_many_channels(m: int) -> None:
 
 
 def test_search_of_many_channels_pivots() -> None:
-    """[[0, 1], [1, 1]] three times: each output responds most to an input that leaves a minor of zero."""
-    Omega: FloatArray = np.kron(np.eye(3), np.array([[0.0, 1.0], [1.0, 1.0]])).astype(np.float64)
+    """Twice a block whose largest responses, 2 2 2 in either order, leave a second minor of zero."""
+    Omega: FloatArray = np.kron(np.eye(2), np.array([[2.0, 2.0, 1.0], [2.0, 2.0, 0.0], [1.0, 0.0, 2.0]])).astype(np.float64)
     outputs, inputs, input_signs, _ = pairing_of(Omega)
     ordered = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
     np.testing.assert_array_equal(signs(ordered), np.ones(6))
