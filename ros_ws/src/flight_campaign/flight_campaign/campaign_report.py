@@ -39,7 +39,8 @@ FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
 
 OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay margin: of all inputs at once."
-    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer"
+    f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer by their A and B;"
+    " lags and delay of the controller's section"
 )
 
 
