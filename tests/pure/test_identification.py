@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Identification by step tests: systems with a response in closed form, then an aircraft of JSBSim from end to end."""
 
+import json
 import math
 import subprocess
 import sys
@@ -41,6 +42,7 @@ from flight_analysis.design.identification import (
 )
 from flight_analysis.design.requirement import Requirement
 from flight_bringup.scenarios import find_scenario
+from flight_cli import identify as identify_command
 from flight_cli.cli import application
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
@@ -339,6 +341,17 @@ def test_shipped_aircraft_fly_closer_than_prototype_did(name: str, cessna: Ident
 def rise_di(*arguments: str) -> Result:
     """`rise-di identify` in this process."""
     return CliRunner().invoke(application(["identify"]), ["identify", *arguments])
+
+
+@pytest.mark.parametrize(("name", "sections"), [("jsbsim_c172p", set()), ("jsbsim_c172p_learn", {"learn", "observer"})])
+def test_json_has_controller_of_scenario(
+    name: str, sections: set[str], cessna: IdentifiedAircraft, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = cessna._replace(text=find_scenario(name).path.read_text(encoding="utf-8"))
+    monkeypatch.setattr(identify_command, "identify_aircraft", lambda *_, **__: found)
+    output = str(tmp_path / "found.yaml")
+    result = rise_di("jsbsim:c172p", "--speed", "46.3", "--altitude", "1219.2", "--output", output, "--json")
+    assert json.loads(result.stdout)["controller"].keys() & {"learn", "observer"} == sections
 
 
 @pytest.mark.parametrize(

@@ -409,8 +409,9 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
 
 def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
     headings = [f"{name}\n{display_unit(unit).unit}" for name, unit in OUTPUTS.items()]
+    alone = ", with the gains alone" if found.scenario().rise_di().learn is not None else ""
     flights = new_table(
-        "\nFlights of 60 s in one process: rms of the error",
+        f"\nFlights of 60 s in one process{alone}: rms of the error",
         ["flight", *headings, "outcome"],
         ("flight", "outcome"),
         ("outcome",),
@@ -451,7 +452,7 @@ def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
         "sideslip_zero": found.sideslip_zero,
         "lost": found.failure,
         "delay_margin": found.selection.engineering.delay_margin,
-        "controller": found.selection.chosen.model_dump(exclude_defaults=True),
+        "controller": found.scenario().controller.model_dump(exclude_defaults=True),
         "flights": {title: flight._asdict() for title, flight in found.flights.items()},
         "scenario": str(path),
     }
