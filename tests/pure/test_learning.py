@@ -18,6 +18,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import learner as design_learner
 from flight_analysis.design.learner import Learner
+from flight_analysis.design.model_identification import Entry, Part, Prediction
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.figures import learned_figure, plot_context
 from flight_analysis.report.run_folder import read_flight
@@ -192,6 +193,28 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     identified.assert_not_called()
     made.propose(0)  # other parameters fly: the proposal was refused, or the controller fell back
     identified.assert_called_once()
+
+
+def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, start = made_learner(scenario()), scenario().rise_di()
+    better, worse = (Prediction(np.ones(4), np.ones(4), value) for value in (2.0, 1.0))
+    entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
+
+    def part(outputs: tuple[str, ...], *entries: Entry) -> Part:
+        return Part(start.inputs, outputs, entries, worse, better, "", 0.0)
+
+    whole = part(NAMES, entry, Entry("B", "p", "elevator", 0.0, 0.3, 0.01, 29.0))
+    found = [(whole,), (part(("q", "V"), entry), part(("p", "r"), entry))]
+    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=found.pop(0)))
+    monkeypatch.setattr(made, "_design", lambda *_: start)
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+    assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
+    assert made.model is not None
+    assert made.model.matrix_b()[5, 0] == pytest.approx(0.3 * 29.0)
+    refused = made.propose(0)
+    assert refused.controller is None
+    assert refused.sentence.startswith("q and V: found no model with coupling, expected one, as that which flies; p and r")
 
 
 def test_flight_without_learner_is_refused() -> None:

@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import as_yaml
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
 from control_laws.riccati import correction_of, corrections_near
@@ -104,6 +105,7 @@ def test_entries_that_matter_found_within_deviations(air: str, uncertainty: floa
 def test_innovations_of_held_out_samples_are_smaller_and_whiter(air: str, uncertainty: float) -> None:
     found = identified(air, uncertainty)
     assert found.refusal == ""
+    assert len(found.parts) == 2  # nothing is taken as coupled that is not
     assert found.after.log_likelihood > found.before.log_likelihood + 0.1
     assert np.sum(found.after.whiteness) < 0.5 * np.sum(found.before.whiteness)
     assert (found.after.rms <= 1.001 * found.before.rms).all()
@@ -132,6 +134,25 @@ def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
     pattern = r"excitation of \w: found B\[\w, \w+\] known to [\d.]+ %, expected 10 %: \w needs [\d.]+ times the amplitude"
     assert re.match(pattern, found.refusal)
+
+
+def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
+    """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll pitches it."""
+    A, B = OSPREY.matrix_a(), OSPREY.matrix_b()
+    row, aileron, elevator = OSPREY.index("p"), list(OSPREY.inputs).index("aileron"), list(OSPREY.inputs).index("elevator")
+    coupled = {"B[p, elevator]": 0.1 * B[row, aileron], "A[q, p]": 0.1 * A[OSPREY.index("q"), OSPREY.index("q")]}
+    B[row, elevator], A[OSPREY.index("q"), row] = coupled.values()
+    airframe = tmp_path / "coupled.yaml"
+    airframe.write_text(as_yaml(OSPREY.with_matrices(A, B, np.ones((8, 3)))), encoding="utf-8")
+    scenario = servo("turbulence", 0.0, duration=20.0).vary(aircraft={"airframe": str(airframe)})
+    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)
+    assert found.refusal == ""
+    assert [part.outputs for part in found.parts] == [OSPREY.outputs]
+    entries = {entry.name: entry for entry in found.entries}
+    for name, value in coupled.items():
+        assert abs(entries[name].value - value) < 3.0 * abs(entries[name].unit) * entries[name].deviation, name
+    assert found.airframe.matrix_b()[row, elevator] == pytest.approx(coupled["B[p, elevator]"], rel=0.2)
+    assert "#   B[p, elevator]: " in model_identification.model_yaml(found, "a flight")
 
 
 def test_a_log_of_another_airframe_is_refused() -> None:
@@ -261,6 +282,17 @@ def test_whiteness_is_one_for_white_noise_and_that_of_autocorrelation_for_colour
     assert whiteness(coloured, held_out[1:]).mean() == pytest.approx(expected, rel=0.03)
 
 
+def test_correlation_is_one_for_independent_noises_and_that_of_what_follows_later() -> None:
+    generator, used = np.random.default_rng(1), np.ones(20_000, dtype=bool)
+    before, noise = generator.standard_normal((2, 20_000, 20))
+    # the mean of 400 figures with a deviation of 0.32 each
+    assert model_identification.correlation(noise, before, used).mean() == pytest.approx(1.0, abs=0.05)
+    # n rho^2 with rho = 0.1 at one of 20 lags
+    following = np.vstack([np.zeros((7, 20)), 0.1 * before[:-7]]) + np.sqrt(0.99) * noise
+    found = np.diag(model_identification.correlation(following, before, used))
+    assert found.mean() == pytest.approx(1.0 + 20_000 * 0.01 / 20, rel=0.1)
+
+
 # The command
 
 
@@ -285,9 +317,10 @@ def test_command_writes_airframe_and_page_of_innovations(tmp_path: Path) -> None
     assert result.exit_code == 0
     found = identified("turbulence", 0.3)
     entries = json.loads(result.stdout)["entries"]
-    assert entries == {
-        entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation} for entry in found.entries
-    }
+    assert list(entries) == [entry.name for entry in found.entries]
+    for entry in found.entries:
+        shown = {"nominal": entry.nominal, "value": entry.value, "change": entry.error, "deviation": entry.deviation}
+        assert entries[entry.name] == shown | {"unit": entry.nominal}
     written = load_airframe(str(model))
     np.testing.assert_array_equal(written.matrix_b(), found.airframe.matrix_b())
     np.testing.assert_array_equal(written.matrix_gusts(), found.airframe.matrix_gusts())

@@ -112,14 +112,27 @@ def entry_table(title: str, entries: Iterable[Entry]) -> Table:
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
     table = new_table(f"{title}, SI; deviation: of the change, standard", headings, left=("entry",))
     for entry in entries:
-        values = f"{entry.nominal:.4g}", f"{entry.nominal * (1.0 + entry.error):.4g}"
-        table.add_row(escape(entry.name), *values, f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}")
+        values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
+        if entry.nominal:
+            percent = f"{100 * entry.error:+.1f}", f"{100 * entry.deviation:.1f}"
+        else:  # it is new: there is no change in %
+            percent = "", f"{100 * entry.deviation / abs(entry.error or 1.0):.1f}"
+        table.add_row(escape(entry.name), *values, *percent)
     return table
 
 
 def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
-    """Entries of A and B by name."""
-    return {entry.name: {"nominal": entry.nominal, "change": entry.error, "deviation": entry.deviation} for entry in entries}
+    """Entries of A and B by name, nominal and identified in SI; change and its deviation in units, that of an entry in SI."""
+    return {
+        entry.name: {
+            "nominal": entry.nominal,
+            "value": entry.value,
+            "change": entry.error,
+            "deviation": entry.deviation,
+            "unit": entry.unit,
+        }
+        for entry in entries
+    }
 
 
 def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wrapped: Container[str] = ()) -> Table:

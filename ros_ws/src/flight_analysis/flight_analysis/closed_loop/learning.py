@@ -36,7 +36,7 @@ Learn = Callable[[RiseDiConfig], Learner]
 
 
 class Entry(Protocol):
-    """An entry of A or B that was identified: its nominal value in SI, its relative error and the deviation of that."""
+    """An entry of A or B that was identified."""
 
     @property
     def name(self) -> str:
@@ -48,15 +48,23 @@ class Entry(Protocol):
 
     @property
     def nominal(self) -> float:
-        """Of the rough airframe."""
+        """Before the flight, SI."""
+
+    @property
+    def value(self) -> float:
+        """After the flight, SI."""
+
+    @property
+    def unit(self) -> float:
+        """Of error and deviation, SI: the nominal value where it is not 0."""
 
     @property
     def error(self) -> float:
-        """Of the nominal value, 1."""
+        """Of the nominal value, units."""
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of the error, 1."""
+        """Standard deviation of the error, units."""
 
 
 class Learned(NamedTuple):
@@ -69,8 +77,8 @@ class Learned(NamedTuple):
 def learned(entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool) -> Learned:
     """What an identification found, and whether it became a proposal."""
     kept = [entry for entry in entries if entry.row in outputs]
-    channels = {f"value.{entry.name}": entry.nominal * (1.0 + entry.error) for entry in kept}
-    channels |= {f"deviation.{entry.name}": abs(entry.nominal) * entry.deviation for entry in kept}
+    channels = {f"value.{entry.name}": entry.value for entry in kept}
+    channels |= {f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in kept}
     return Learned(("proposed", *channels), np.array([float(proposed), *channels.values()]))
 
 
@@ -79,6 +87,7 @@ class Identifications:
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
         self._learner, self._outputs, self._last = learner, outputs, None
+        self._names: tuple[str, ...] = ()
 
     def next(self, proposal: Proposal) -> Learned | None:
         """That of a proposal; None where nothing was identified."""
@@ -86,7 +95,9 @@ class Identifications:
         if found is None or found is self._last:
             return None
         self._last = found
-        return learned(found.entries, self._outputs, proposed=proposal.controller is not None)
+        entries = {entry.name: entry for entry in found.entries if entry.nominal}
+        self._names = self._names or tuple(entries)  # a topic keeps its channels: those of the rough airframe
+        return learned((entries[name] for name in self._names), self._outputs, proposed=proposal.controller is not None)
 
 
 def as_received(proposal: Proposal, start: RiseDiConfig, end_ns: int, flown: int) -> ReceivedProposal:

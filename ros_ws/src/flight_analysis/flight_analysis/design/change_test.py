@@ -56,8 +56,8 @@ def change_test(
         outputs = tuple(flown.outputs[i] for i in block.outputs)
         delay = (delays or {}).get(outputs, actuation.delay)
         search = _search(recorded, flown, actuation, block, delay)
-        near = np.array([max(deviation.get(entry.name, 0.0), LEAST_DEVIATION) for entry in search.nominal_entries()])
         free = np.full(search.count, FREE_DEVIATION)
+        near = np.clip([deviation.get(entry.name, 0.0) for entry in search.nominal_entries()], LEAST_DEVIATION, free)
         same, changed = _least(search, near), _least(search, free, starts=STARTS)
         if not np.array_equal(same.levels, changed.levels):
             # what another wind explains is no change: both hypotheses have the winds of both

@@ -304,4 +304,10 @@ def blocks(model: NominalModel) -> list[Block]:
     found = [Block(*(np.flatnonzero(part == label) for part in parts)) for label in np.unique(labels)]
     if all(len(block.inputs) == len(block.outputs) > 0 for block in found):
         return found
-    return [Block(*(np.arange(len(part)) for part in parts))]
+    return [whole(model)]
+
+
+def whole(model: NominalModel) -> Block:
+    """All of an aircraft as one part."""
+    (n, m), G = model.B.shape, model.wind.shape[1]
+    return Block(*map(np.arange, (n, m, m, G)))

@@ -22,7 +22,6 @@ from flight_analysis.design.model_identification import (
     KNOWN,
     MAX_WHITENESS,
     PRIOR,
-    Entry,
     Identification,
     Part,
     Unknown,
@@ -162,15 +161,21 @@ class Learner:
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
         for part in identified.parts:
-            if part.outputs in gone:
+            if any(is_within(part.outputs, without) or is_within(without, part.outputs) for without in gone):
+                continue
+            if any(is_within(part.outputs, whole) for whole in known.keys() - {part.outputs}):
+                refusals.append(
+                    f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that which flies"
+                )
                 continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
             if not rough and (refusal := part.refusal or not_white(part)):
                 refusals.append(refusal)
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
-            model = with_entries(model, relative(entries, self._prior, model))
-            deviation = {entry.name: entry.deviation / (1.0 + entry.error) for entry in entries}
+            model = with_entries(model, entries)
+            deviation = {entry.name: abs(entry.deviation * entry.unit / entry.value) for entry in entries if entry.value}
+            known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
             known[part.outputs] = Known(end_ns, deviation, self._actuation.delay if rough else part.delay)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
@@ -181,8 +186,9 @@ class Learner:
             proposed = self._designed(model, known, gone)
         except ParameterError as error:
             return Proposal(None, str(error))
-        learned = {part for part, value in known.items() if value.end_ns == end_ns}
-        self._known, self._model, self._dead, self._changed = known, model, gone, self._changed - learned - gone.keys()
+        new = [*gone, *(part for part, value in known.items() if value.end_ns == end_ns)]
+        self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
+        self._known, self._model, self._dead = known, model, gone
         self._proposed = proposed.digest()
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
@@ -259,16 +265,9 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
     return designed.model_copy(update=changed)
 
 
-def relative(entries: Iterable[Entry], prior: Airframe, model: Airframe) -> list[Entry]:
-    """Entries whose errors count from the matrices of a model in place of those of the prior."""
-    matrices = {"A": (prior.matrix_a(), model.matrix_a()), "B": (prior.matrix_b(), model.matrix_b())}
-    moved = []
-    for entry in entries:
-        before, now = matrices[entry.matrix]
-        columns = list(model.states if entry.matrix == "A" else model.inputs)
-        place = model.index(entry.row), columns.index(entry.column)
-        moved.append(entry._replace(error=(1.0 + entry.error) * before[place] / now[place] - 1.0))
-    return moved
+def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
+    """Whether the outputs of a part are among those of another."""
+    return set(part) <= set(whole)
 
 
 def explains(found: Part) -> bool:
@@ -289,5 +288,6 @@ def not_white(found: Part) -> str:
 def sentence(found: Part) -> str:
     """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with deviations."""
     effects = (entry for entry in found.entries if entry.matrix == "B" and entry.row in found.outputs)
-    known = (entry for entry in effects if entry.deviation < PRIOR / 2.0)
-    return ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
+    known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
+    text = ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
+    return text if all(entry.nominal for entry in found.entries) else f"{text}, with coupling"

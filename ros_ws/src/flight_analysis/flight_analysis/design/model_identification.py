@@ -34,12 +34,17 @@ from flight_analysis.design.innovation_filters import (
     delayed,
     filter_bank,
     filter_model,
+    whole,
 )
 from flight_core.vectors import FloatArray
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
 MAX_ERROR = 0.6  # 1, bound of a relative error: two standard deviations
+
+FOLLOWS = 10.0  # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up to 3
+COUPLED_GAIN = 20.0  # of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
+COUPLING = 0.34  # of the largest effect on a row, unit of an entry that is 0: a deviation of 10 % before the flight
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
 DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
@@ -111,14 +116,28 @@ class Fit(NamedTuple):
     levels: NDArray[np.int64]  # (spans,) of the wind, with the identified model
 
 
-def uncertain(model: NominalModel) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Masks of the entries of A and B that are identified: all that are not 0, but for the rows of angles."""
-    free = model.kinematic[:, None] == 0.0
-    return (model.A != 0.0) & free, (model.B != 0.0) & free
+def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, FloatArray]:
+    """Units of the errors of A and B, SI, 0 for an entry that is known: nominal values, and 0 in the rows of angles.
+
+    If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in units of motion; the columns of
+    angles stay 0.
+    """
+    free, turned = model.kinematic[:, None] == 0.0, model.kinematic == 0.0
+    of_A, of_B = np.where(free, model.A, 0.0), np.where(free, model.B, 0.0)
+    if coupled:
+        largest_A = np.max(np.abs(of_A) * model.size, axis=1, keepdims=True) / model.size * turned
+        largest_B = np.max(np.abs(of_B), axis=1, keepdims=True)
+        of_A, of_B = (
+            np.where((part == 0.0) & free, COUPLING * largest, part) for part, largest in ((of_A, largest_A), (of_B, largest_B))
+        )
+    return of_A, of_B
 
 
 class Entry(NamedTuple):
-    """An entry of A or B: its nominal value in SI, its relative error, and the standard deviation of that after the flight."""
+    """An entry of A or B: its nominal value in SI, its relative error, and the standard deviation of that after the flight.
+
+    Where the nominal value is 0 both are in parts of another `unit`.
+    """
 
     matrix: str
     row: str
@@ -126,11 +145,17 @@ class Entry(NamedTuple):
     nominal: float
     error: float
     deviation: float
+    unit: float  # of error and deviation, SI: the nominal value where it is not 0
 
     @property
     def name(self) -> str:
         """Such as B[q, elevator]."""
         return f"{self.matrix}[{self.row}, {self.column}]"
+
+    @property
+    def value(self) -> float:
+        """After the flight, SI."""
+        return self.nominal + self.unit * self.error
 
 
 class Search:
@@ -145,16 +170,19 @@ class Search:
         delay: float,
         unknown: Unknown = KNOWN,
         factor: int | None = None,
+        *,
+        coupled: bool = False,
     ) -> None:
         """The prior of each error of A is PRIOR; `believe` replaces it. The delay of u is `delay`, s, where it is known.
 
-        The starts of the search take means of `factor` periods, by default of the shortest lag.
+        The starts of the search take means of `factor` periods, by default of the shortest lag. If `coupled`, the entries that
+        are 0 are identified too.
         """
         factor = max(int(float(np.min(model.lag)) / recorded.period + 1e-9), 1) if factor is None else factor
         self.coarse = self
         if factor > 1:
             slow = model._replace(noise=model.noise / np.sqrt(factor), period=factor * recorded.period)
-            self.coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1)
+            self.coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1, coupled=coupled)
         self._period = recorded.period
         self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
         self._drift = unknown.drift
@@ -166,7 +194,8 @@ class Search:
         self._y, self._u = recorded.y[:, block.outputs], recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
-        of_A, of_B = (int(mask.sum()) for mask in uncertain(self._model))
+        self._units = units(self._model, coupled=coupled)
+        of_A, of_B = map(np.count_nonzero, self._units)
         self.count = of_A + of_B  # of the entries that are identified
         self.believe(np.repeat([PRIOR, unknown.effect], [of_A, of_B]))
 
@@ -187,12 +216,10 @@ class Search:
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that acts by the model's own A."""
-        matrices, masks = [], uncertain(self._model)
-        of_A, of_B = (int(mask.sum()) for mask in masks)
-        parts = np.split(thetas, [of_A, of_A + of_B], axis=1)[:2]
-        for matrix, mask, part in zip((self._model.A, self._model.B), masks, parts, strict=True):
+        matrices, parts = [], np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
+        for matrix, unit, part in zip((self._model.A, self._model.B), self._units, parts, strict=True):
             changed = np.tile(matrix, (len(thetas), 1, 1))
-            changed[:, mask] *= 1.0 + part
+            changed[:, unit != 0.0] += unit[unit != 0.0] * part
             matrices.append(changed)
         whole, x = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1)), self._block.states
         whole[:, x[:, None], x] = matrices[0]
@@ -260,6 +287,7 @@ class Search:
         progress: Callable[[], None] = lambda: None,
         starts: Sequence[int] = STARTS,
         levels: NDArray[np.int64] | None = None,
+        begin: FloatArray | None = None,
     ) -> Fit:
         """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2 where `used`, (T,).
 
@@ -267,10 +295,35 @@ class Search:
         wind explains a wrong model. So the search begins several times, with a level of `starts` in a span, on means over
         the shortest lag. From the REFINED best starts, or 0, the search goes on with the level of a span by theta, or with
         `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
-        a few gusts.
+        a few gusts. With a theta to `begin` at, (p,), it begins there alone.
         """
+        if begin is None:
+            ends = self._ends(starts, used, levels, progress)
+        else:
+            theta, coarse = np.clip(begin, self._lower, self.bound), self.coarse
+            fitted, free = coarse.fitted(), np.ones(len(begin), dtype=bool)
+            for _ in range(START_STEPS):
+                progress()
+                theta, _, progressed = coarse._step(theta, coarse.levels(theta), fitted, free)
+                if progressed < START_PROGRESS:
+                    break
+            ends = [self._refined(theta, levels, used, progress)]
+        _, theta, hessian = min(ends, key=lambda end: end[0])
+        deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
+        nominal = np.where(self._errors, 0.0, theta)
+        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
+        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+
+    def _ends(
+        self,
+        starts: Sequence[int],
+        used: NDArray[np.bool_],
+        levels: NDArray[np.int64] | None,
+        progress: Callable[[], None],
+    ) -> list[tuple[float, FloatArray, FloatArray]]:
+        """Costs, thetas and Hessians at the ends of the search from the best starts."""
         coarse = self.coarse
-        fitted = coarse.known() & ~held_out(len(coarse._y), coarse._spans[0].stop)
+        fitted = coarse.fitted()
         fixed = np.ones(len(self.prior), dtype=bool)
         fixed[self._winds] = False
         found = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
@@ -283,12 +336,7 @@ class Search:
                     break
             found.append((coarse.cost(theta, fitted), theta))
         best = sorted(found, key=lambda start: start[0])[:REFINED]
-        refined = [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
-        _, theta, hessian = min(refined, key=lambda end: end[0])
-        deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
-        nominal = np.where(self._errors, 0.0, theta)
-        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
-        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+        return [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
 
     def _refined(
         self,
@@ -340,10 +388,27 @@ class Search:
     def nominal_entries(self) -> list[Entry]:
         """The entries of A and B that are identified, before the flight."""
         places = []
-        for matrix, mask, columns in zip("AB", uncertain(self._model), (self.names.states, self.names.inputs), strict=True):
+        for matrix, unit, columns in zip("AB", self._units, (self.names.states, self.names.inputs), strict=True):
             values = self._model.A if matrix == "A" else self._model.B
-            places += [(matrix, self.names.states[i], columns[j], float(values[i, j])) for i, j in np.argwhere(mask)]
-        return [Entry(*place, 0.0, deviation) for place, deviation in zip(places, self.prior.tolist(), strict=False)]
+            places += [
+                Entry(matrix, self.names.states[i], columns[j], float(values[i, j]), 0.0, 0.0, float(unit[i, j]))
+                for i, j in np.argwhere(unit)
+            ]
+        return [place._replace(deviation=deviation) for place, deviation in zip(places, self.prior.tolist(), strict=False)]
+
+    def named(self) -> list[str]:
+        """Names of the parameters theta, (p,): those of the entries, the winds, the angles, the delay."""
+        angles = [self.names.states[k] for k in self._angles]
+        names = [entry.name for entry in self.nominal_entries()]
+        return names + [*self.names.winds, *angles, "delay"][: len(self.prior) - len(names)]
+
+    def joined(self, parts: Iterable[tuple["Search", Fit]]) -> FloatArray:
+        """Theta, (p,), from those of parts: the mean where several have a parameter, 0 where none has it."""
+        known: dict[str, list[float]] = {}
+        for part, fit in parts:
+            for name, value in zip(part.named(), fit.theta.tolist(), strict=True):
+                known.setdefault(name, []).append(value)
+        return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
@@ -355,6 +420,10 @@ class Search:
     def known(self) -> NDArray[np.bool_]:
         """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
         return np.isfinite(self._y).all(axis=1) & (np.arange(len(self._y)) >= TRANSIENT / self._period - 0.5)
+
+    def fitted(self) -> NDArray[np.bool_]:
+        """Mask of the samples that fit the model, (T,)."""
+        return self.known() & ~held_out(len(self._y), self._spans[0].stop)
 
     def _counted(self, theta: FloatArray, levels: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Mask of the samples to count, (T,): not of spans without a level to explain them, nor of gusts if these are FEW.
@@ -469,12 +538,16 @@ def identify(
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every, done = blocks(model), count(1)
-    total = len(every) * (len(STARTS) * START_STEPS + REFINED * STEPS)
+    total = len(every) * (len(STARTS) * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
-    parts, before, after = [], [], []
-    for block in every:
-        search = Search(recorded, model, block, airframe, actuation.delay, unknown)
-        fit = search.fit(known & ~validating, lambda: progress(completed=next(done), total=total))
+
+    def search_of(block: Block, *, coupled: bool = False) -> Search:
+        return Search(recorded, model, block, airframe, actuation.delay, unknown, coupled=coupled)
+
+    def step() -> None:
+        progress(completed=next(done), total=total)
+
+    def part_of(search: Search, fit: Fit) -> Part:
         outputs, entries = search.names.outputs, search.entries(fit)
         predictions = prediction(fit.before, validating), prediction(fit.after, validating)
         sentences = (
@@ -484,10 +557,21 @@ def identify(
             no_better(*predictions),
         )
         refusal, delay = next(filter(None, sentences), ""), recorded.period * search.delay(fit)
-        parts.append(Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay))
-        before.append(fit.before)
-        after.append(fit.after)
-    first, last = joined(before, every), joined(after, every)
+        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay)
+
+    found = [(search, search.fit(known & ~validating, step)) for search in map(search_of, every)]
+    parts = [part_of(*each) for each in found]
+    first, last = (joined([getattr(fit, key) for _, fit in found], every) for key in ("before", "after"))
+    others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
+    follows = [correlation(fit.after.normalised, u, known) for (_, fit), u in zip(found, others, strict=True)]
+    if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
+        search = search_of(whole(model), coupled=True)
+        fit = search.fit(known & ~validating, step, begin=search.joined(found))
+        part = part_of(search, fit)
+        gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
+        white = part.after.whiteness.max() <= MAX_WHITENESS
+        if white and not part.refusal and gain * validating.sum() > COUPLED_GAIN:
+            parts, first, last = [part], fit.before, fit.after
     identified = with_entries(airframe, (entry for part in parts for entry in part.entries))
     figures = prediction(first, validating), prediction(last, validating)
     return Identification(identified, recorded, validating, (first.r, last.r), *figures, tuple(parts))
@@ -499,9 +583,9 @@ def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
     for entry in entries:
         row = airframe.index(entry.row)
         if entry.matrix == "A":
-            A[row, airframe.index(entry.column)] *= 1.0 + entry.error
+            A[row, airframe.index(entry.column)] = entry.value
         else:
-            B[row, list(airframe.inputs).index(entry.column)] *= 1.0 + entry.error
+            B[row, list(airframe.inputs).index(entry.column)] = entry.value
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
@@ -526,11 +610,20 @@ def whiteness(e: FloatArray, held_out: NDArray[np.bool_]) -> FloatArray:
     It is 1 for white noise, with a standard deviation of sqrt(2 / LAGS). Arguments: e (T, m), held_out (T,). Source: G. M.
     Ljung, G. E. P. Box, Biometrika 65(2), 1978, here for the pairs within the held-out spans.
     """
-    kept = np.where(held_out[:, None], e, 0.0)
-    power, total = np.sum(kept**2, axis=0) / held_out.sum(), np.zeros(e.shape[1])
+    return np.diag(correlation(e, e, held_out))
+
+
+def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
+    """Mean of n_k rho_k^2 over the lags k = 1 .. LAGS, (m, k), rho_k the correlation of e with what was k samples `before`.
+
+    It is 1 for independent white noises. Arguments: e (T, m), before (T, k), `used` (T,), mask of n samples.
+    """
+    now, then = (np.where(used[:, None], values, 0.0) for values in (e, before))
+    power = np.outer(*(np.sum(values**2, axis=0) / used.sum() for values in (now, then)))
+    total = np.zeros_like(power)
     for lag in range(1, LAGS + 1):
-        pairs = max(int(np.sum(held_out[lag:] & held_out[:-lag])), 1)
-        total += np.sum(kept[lag:] * kept[:-lag], axis=0) ** 2 / pairs / power**2
+        pairs = max(int(np.sum(used[lag:] & used[:-lag])), 1)
+        total += (now[lag:].T @ then[:-lag]) ** 2 / pairs / power
     return np.asarray(total / LAGS)
 
 
@@ -542,7 +635,12 @@ def model_yaml(found: Identification, origin: str) -> str:
         figures = zip(found.airframe.outputs, prediction.rms, prediction.whiteness, strict=True)
         lines.append(f"  {name}: " + ", ".join(f"{output} {rms:.3g}, {white:.3g}" for output, rms, white in figures))
     lines += ["", f"Changes of entries and their standard deviations in %, {100 * PRIOR:g} before the flight:"]
-    lines += [f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}" for entry in found.entries]
+    lines += [
+        f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}" for entry in found.entries if entry.nominal
+    ]
+    if between := [entry for entry in found.entries if not entry.nominal]:
+        lines += ["", "Entries between parts that do not couple in the nominal airframe, and their standard deviations, SI:"]
+        lines += [f"  {entry.name}: {entry.value:.3g}, {entry.unit * entry.deviation:.3g}" for entry in between]
     return "".join(f"# {line}".rstrip() + "\n" for line in lines) + as_yaml(found.airframe)
 
 
@@ -551,7 +649,7 @@ def model_yaml(found: Identification, origin: str) -> str:
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
     """The output whose inputs are known worst, if the best known effect on it has a deviation above MAX_DEVIATION."""
-    effects = [entry for entry in entries if entry.matrix == "B"]
+    effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
     best = [min((entry for entry in effects if entry.row == output), key=lambda one: one.deviation) for output in outputs]
     worst = max(best, key=lambda one: one.deviation)
     if worst.deviation <= MAX_DEVIATION:
