@@ -145,10 +145,12 @@ def test_second_and_late_proposals_are_refused() -> None:
     flight.step()
     flight.receive()
     flight.receive(stamp_ns=END_NS - nanoseconds(31.0))  # of a learner that was stopped
+    flight.receive(stamp_ns=END_NS + 1)  # of another clock
     assert [sentence.partition(", expected ")[2] for sentence in flight.sentences] == [
         "one at a time",
         "",
         "one that ends at least 2.5 s after that of the last proposal",
+        "0 to 30 s",
         "0 to 30 s",
     ]
     flight.now_ns += nanoseconds(5.0)
