@@ -164,7 +164,8 @@ def read_file(path: Path, key: str, expected: str) -> bytes:
         with open_nonblocking(path) as stream:
             content = stream.read(MAX_FILE_BYTES + 1)
     except (OSError, ValueError) as error:
-        raise ParameterError(f"{key}: cannot be read ({error}), expected {expected}") from None
+        reason = (isinstance(error, OSError) and error.strerror) or error  # the key names the file
+        raise ParameterError(f"{key}: cannot be read ({reason}), expected {expected}") from None
     return limited(content, key, expected)
 
 
