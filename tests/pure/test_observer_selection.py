@@ -141,6 +141,8 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(observer_selection, "MAX_RELAXATION", 1.2)  # the search up to 18 takes half a minute
     with pytest.raises(ParameterError, match=r"^--margin: delay margin \(ms\): found .*, expected at least 500"):
         with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.5)
+    with pytest.raises(ParameterError, match=r"^--margin: found factors with a product of 1, expected less than 1$"):
+        with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.03, uncertain=False, below=1.0)
     with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
         with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)
     calm = OSPREY.model_copy(update={"gusts": {}})

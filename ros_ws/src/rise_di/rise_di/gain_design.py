@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,6 +17,7 @@ from flight_analysis.design.effectors import LAW_INPUT, Effectors, design_alloca
 from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import (
+    SelectedObserver,
     gains_beside_sketch,
     gains_by_rule,
     gains_of_search,
@@ -306,19 +308,20 @@ def observed(
         origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
         of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
         candidates = list(zip(of_search, origins, strict=True))
-    selected, refusal = [], None
+    selected: tuple[SelectedObserver, str] | None = None
+    refusal, least = None, math.inf
     for gains, origin in candidates:
-        try:
+        try:  # of those that need the least relaxation the first, which has the least cost
             found = with_aircraft_observer(
-                controller, model, gains, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds
+                controller, model, gains, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds, below=least
             )
-            selected.append((found, origin))
+            selected, least = (found, origin), float(np.prod(found.relaxation))
         except ParameterError as error:  # another gain set may have the margin
             refusal = error
-    if refusal is not None and not selected:
+    if selected is None:
+        assert refusal is not None  # noqa: S101 - there is a candidate
         raise refusal
-    # the first, of the least cost, where several need none
-    found, origin = min(selected, key=lambda one: float(np.prod(one[0].relaxation)))
+    found, origin = selected
     factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
     lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""

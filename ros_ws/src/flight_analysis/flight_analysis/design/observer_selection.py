@@ -8,6 +8,7 @@ then `effort` is raised, and K and the integral are lowered, in the channel in w
 the extended-state observer are taken as slower.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from types import MappingProxyType
@@ -24,10 +25,12 @@ from control_laws.observer_design import (
     ExtendedStateWeights,
     Names,
     ObserverDesign,
+    ObserverModel,
     Weights,
     aircraft_model,
     aircraft_observer,
     extended_state_observer,
+    feedback_gain,
     vane_correction,
 )
 from flight_analysis.closed_loop.margins import law_order, loop_of
@@ -159,13 +162,14 @@ def with_aircraft_observer(
     *,
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
+    below: float = math.inf,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
     `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
     WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
     a schedule then, and the margins at these speeds too. Raises ParameterError for an airframe with another D or without a
-    wind, one that a feedforward refuses, and for margins that no relaxation reaches.
+    wind, one that a feedforward refuses, and for margins that no relaxation with a product `below` this reaches.
     """
     require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
     rows, columns = law_order(airframe, controller)
@@ -175,7 +179,9 @@ def with_aircraft_observer(
     names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
 
     def designer(model: NominalModel) -> Callable[[FloatArray], ObserverDesign]:
-        return lambda slower: aircraft_observer(model, names, gains.weights._replace(effort=slower * gains.weights.effort))
+        observer = aircraft_observer(model, names, gains.weights)
+        sampled = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
+        return lambda slower: observer._replace(F=feedback_gain(sampled, model, slower * gains.weights.effort))
 
     def at(ratio: float) -> AtSpeed:
         frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
@@ -194,7 +200,7 @@ def with_aircraft_observer(
     read = [[float(name == state) for state in airframe.states] for name in vanes]
     plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *read]))
     section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
-    selected = _within_margin(base, model, plant, gains, designer(model), margin, needed, section, others)
+    selected = _within_margin(base, model, plant, gains, designer(model), margin, needed, section, others, below)
     if not others:
         return selected
     slow, fast = (there.model(selected.relaxation).model_dump() for there in others)
@@ -344,6 +350,7 @@ def _within_margin(
     needed: Requirement,
     vanes: VanesConfig | None = None,
     others: Sequence[AtSpeed] = (),
+    below: float = math.inf,
 ) -> SelectedObserver:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
@@ -354,45 +361,60 @@ def _within_margin(
     m, nominal = len(model.lag), LinearPlant(plant.A[0], plant.B[0], plant.C)
     needed = above_zeros(needed, nominal)
 
-    def assessed(controller: RiseDiConfig, plant: LinearPlant) -> tuple[float, float, float]:
-        """Delay margin, least phase margin, and the least of what is found over what is needed, with any vanes in use."""
-        delays, phases, parts = [], [], []
-        for law in _laws(controller):
-            delays.append(delay_margin(plant, law, loop, longest=DELAYS * margin))
-            margins = loop_margins(plant, law, loop_of(controller), together=False)
-            phases.append(float(margins.phase.min()))
-            parts.append(least_fraction(margins, needed))
-        of_delay = min(delays) / (margin + RESOLUTION) if margin > 0.0 else 1.0
-        return min(delays), min(phases), min(of_delay, *parts)
+    def delayed(controller: RiseDiConfig, plant: LinearPlant) -> tuple[list[LinearLaw], float]:
+        """The laws with any vanes in use, and the least delay margin, s."""
+        laws = _laws(controller)
+        return laws, min(delay_margin(plant, law, loop, longest=DELAYS * margin) for law in laws)
 
-    def relaxed(relaxation: FloatArray) -> SelectedObserver:
-        controller = _parameters(base, model, gains, design(relaxation), relaxation, vanes)
-        delay, phase, fraction = assessed(controller, nominal)
-        elsewhere = [assessed(there.flown(controller, relaxation), there.plant)[2] for there in others]
-        return SelectedObserver(controller, delay, phase, min([fraction, *elsewhere]), relaxation)
+    def of_delay(delay: float) -> float:
+        return delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
+
+    def of_margins(controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant) -> tuple[float, float]:
+        """The least phase margin, and the least of what is found over what is needed beside the delay margin."""
+        each = [loop_margins(plant, law, loop_of(controller), together=False) for law in laws]
+        return min(float(margins.phase.min()) for margins in each), min(least_fraction(margins, needed) for margins in each)
+
+    def assessed(there: AtSpeed, controller: RiseDiConfig, relaxation: FloatArray) -> float:
+        flown = there.flown(controller, relaxation)
+        laws, delay = delayed(flown, there.plant)
+        return min(of_delay(delay), of_margins(flown, laws, there.plant)[1])
+
+    def best(relaxations: FloatArray) -> SelectedObserver:
+        """The first of those with the largest fraction; margins only where the delay margin does not rule them out."""
+        controllers = [_parameters(base, model, gains, design(relaxation), relaxation, vanes) for relaxation in relaxations]
+        each, found = [delayed(controller, nominal) for controller in controllers], dict[int, SelectedObserver]()
+        for k in sorted(range(len(each)), key=lambda k: -of_delay(each[k][1])):
+            (laws, delay), controller, relaxation = each[k], controllers[k], relaxations[k]
+            if found and of_delay(delay) < max(candidate.fraction for candidate in found.values()):
+                break
+            phase, fraction = of_margins(controller, laws, nominal)
+            elsewhere = (assessed(there, controller, relaxation) for there in others)
+            fraction = min([of_delay(delay), fraction, *elsewhere])
+            found[k] = SelectedObserver(controller, delay, phase, fraction, relaxation)
+        return max((found[k] for k in sorted(found)), key=lambda candidate: candidate.fraction)
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
         each = (loop_margins(uncertain, law, loop_of(controller), together=False) for law in _laws(controller))
         return np.asarray(np.min([margins.phase.min(axis=0) for margins in each], axis=0))
 
-    def stepped(channel: int) -> SelectedObserver:
-        return relaxed(selected.relaxation * RELAXATION ** np.eye(m)[channel])
-
-    selected = relaxed(np.ones(m))
+    steps = RELAXATION ** np.eye(m)
+    selected = best(np.ones((1, m)))
     fractions = [selected.fraction]
     while True:
+        factor = float(np.prod(selected.relaxation))
+        require(factor < below, "--margin", f"factors with a product of {factor:.3g}", f"less than {below:.3g}")
         ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
         if selected.relaxation.max() > MAX_RELAXATION or ended:
             lacking = _lacking(selected, nominal, loop, margin, needed)
             elsewhere = "speeds: found less than the margins at another speed, expected speeds nearer to that of the trim"
             raise ParameterError(elsewhere if others and not lacking else f"--margin: {lacking or _phases(needed)}")
         if selected.fraction < 1.0:
-            best = max((stepped(channel) for channel in range(m)), key=lambda candidate: candidate.fraction)
-            selected = best if best.fraction > selected.fraction else relaxed(selected.relaxation * RELAXATION)
+            stepped = best(selected.relaxation * steps)
+            selected = stepped if stepped.fraction > selected.fraction else best(selected.relaxation[None] * RELAXATION)
             fractions.append(selected.fraction)
         elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
-            selected, fractions = stepped(int(np.argmin(worst))), []
+            selected, fractions = best(selected.relaxation * steps[[int(np.argmin(worst))]]), []
         else:
             break
     checked = selected.controller.model_dump()
