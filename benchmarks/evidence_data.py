@@ -16,6 +16,7 @@ from typing import NamedTuple
 REPOSITORY = Path(__file__).resolve().parents[1]
 FOLDER = REPOSITORY / "docs" / "evidence"
 BASELINE = " x baseline"  # end of a goal on a ratio
+DIRTY = "-dirty"  # end of a revision with changes that are not committed
 BUSY = "busy with other work"  # end of a host on which times are longer than on an idle host
 
 
@@ -124,10 +125,11 @@ def origin(command: str) -> Origin:
     return Origin(command, revision(), host(), f"{datetime.now(UTC):%Y-%m-%d %H:%M UTC}")
 
 
-def revision() -> str:
-    """The commit, with -dirty if any file but the evidence differs from the commit."""
-    changed = _git("status", "--porcelain", "--", ".", ":(exclude)docs/evidence*").strip()
-    return _git("describe", "--always").strip() + ("-dirty" if changed else "")
+def revision(*paths: str) -> str:
+    """The commit, with DIRTY if any file but the evidence differs from the commit; of `paths` the last that touched them."""
+    changed = _git("status", "--porcelain", "--", *(paths or (".", ":(exclude)docs/evidence*"))).strip()
+    commit = _git("log", "-1", "--format=%h", "--", *paths) if paths else _git("describe", "--always")
+    return commit.strip() + (DIRTY if changed else "")
 
 
 def _git(*arguments: str) -> str:

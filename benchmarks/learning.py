@@ -2,16 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's model and the true one.
 
-python -m benchmarks.learning --aircraft 20                    # every cell; run again, it flies what is missing
-python -m benchmarks.learning --aircraft 20 --cell turbulence  # of one cell
+python -m benchmarks.learning                                     # every cell, 60 aircraft: 90 min of two cores of a host
+python -m benchmarks.learning --aircraft 6                        # with fewer; run again, it flies what is missing
+python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
 
 An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
-osprey_observer, as the others do. A row an aircraft goes to build/learning.csv. The figures go to docs/evidence/learning.csv,
-and the picture to docs/images/learning.png.
+osprey_observer, as the others do, and as the laws of `rise-di compare` do with their gains for the airframe file. A row an
+aircraft goes to build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where
+the airs of both uncertainties were, the picture goes to docs/images/learning.png. Two minutes a learning aircraft go by on
+one core; flights without damage, for false alarms, are at most two of 600 s in each air.
 """
 
 import csv
 import math
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -31,14 +35,17 @@ from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.turbulence import MODERATE
-from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
+from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, sampled_matrices, wind_factors
+from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.learning import Learn, Learner, Proposal
 from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
+from flight_campaign import fleet, tuning
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
+from flight_campaign.tuned_gains import load, tuned_file
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
@@ -54,6 +61,7 @@ REPOSITORY = Path(__file__).parents[1]
 IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
 SEED = 11  # of the aircraft
 LEARNED, DAMAGED, SETTLED, END = 64.0, 60.0, 75.0, 100.0  # s: when the last model flies; the fault, and what counts after it
+UPDATE = 1.0  # s, of a core, for the two parts of the osprey
 LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
 REPEATED = 35.0  # s, after which the commands of osprey_learn come again
 ROUGH = 0.6  # deviation of the logarithms of the entries of a rough prior
@@ -62,6 +70,9 @@ ALARM_FLIGHT = 600.0  # s
 COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
 LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
 PALETTE = 32  # colours of the picture
+RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "lqg", "rise_observer"), "gust_turbulence"
+"""Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file in the loop of osprey_servo.
+MRAC measures the full state, and INDI the actuators too."""
 TRAIN = {  # m/s, m, s: a gust every 3 to 7 s
     "vertical": {"start": 1.0, "speed": 8.0, "length": 15.0, "every": 4.7},
     "lateral": {"start": 2.5, "speed": 5.0, "length": 12.0, "every": 6.1},
@@ -84,6 +95,7 @@ class Cell(NamedTuple):
     air: str
     uncertainty: float
     share: float = 1.0  # of --aircraft
+    most: int = sys.maxsize  # aircraft
 
 
 CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbulence", "gusts", "calm") for p in (0.3, 0.5)} | {
@@ -92,7 +104,7 @@ CELLS = {f"{air}, +-{100 * p:.0f} %": Cell("learn", air, p) for air in ("turbule
     "u late": Cell("late", "turbulence", 0.3, 0.25),
     "weak": Cell("weak", "turbulence", 0.3, 0.5),
     "dead": Cell("dead", "turbulence", 0.3, 0.5),
-    **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1) for air in AIR},
+    **{f"alarms in {air}": Cell("alarm", air, 0.3, 0.1, 2) for air in AIR},
 }
 
 
@@ -120,17 +132,18 @@ class Row(NamedTuple):
     found: str = ""  # the input found to be without effect
     found_at: float = math.nan  # s
     lost: int = 0  # 1: with the learner alone of the two
-    identification: float = 0.0  # s of a core, the longest
+    update: float = 0.0  # s of a core, mean: identification, test for a change and design
+    longest: float = 0.0  # s of a core, the same
     replayed: int = 0
     events: str = ""
     revision: str = ""  # of the code that flew
 
 
 class Timed:
-    """A learner, and how long its longest step takes on one core."""
+    """A learner, and how long its steps take on one core."""
 
     def __init__(self, own: Learner) -> None:
-        self._own, self.longest = own, 0.0
+        self._own, self.steps = own, list[float]()
 
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
         """Of the learner."""
@@ -140,7 +153,7 @@ class Timed:
         """Of the learner."""
         begin = time.process_time()
         proposal = self._own.propose(flown)
-        self.longest = max(self.longest, time.process_time() - begin)
+        self.steps.append(time.process_time() - begin)
         return proposal
 
 
@@ -239,7 +252,8 @@ def fly(name: str, number: int, chosen: Scenario) -> Learned:
         alarms=sum("changed, log-likelihood" in event.sentence for event in events),
         found=found,
         found_at=dead[0].stamp_ns / 1e9 if dead else math.nan,
-        identification=timed[0].longest,
+        update=float(np.mean(timed[0].steps)),
+        longest=max(timed[0].steps),
         replayed=int(replay(tape).equal()),
         events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
     )
@@ -361,12 +375,19 @@ FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "wea
 
 def count(name: str, aircraft: int) -> int:
     """The number of aircraft in a cell."""
-    return math.ceil(CELLS[name].share * aircraft)
+    return min(math.ceil(CELLS[name].share * aircraft), CELLS[name].most)
 
 
 def flown_rows(names: Sequence[str], number: int) -> list[Row]:
     """The rows of an aircraft in some cells."""
     return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
+
+
+def code() -> list[str]:
+    """The paths of the code that flies: this file, and the packages of this stack that it imports."""
+    sources = REPOSITORY / "ros_ws" / "src"
+    imported = {name.partition(".")[0] for name in sys.modules} & {folder.name for folder in sources.iterdir()}
+    return [f"benchmarks/{Path(__file__).name}", *(f"ros_ws/src/{name}" for name in sorted(imported))]
 
 
 # The results
@@ -388,6 +409,7 @@ KINDS = tuple(Row.__annotations__.values())
 
 def write(path: Path, rows: Sequence[Row]) -> None:
     """Write the rows, sorted."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerows((Row._fields, *sorted(rows, key=lambda each: (list(CELLS).index(each.cell), each.number))))
@@ -400,7 +422,8 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence_data.Row]:
         if chosen:
             yield row(f"{name}: aircraft", float(len(chosen)))
             yield row(f"{name}: replay equal", float(np.mean([each.replayed for each in chosen])), at_least=1.0)
-            yield row(f"{name}: longest identification", max(each.identification for each in chosen), "s")
+            yield row(f"{name}: update, mean", float(np.mean([each.update for each in chosen])), "s", at_most=UPDATE)
+            yield row(f"{name}: update, longest", max(each.longest for each in chosen), "s")
             yield from CELL_FIGURES[cell.kind](name, cell, chosen)
 
 
@@ -471,6 +494,30 @@ CELL_FIGURES = {
 }
 
 
+def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence_data.Row]:
+    """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there with u LATE.
+
+    All aircraft have the same noise. Each law has its model and gains by the airframe file.
+    """
+    benchmark = tuning.build_benchmark(find_scenario("osprey_observer"))
+    tuned = load(tuned_file(find_scenario("osprey_servo")))
+    A, B = sampled_matrices(load_airframe("osprey"), uncertainty, uncertainty, SEED, 0, max(numbers) + 1)
+    of = np.tile(np.array(numbers), 2)
+    late = np.repeat([0, round(LATE / benchmark.model.period)], len(numbers))
+    flights = tuning.benchmark_fleet(A[of], B[of], late, tuning.GUST, benchmark)
+    for name in RIVALS:
+        law = LAWS[name]
+        params = law.params(tuning.as_gains(tuned[name][OBJECTIVE]), benchmark.model)
+        course = benchmark.courses[tuning.GUST][law.feedforward]
+        flown = fleet.fly(flights, benchmark.vehicle, course, law.control_law(benchmark.model), params)
+        in_time, delayed = np.split(tuning.score(flown, benchmark.unit), 2)
+        subject = f"rivals, +-{100 * uncertainty:.0f} %"
+        yield row(f"{subject}: score, {law.title}", float(np.mean(in_time)))
+        yield row(f"{subject}: largest score, {law.title}", float(np.max(in_time)))
+        lost = float(np.mean(delayed > LOSS_OF_TRACK_SCORE))
+        yield row(f"{subject}: share lost with u {1e3 * LATE:.0f} ms late, {law.title}", lost)
+
+
 def plot(rows: Sequence[Row]) -> Figure:
     """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the mean."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
@@ -497,17 +544,21 @@ def plot(rows: Sequence[Row]) -> Figure:
 
 
 def main(
-    aircraft: Annotated[int, typer.Option(help="Aircraft of a cell; some have a part of it.")] = 20,
+    aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 60,
     cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
     results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
-    jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
     """Fly the aircraft that are missing in the results, and write the figures and the picture.
 
-    Rows of another revision are flown again.
+    Rows that other code flew are flown again, and all where that code is not committed: the revision of a row is the last one
+    that touched the code that flies.
     """
+    if unknown := [name for name in cell if name not in CELLS]:
+        raise typer.BadParameter(f"found {', '.join(unknown)}, expected cells among {', '.join(CELLS)}")
     begun = evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
-    rows = [each for each in read(results) if each.revision == begun.revision]
+    flown_by = evidence_data.revision(*code())
+    rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence_data.DIRTY)]
     known = {(each.cell, each.number) for each in rows}
     # aircraft by aircraft, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
@@ -520,14 +571,19 @@ def main(
     with ProcessPoolExecutor(jobs) as pool:
         pending = [pool.submit(flown_rows, names, n) for (n, _, _), names in cases.items()]
         for future in track(as_completed(pending), "aircraft", total=len(pending)):
-            rows += [each._replace(revision=begun.revision) for each in future.result()]
+            rows += [each._replace(revision=flown_by) for each in future.result()]
             write(results, rows)
     rows = [each for each in rows if each.number < count(each.cell, aircraft)]
-    found = list(figures(rows))
+    whole = [name for name in CELLS if sum(each.cell == name for each in rows) == count(name, aircraft)]
+    rows = [each for each in rows if each.cell in whole]
+    found, airs = list(figures(rows)), [name for name in CELLS if CELLS[name].kind == "learn"]
+    for uncertainty in sorted({CELLS[name].uncertainty for name in airs if name in whole}):
+        found += rival_figures(uncertainty, range(aircraft))
     for each in found:
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
-    if set(cell) == set(CELLS):
+    if found:
         evidence_data.write("learning", found, begun)
+    if set(airs) <= set(whole):
         rendered = BytesIO()
         plot(rows).savefig(rendered, dpi=110)
         Image.open(rendered).convert("RGB").quantize(PALETTE).save(IMAGE, optimize=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from benchmarks import autopilots
+from benchmarks import autopilots, evidence_data, learning
 from benchmarks.evidence import EXIT_STATUS, MEASUREMENTS, SPEED, cases, read_result, rows_of, wanted
 from benchmarks.evidence_data import BUSY, FOLDER, REPOSITORY, Measured, Origin, Row, read, row, used, write
 from benchmarks.evidence_page import PAGE, TITLES, page
@@ -400,3 +400,38 @@ def test_result_of_a_program(tmp_path: Path) -> None:
     left.write_text(json.dumps([2]), encoding="utf-8")
     assert read_result(left, '{"a": 1}') == [2]
     assert read_result(tmp_path / "left.xml", "") is None
+
+
+def test_revision_of_paths_is_the_last_commit_that_touched_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*arguments: str) -> str:
+        command = ("git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments)
+        return subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout.strip()
+
+    git("init", "-q")
+    commits = []
+    for name in ("law", "page"):
+        (tmp_path / name).write_text(name, encoding="utf-8")
+        git("add", name)
+        git("commit", "-qm", name)
+        commits.append(git("rev-parse", "--short", "HEAD"))
+    monkeypatch.setattr(evidence_data, "REPOSITORY", tmp_path)
+    assert [evidence_data.revision(name) for name in ("law", "page")] == commits
+    (tmp_path / "page").write_text("changed", encoding="utf-8")
+    assert [evidence_data.revision(name) for name in ("law", "page")] == [commits[0], f"{commits[1]}-dirty"]
+
+
+def test_learning_measurement_flies_what_is_missing_and_writes_whole_cells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[tuple[str, set[str]]] = []
+    monkeypatch.setattr(evidence_data, "revision", lambda *paths: "abc" if paths else "of all")
+    monkeypatch.setattr(
+        evidence_data,
+        "write",
+        lambda name, rows, origin: written.append((origin.revision, {row.name.partition(":")[0] for row in rows})),
+    )
+    of_dead = [learning.Row("dead", n, 1.0, 1.0, 1.0, revision="abc", dead="rudder") for n in range(2)]
+    others = [learning.Row("weak", 0, 1.0, 1.0, 1.0, 1.0, revision="abc"), of_dead[0]._replace(revision="older")]
+    learning.write(tmp_path / "rows.csv", [*of_dead, *others])
+    learning.main(aircraft=4, cell=["dead"], results=tmp_path / "rows.csv", jobs=1)  # half of the four have a dead surface
+    assert written == [("of all", {"dead"})]  # of the cell "weak" a row is missing
