@@ -297,6 +297,19 @@ def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
     assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines
 
 
+def test_page_shows_known_entries_and_measured_error_by_model(flown: Flown) -> None:
+    flight, ticks = Flight(flown.run), read_run(flown.run).tape["internals"]
+    flight.update()
+    assert "B[p, aileron]" in flight.description["learned"]
+    assert "A[V, V]" not in flight.description["learned"]  # a slow decay, which 14 s do not show
+    e, t = ticks.group("e"), ticks.stamp_ns / NANOSECONDS
+    rms = [1e3 * np.sqrt(np.mean(e["p"][within] ** 2)) for within in (t < SWITCH, t >= SWITCH)]
+    column = flight.models["headings"].index("p (mrad/s)")
+    rows = flight.models["rows"]
+    assert [row[0] for row in rows] == ["start", "model 1"]
+    assert [float(row[column]) for row in rows] == pytest.approx(rms, rel=0.01)  # three digits
+
+
 def test_report_has_error_by_model(flown: Flown) -> None:
     flight = read_flight(flown.run)
     before, under = errors_by_model(flight.tape)

@@ -581,6 +581,33 @@ def test_guided_flight_shows_route_and_modes(browser: Browser, tmp_path: Path) -
         assert pixels_of(browser, "#scene", "--reference") == 0  # nothing but a route has its colour
 
 
+def test_learned_entries_and_error_by_model_shown(browser: Browser, tmp_path: Path) -> None:
+    k = np.arange(200)
+    ticks = np.column_stack([np.ones(200), np.where(k < 100, 7.0, 8.0), np.where(k < 100, 0.1, 0.05)])
+    stamps = 20_000_000 * k
+    names = [f"{kind}.{entry}" for entry in ("B[p, aileron]", "A[q, q]") for kind in ("value", "deviation")]
+    found = np.array([[0.0, 5.0, 0.5, -1.0, 0.9], [1.0, 4.0, 0.25, -1.0, 0.9]])  # A[q, q] is not known
+    signals = {
+        "internals": Signal(stamps, ("mode", "parameters", "e.q"), ticks),
+        "learned": Signal(stamps[[50, 100]], ("proposed", *names), found),
+    }
+    write_run(Tape(signals), tmp_path / "run", LogAttachments(find_scenario("osprey_learn").path))
+    with shown(browser, tmp_path / "run"):
+        titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
+        assert [title for title in titles if "learned" in title] == ["B[p, aileron], learned"]
+        rows = browser.run("[...document.querySelectorAll('#models tr')].map(one => [...one.cells].map(cell => cell.textContent))")
+        assert rows == [  # 0.1 rad/s and half of it
+            ["", "from (s)", "to (s)", "q (mrad/s)"],
+            ["start", "0.0", "2.0", "100"],
+            ["model 1", "2.0", "4.0", "50.0"],
+        ]
+        browser.run(SAID)
+        press(browser, "End")
+        browser.wait_for("said.includes('B[p, aileron] 4.000 +- 0.50')")
+        assert pixels_of(browser, "[aria-label*=learned]", "--plant") > 100
+        assert browser.console == []
+
+
 SAID = """(() => {
     const said = window.said = [], fillText = CanvasRenderingContext2D.prototype.fillText;
     CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {

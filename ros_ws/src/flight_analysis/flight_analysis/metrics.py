@@ -30,6 +30,8 @@ MIN_BAND_NOISE_FLOORS = 4.0
 """Least half-width of the settling band of a measured error, in noise floors. 500 samples of normal noise stay within 4 with a
 probability of 97 %."""
 
+MAX_DEVIATION = 0.15  # of the value of an entry that the flight shows: half of the deviation before it
+
 LONGEST_INTERVAL = 1.0
 """s. A sample stands for no longer time: a longer interval is a gap of the log, over which no figure is taken."""
 
@@ -315,6 +317,12 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
         rms = {name: error_metrics(error[name][within]).rms for name in error.names}
         spans.append(ModelSpan(digests.index(digest), start, stop, rms))
     return spans
+
+
+def known_entries(learned: Signal) -> list[str]:
+    """Entries of A and B in samples of `learned` whose least deviation is below MAX_DEVIATION of the value."""
+    values, deviations = learned.group("value"), learned.group("deviation")
+    return [name for name in values.names if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))]
 
 
 def errors_by_part(

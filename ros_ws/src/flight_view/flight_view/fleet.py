@@ -17,6 +17,7 @@ class Fleet:
         self.flights = flights
         self.events: list[Event] = []
         self.bands: Mapping[str, float] = {}
+        self.models: Mapping[str, Any] = {}
 
     @property
     def samples(self) -> dict[str, Series]:

@@ -4,7 +4,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,15 +17,16 @@ from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_scenario_sections
-from flight_analysis.metrics import settling_bands
+from flight_analysis.metrics import ModelSpan, known_entries, settling_bands
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.run_folder import log_account
-from flight_analysis.report.summary import display_unit, display_units, pulse_edges
+from flight_analysis.report.summary import NO_UNIT, display_unit, display_units, model_rows, pulse_edges
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.text import printable
+from flight_core.vectors import FloatArray
 from flight_guidance import modes as guidance
 from flight_guidance.odometry import ROUTE_FRAMES
 from flight_guidance.params import GuidanceConfig
@@ -41,8 +42,9 @@ from flight_log.tape_reader import StoredFile, listed, read_run
 from flight_view.background import Line
 from flight_view.series import Series
 
+LEARNED = "learned"  # entries of A and B, as identified in flight
 RATE = 50.0  # Hz
-RATES = {"internals": math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}
+RATES = {"internals": math.inf, LEARNED: math.inf, **dict.fromkeys(("guidance", "pose", "truth", "u", "y", "y_m"), RATE)}
 """Topics that are read, and the highest rate. Ticks are all read: a peak between two drawn samples would be hidden."""
 
 IN_TICKS = ("u", "y", "y_m")  # topics that the ticks have, too: not read from the first tick on
@@ -76,7 +78,7 @@ SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
 ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
 LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
-MAX_EVENTS, MAX_NOTES, MAX_CHANNELS = 5000, 50, 200
+MAX_EVENTS, MAX_NOTES, MAX_CHANNELS, MAX_SPANS = 5000, 50, 200, 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
 SILENT = 1.0  # s without a sample after which the state is "no data"
@@ -97,6 +99,16 @@ class _Topic:
     messages: list[bytes] = field(default_factory=list)  # not decoded yet
     names: tuple[str, ...] = ()  # of all channels
     columns: NDArray[np.intp] | None = None  # of the kept channels
+
+
+class _Flown(NamedTuple):
+    """Successive ticks under the same parameters of the controller."""
+
+    digest: float
+    start_ns: int
+    stop_ns: int
+    count: int
+    squares: Mapping[str, float]  # sums of e^2 by output
 
 
 class Flight:
@@ -142,6 +154,7 @@ class Flight:
         self._first_ns: int | None = None
         self._mode = -1
         self._banded = 0  # rows of internals behind the bands
+        self._flown: list[_Flown] = []
         self._now = now
         self._changed = now()
         self._behind = False  # there is more to read at once
@@ -182,6 +195,22 @@ class Flight:
             if is_locked(path):
                 return "no data" if self.samples else "waiting"
         return "interrupted"
+
+    @property
+    def models(self) -> dict[str, Any]:
+        """Headings and rows of the rms of the measured error by model, as in the report; empty without a learner."""
+        if LEARNED not in self.samples or not self._flown:
+            return {}
+        digests = list(dict.fromkeys(span.digest for span in self._flown))
+        ends_ns = [*(span.start_ns for span in self._flown[1:]), self._flown[-1].stop_ns]
+        spans = []
+        for span, stop_ns in zip(self._flown, ends_ns, strict=True):
+            start, stop = ((stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
+            rms = {name: math.sqrt(square / span.count) for name, square in span.squares.items()}
+            spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
+        units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | ({} if self.scenario is None else display_units(self.scenario))
+        headings, rows = model_rows(spans, units)
+        return {"headings": ["", *headings], "rows": rows}
 
     def faults(self) -> list[str]:
         """Sentences on what the log lacks."""
@@ -351,7 +380,27 @@ class Flight:
             and math.isfinite(digest := values[-1, names.index("parameters")])
         ):
             self.digest = int(digest)
+            self._take_errors(stamp_ns, names, values)
         samples.append(stamp_ns, values[:, topic.columns])
+        if topic.name == LEARNED:
+            found = known_entries(Signal(samples.stamp_ns, samples.names, samples.values.astype(float)))
+            self.description |= {"learned": found}
+            self.described += 1
+
+    def _take_errors(self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray) -> None:
+        """Sum the squares of e under each set of parameters."""
+        flown = values[:, names.index("parameters")]
+        errors = {_text(name[2:]): values[:, k] for k, name in enumerate(names[:MAX_CHANNELS]) if name.startswith("e.")}
+        for rows in np.split(np.arange(len(flown)), np.flatnonzero(np.diff(flown)) + 1):
+            digest, start_ns, stop_ns = float(flown[rows[0]]), int(stamp_ns[rows[0]]), int(stamp_ns[rows[-1]])
+            squares = {name: float(np.sum(e[rows] ** 2)) for name, e in errors.items()}
+            span = _Flown(digest, start_ns, stop_ns, len(rows), squares)
+            if self._flown and (before := self._flown[-1]).digest == digest:
+                self._flown.pop()
+                total = {name: square + before.squares[name] for name, square in squares.items()}
+                span = before._replace(stop_ns=stop_ns, count=before.count + len(rows), squares=total)
+            if len(self._flown) < MAX_SPANS:
+                self._flown.append(span)
 
     def _take_modes(self, stamp_ns: NDArray[np.int64], modes: NDArray[np.float64]) -> None:
         changes = np.flatnonzero(np.diff(modes, prepend=self._mode))

@@ -207,6 +207,7 @@ def answer(
         "control": control,
         "faults": flight.faults(),
         "bands": finite_or_null(flight.bands),
+        "models": flight.models,
         "topics": topics,
         "first_event": first["events"],
         "events": events,

@@ -150,7 +150,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
     if simulated and not {*TICKS} & {*tape.signals}:
         return "" if is_part else f"{NEVER_FLEW}: the controller never engaged"
     loop = [tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape]
-    held = min(int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop)
+    held = min((int(stamp_ns[-1]) if len(stamp_ns) else tape.start_ns for stamp_ns in loop), default=tape.start_ns)
     planned = scenario.flight.duration if tape.duration is None else tape.duration
     if held >= tape.start_ns + nanoseconds(planned) - LATE_TICK_NS:
         return COMPLETED

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import Windows, mask_spans, spectra, tick_periods, tracking_error, true_error
+from flight_analysis.metrics import Windows, known_entries, mask_spans, spectra, tick_periods, tracking_error, true_error
 from flight_analysis.report.plotting import (
     Curve,
     Figure,
@@ -56,7 +56,6 @@ MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
 FREQUENCIES = [digit * 10.0**power for power in range(-4, 4) for digit in (1, 2, 5)]  # Hz, ticks of a spectrum
 MIN_VISIBLE_FRACTION = 1 / 500  # of the axis, about two pixels: shorter intervals are lengthened to it
-MAX_DEVIATION = 0.15  # of the value of an entry that the flight shows: half of the deviation before it
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
 Limits = Mapping[str, tuple[float, float]]  # lower and upper limit by input, SI; infinite without a limit
@@ -177,13 +176,12 @@ def integral_figure(context: PlotContext) -> Figure | None:
 def learned_figure(context: PlotContext) -> Figure | None:
     """Entries of A and B over time, as identified in flight, with bars of two deviations; open marks: no model was proposed.
 
-    None without a learner. An entry whose least deviation is above MAX_DEVIATION of its value is left out.
+    None without a learner. An entry that is not among `known_entries` is left out.
     """
     if "learned" not in context.tape:
         return None
     t, found = context.tape.time("learned"), context.tape["learned"]
-    values, deviations = found.group("value"), found.group("deviation")
-    known = [name for name in values.names if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))]
+    known, values, deviations = known_entries(found), found.group("value"), found.group("deviation")
     if not known:
         return None
     columns, symbols = min(len(known), 3), np.where(found["proposed"] > 0.0, "circle", "circle-open").tolist()

@@ -72,6 +72,10 @@ export function chartsOf(flight, ghost) {
     const bounds = (limits[name] ?? []).filter(bound => bound !== null).map(bound => bound * factor);
     charts.push({title: name, unit: text, lines, limits: bounds, saturation: `limited.${name}`});
   }
+  for (const name of flight.info.learned) { // an entry of A or B, with the band of two deviations
+    const lines = [line("learned", `value.${name}`, name, "--plant", 1.4, {deviation: `deviation.${name}`})];
+    charts.push({title: `${name}, learned`, unit: "SI", lines});
+  }
   const winds = flight.get("truth")?.group("gust") ?? [];
   if (winds.length) {
     const colours = ["--plant", "--ghost", "--error"];
@@ -113,10 +117,10 @@ function extent(chart, view, bins) { // the decimated lines, and the least and l
   for (const line of chart.lines) {
     const series = line.flight.get(line.topic), column = series?.column(line.channel);
     if (!column || !series.count) continue;
-    const chosen = rows(series, column, view, bins);
+    const chosen = rows(series, column, view, bins), deviation = series.column(line.deviation);
     for (const k of chosen) {
-      const value = column[k] * line.factor;
-      if (series.t[k] >= view[0] - 1 && Number.isFinite(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+      const value = column[k] * line.factor, spread = deviation ? 2 * deviation[k] : 0;
+      if ((deviation || series.t[k] >= view[0] - 1) && Number.isFinite(value + spread)) { low = Math.min(low, value - spread); high = Math.max(high, value + spread); }
     }
     drawn.push({line, series, column, chosen});
   }
@@ -157,6 +161,10 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
   ctx.setLineDash([6, 4]);
   for (const bound of chart.limits ?? []) stroke(ctx, [[LEFT, y(bound)], [right, y(bound)]]);
   for (const {line, series, column, chosen} of drawn) {
+    if (line.deviation) {
+      drawLearned(ctx, line, series, column, chosen, x, y, Math.min(right, x(flight.end)), colour);
+      continue;
+    }
     ctx.strokeStyle = colour(line.colour);
     ctx.lineWidth = line.width;
     ctx.lineJoin = "round";
@@ -189,6 +197,19 @@ export function drawChart(canvas, chart, flight, view, cursor, selection, colour
   drawTitle(ctx, chart, drawn, cursor, right, colour);
 }
 
+function drawLearned(ctx, line, series, column, chosen, x, y, end, colour) { // a value until the next identification; dashed where no model was proposed
+  const deviation = series.column(line.deviation), proposed = series.column("proposed");
+  ctx.lineWidth = line.width;
+  for (const k of chosen) {
+    const start = x(series.t[k]), stop = k + 1 < series.count ? x(series.t[k + 1]) : Math.max(end, start + 2), spread = 2 * deviation[k];
+    ctx.fillStyle = colour("--band");
+    ctx.fillRect(start, y(column[k] + spread), stop - start, y(column[k] - spread) - y(column[k] + spread));
+    ctx.strokeStyle = colour(line.colour);
+    ctx.setLineDash(proposed?.[k] > 0 ? [] : [5, 3]);
+    stroke(ctx, [[start, y(column[k])], [stop, y(column[k])]]);
+  }
+}
+
 function stroke(ctx, points) {
   ctx.beginPath();
   points.forEach(([x, y], k) => (k ? ctx.lineTo(x, y) : ctx.moveTo(x, y)));
@@ -217,7 +238,8 @@ function drawTitle(ctx, chart, drawn, cursor, right, colour) { // the title, and
   let place = right;
   for (const {line, series} of [...drawn].reverse()) {
     const value = series.at(line.channel, cursor) * line.factor;
-    const text = `${line.label} ${Number.isFinite(value) ? value.toPrecision(4) : "-"}`, size = ctx.measureText(text).width;
+    const spread = line.deviation ? ` +- ${(2 * series.at(line.deviation, cursor)).toPrecision(2)}` : "";
+    const text = `${line.label} ${Number.isFinite(value) ? value.toPrecision(4) + spread : "-"}`, size = ctx.measureText(text).width;
     if (place - size < LEFT + 170) break;
     ctx.fillStyle = colour("--ink");
     ctx.fillText(text, place, TOP - 5);

@@ -36,13 +36,13 @@ export class Flight { // one flight of the server
   constructor(number) {
     this.number = number;
     this.socket = null;
-    this.head = {state: "", faults: [], bands: {}, described: "", ghost: false, fleet: 0, start: 0};
+    this.head = {state: "", faults: [], bands: {}, models: {}, described: "", ghost: false, fleet: 0, start: 0};
     this.clear("");
   }
 
   clear(epoch) {
     this.epoch = epoch;
-    this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: []};
+    this.info = {name: "", modes: {}, units: {}, positive: {}, limits: {}, gusts: [], commands: [], learned: []};
     this.series = new Map();
     this.events = [];
     this.begin = Infinity;
@@ -70,8 +70,8 @@ export class Flight { // one flight of the server
       if (head.events.length) this.events.sort((one, other) => one.t - other.t); // topics arrive one behind another
     }
     if (head.flight) this.info = {...this.info, ...head.flight};
-    const {state, faults, bands, described, ghost, fleet, start, control} = head;
-    this.head = {state, faults, bands, described, ghost, fleet, start, control};
+    const {state, faults, bands, models, described, ghost, fleet, start, control} = head;
+    this.head = {state, faults, bands, models, described, ghost, fleet, start, control};
     return head.topics.length > 0;
   }
 

@@ -265,6 +265,7 @@ function drawState() {
   text($("legend"), scene.legend ?? "");
   drawReadouts();
   drawEvents();
+  drawModels();
 }
 
 function list(node, lines) {
@@ -338,6 +339,20 @@ function drawEvents() { // in the order of time; the last one before the cursor 
   const past = flight.events.findLastIndex(({t}) => t <= clock.t + 1e-9);
   node.querySelector(".now")?.classList.remove("now");
   node.children[past]?.classList.add("now");
+}
+
+function drawModels() { // the rms of the error under the law of the start and under each model of a learner
+  const node = $("models"), {headings, rows = []} = flight.head.models, shown = JSON.stringify([headings, rows]);
+  node.hidden = rows.length === 0;
+  if (node.hidden || node.dataset.shown === shown) return;
+  node.dataset.shown = shown;
+  const cell = content => Object.assign(document.createElement("td"), {textContent: content});
+  const lines = [headings, ...rows].map(cells => {
+    const line = document.createElement("tr");
+    line.append(...cells.map(cell));
+    return line;
+  });
+  node.tBodies[0].replaceChildren(...lines);
 }
 
 let before = 0, second = 0;
