@@ -33,7 +33,6 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
 from rise_di.learning import learn_again, learner
-from rise_di_controller import divergence
 from rise_di_controller.learning import changes
 from rise_di_controller.observer import PastTick, estimates_after
 from rise_di_controller.rise_di import RiseDiConfig
@@ -254,29 +253,6 @@ def test_filter_of_a_constant_record_begins_as_after_a_long_one() -> None:
     for _ in range(60_000):  # six times as long as the slowest decay, of 100 s
         z = params.Phi @ (z + params.L @ (e - params.H @ z)) + params.Gamma @ (u - 0.01)
     assert estimates_after(record, np.full(4, 0.01), params) == pytest.approx(z, rel=0.01, abs=1e-6)  # exp(-6) is 0.0025
-
-
-@pytest.mark.parametrize(
-    ("errors", "expected"),
-    [
-        ((0.02, 0.01), False),  # twice the largest before, but small
-        ((0.2, 0.07), False),  # less than three times
-        ((0.2, 0.05), True),
-    ],
-)
-def test_divergence_is_three_times_the_error_before(errors: tuple[float, float], expected: bool) -> None:
-    now, largest = (np.array([value**2, 0.0]) for value in errors)
-    state, least = divergence.Errors(now, largest), divergence.least(("q", "V"))
-    assert divergence.diverges(state, least, np.array([True, True])) is expected
-    assert not divergence.diverges(state, least, np.array([False, True]))  # q flies the law of the start
-
-
-def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
-    state = divergence.Errors(np.zeros(1), np.zeros(1))
-    for _ in range(100):
-        state = divergence.step(state, np.array([0.3]), 0.01, first_law=True)
-    assert state.now == pytest.approx(0.09 * (1.0 - np.exp(-1.0)))
-    assert divergence.step(state, np.array([9.0]), 0.01, first_law=False).largest == state.now
 
 
 def test_changes_in_log_are_those_that_the_controller_took(flown: Flown) -> None:

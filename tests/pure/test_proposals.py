@@ -205,3 +205,21 @@ def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behin
     }
     with pytest.raises(ValueError, match=r"controller\.learn: found a bridge, expected a simulated aircraft"):
         second_stage(scenario, bridge=True)
+
+
+def test_model_that_oscillates_gives_way_to_the_law_of_the_start_for_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step()
+    monkeypatch.setattr(flight.controller, "oscillations", lambda: {"q": 0.25})
+    flight.step()
+    assert flight.controller.digest == START.digest()
+    monkeypatch.setattr(flight.controller, "oscillations", dict)
+    flight.now_ns += 10 * NANOSECONDS
+    flight.receive()
+    flight.step()
+    assert flight.controller.digest == START.digest()
+    assert flight.sentences[1:] == [
+        "falls back to the law of the start: q oscillated at 4 Hz, for the rest of the flight",
+        "refused: q oscillated at 4 Hz under a learned model",
+    ]

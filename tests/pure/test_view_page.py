@@ -595,7 +595,9 @@ def test_learned_entries_and_error_by_model_shown(browser: Browser, tmp_path: Pa
     with shown(browser, tmp_path / "run"):
         titles = browser.run("[...document.querySelectorAll('#charts canvas')].map(one => one.getAttribute('aria-label'))")
         assert [title for title in titles if "learned" in title] == ["B[p, aileron], learned"]
-        rows = browser.run("[...document.querySelectorAll('#models tr')].map(one => [...one.cells].map(cell => cell.textContent))")
+        rows = browser.run(
+            "[...document.querySelectorAll('#models tr')].map(one => [...one.cells].map(cell => cell.textContent))"
+        )
         assert rows == [  # 0.1 rad/s and half of it
             ["", "from (s)", "to (s)", "q (mrad/s)"],
             ["start", "0.0", "2.0", "100"],

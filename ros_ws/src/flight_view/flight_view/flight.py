@@ -107,7 +107,7 @@ class _Flown(NamedTuple):
     digest: float
     start_ns: int
     stop_ns: int
-    count: int
+    ticks: int
     squares: Mapping[str, float]  # sums of e^2 by output
 
 
@@ -206,7 +206,7 @@ class Flight:
         spans = []
         for span, stop_ns in zip(self._flown, ends_ns, strict=True):
             start, stop = ((stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
-            rms = {name: math.sqrt(square / span.count) for name, square in span.squares.items()}
+            rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
             spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
         units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | ({} if self.scenario is None else display_units(self.scenario))
         headings, rows = model_rows(spans, units)
@@ -398,7 +398,7 @@ class Flight:
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}
-                span = before._replace(stop_ns=stop_ns, count=before.count + len(rows), squares=total)
+                span = before._replace(stop_ns=stop_ns, ticks=before.ticks + len(rows), squares=total)
             if len(self._flown) < MAX_SPANS:
                 self._flown.append(span)
 

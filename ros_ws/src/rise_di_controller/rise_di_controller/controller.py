@@ -62,6 +62,7 @@ class Controller:
         self._first_law, self._learned = True, _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
+        self._oscillations = divergence.Oscillations(self._least)
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
@@ -133,10 +134,19 @@ class Controller:
         known = self._vanes_moved | (seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time)
         self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
 
-    def fallback(self) -> ControllerConfig | None:
-        """The parameters of the start where a law with a model that was learned in flight diverges; else None."""
-        diverges = not self._first_law and divergence.diverges(self._errors, self._least, self._learned)
-        return self._first if diverges else None
+    @property
+    def first(self) -> ControllerConfig:
+        """The parameters of the start."""
+        return self._first
+
+    def diverges(self) -> bool:
+        """Whether a law with a model that was learned in flight diverges."""
+        return not self._first_law and divergence.diverges(self._errors, self._least, self._learned)
+
+    def oscillations(self) -> dict[str, float]:
+        """Periods, s, of the outputs that oscillate under a model learned in flight, more than before."""
+        periods = zip(self._parameters.outputs, self._oscillations.periods.tolist(), strict=True)
+        return {name: period for name, period in periods if period and not self._first_law}
 
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return (parameters.observer, parameters.feedforward) == (self._first.observer, self._first.feedforward)
@@ -167,7 +177,9 @@ class Controller:
             return None
         self._measure_vanes(inputs)
         self._number += self.has_internals
-        self._errors = divergence.step(self._errors, inputs.y - inputs.y_m, inputs.dt, first_law=self._first_law)
+        e = inputs.y - inputs.y_m
+        self._errors = divergence.step(self._errors, e, inputs.dt, first_law=self._first_law)
+        self._oscillations.take(e, inputs.dt, None if self._first_law else self._learned)
         age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)

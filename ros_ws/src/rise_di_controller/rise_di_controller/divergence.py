@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a model learned in flight diverges: its error beside that of the law that the flight began with."""
+"""Whether a law with a model learned in flight diverges or oscillates: its error beside that of the law of the start."""
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,12 @@ MEMORY = 1.0  # s, time constant of the mean square of e: a few periods of the s
 FACTOR = 3.0  # of the largest rms error before: gusts that come later are up to twice as strong
 LEAST = {"V": 1.0}  # m/s, rms error that does not count as a divergence
 LEAST_RATE = 0.1  # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
+
+WINDOW, STEP = 10.0, 0.02  # s, length of the record of e, and of the means in it: a loop with servos oscillates slower
+TEST = 50  # means between two tests for an oscillation, 1 s
+LIKENESS = 0.7  # correlation of e with e a period later: above 0.9 in a limit cycle, at most 0.4 in turbulence and gusts
+GROWN = 1.5  # of the largest rms error over WINDOW before: below this the law of the start is not clearly better
+HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 
 
 class Errors(NamedTuple):
@@ -39,3 +46,55 @@ def diverges(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> b
     Only outputs with a model that was learned count, mask (m,): the others fly the first law.
     """
     return bool(np.any(learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))))
+
+
+class Oscillations:
+    """The error e over the last WINDOW, and in which outputs it oscillates, by more than under the first law.
+
+    A limit cycle repeats itself: e is like e a period earlier, over the whole window. Wind and single commands do not.
+    """
+
+    def __init__(self, least: FloatArray) -> None:
+        """`least`: mean squares that do not count as a divergence, (m,)."""
+        self.periods = np.zeros_like(least)  # s, of the oscillations at the last test, (m,); 0 for none
+        self._least, self._largest = HARMLESS**2 * least, np.zeros_like(least)
+        self._record = deque[FloatArray](maxlen=round(WINDOW / STEP))
+        self._sum, self._count, self._time, self._means, self._first_law = 0.0 * least, 0, 0.0, 0, True
+
+    def take(self, e: FloatArray, dt: float, learned: NDArray[np.bool_] | None) -> None:
+        """Record a tick, and test once a second. `learned`: outputs with a learned model, (m,); None under the first law."""
+        if (learned is None) is not self._first_law:
+            self._first_law = learned is None
+            self._record.clear()
+            self.periods = 0.0 * self.periods
+        self._sum, self._count, self._time = self._sum + e, self._count + 1, self._time + dt
+        if self._time < 0.99 * STEP:  # dt is rounded
+            return
+        self._record.append(self._sum / self._count)
+        spacing, self._means = self._time, self._means + 1
+        self._sum, self._count, self._time = 0.0 * e, 0, 0.0
+        if self._means % TEST:
+            return
+        record = np.array(self._record)
+        square = np.mean(record**2, axis=0)
+        if learned is None:
+            self._largest = np.maximum(self._largest, square)
+        elif len(record) == self._record.maxlen:
+            grown = square > np.maximum(GROWN**2 * self._largest, self._least)
+            self.periods = np.array([spacing * period(x) * tested for x, tested in zip(record.T, learned & grown, strict=True)])
+
+
+def period(x: FloatArray) -> int:
+    """The period of an oscillation that fills a record, (N,), in samples, at most N / 4; 0 without one.
+
+        r_k = N / (N - k) sum x_i x_(i+k) / sum x_i^2,  x less its mean
+
+    The period is that of the first peak above LIKENESS beyond the first negative r.
+    """
+    n, lags = len(x), len(x) // 4
+    x = x - np.mean(x)
+    sums = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2)[:lags]
+    r = n / (n - np.arange(lags)) * sums / max(sums[0], np.finfo(float).tiny)
+    like = np.flatnonzero((r > LIKENESS) & np.logical_or.accumulate(r < 0.0))
+    peak = np.split(like, np.flatnonzero(np.diff(like) > 1) + 1)[0]
+    return int(peak[np.argmax(r[peak])]) if len(peak) else 0

@@ -75,6 +75,7 @@ class Learning:
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
+        self._oscillated = ""  # why no model flies any more
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
 
     def ticked(self, now_ns: int) -> bool:
@@ -109,9 +110,14 @@ class Learning:
             taken = self._certify(controller, now_ns) or taken
         if not self._simulated:
             taken = self._certify(controller, now_ns)
-        if (fallback := controller.fallback()) is not None:
-            self._take(controller, now_ns, prepared(fallback), "falls back to the law of the start: it diverges")
-            taken = fallback
+        if oscillations := controller.oscillations():
+            self._oscillated = " and ".join(
+                f"{name} oscillated at {1.0 / period:.2g} Hz" for name, period in oscillations.items()
+            )
+        if oscillations or controller.diverges():
+            why = f"{self._oscillated}, for the rest of the flight" if oscillations else "it diverges"
+            taken = controller.first
+            self._take(controller, now_ns, prepared(taken), f"falls back to the law of the start: {why}")
         return taken
 
     def _acts_ns(self, end_ns: int) -> int:
@@ -135,7 +141,9 @@ class Learning:
         return _race(proposal, flown)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
-        if proposal.change:
+        if proposal.change and self._oscillated:
+            self._announce(Event(now_ns, {}, f"refused: {self._oscillated} under a learned model"))
+        elif proposal.change:
             self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
         else:
             self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
