@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+import psutil
 import pytest
 from rcl_interfaces.srv import GetParameters
 from tests.ros.conftest import Start
@@ -119,7 +120,7 @@ def get(peer_node: Peer) -> float:
 
 
 def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
-    chosen = scenario(tmp_path, updates=[1.0, 4.0])
+    chosen = scenario(tmp_path, updates=[1.0, 2.5])
     command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
     command.wait_for("no model: record: found")
     learning = command.child("flight_learner.main")
@@ -131,6 +132,12 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     said = command.output.count("no model: record")
     start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
     command.until(lambda: command.output.count("no model: record") > said)
+    # no byte more, as on a full disk: the write fails, and Python ignores SIGXFSZ
+    command.child("flight_recorder.main").rlimit(psutil.RLIMIT_FSIZE, (0, 0))
+    recorder_log = next((tmp_path / "runs").rglob("recorder.log"))
+    command.until(lambda: "recording ended" in recorder_log.read_text())
+    said = command.output.count("t = ")
+    command.until(lambda: command.output.count("t = ") > said)
     assert command.interrupt().end() == 130  # it flew on until then
 
 
