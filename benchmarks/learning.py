@@ -29,6 +29,7 @@ import numpy as np
 import typer
 from benchmarks import evidence_data
 from benchmarks.evidence_data import row
+from benchmarks.evidence_page import write_page
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.progress import track
@@ -583,6 +584,7 @@ def main(
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
     if found:
         evidence_data.write("learning", found, begun)
+        write_page()
     if set(airs) <= set(whole):
         rendered = BytesIO()
         plot(rows).savefig(rendered, dpi=110)

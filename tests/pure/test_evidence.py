@@ -425,6 +425,7 @@ def test_learning_measurement_flies_what_is_missing_and_writes_whole_cells(
 ) -> None:
     written: list[tuple[str, set[str]]] = []
     monkeypatch.setattr(evidence_data, "revision", lambda *paths: "abc" if paths else "of all")
+    monkeypatch.setattr(learning, "write_page", lambda: None)
     monkeypatch.setattr(
         evidence_data,
         "write",
