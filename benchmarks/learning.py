@@ -2,15 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning in the air: uncertain aircraft that learn in every air, beside the law alone, the file's model and the true one.
 
-python -m benchmarks.learning                                     # every cell, 60 aircraft: 90 min of two cores of a host
+python -m benchmarks.learning                                     # every cell, 50 aircraft: at most 90 min on two idle cores
 python -m benchmarks.learning --aircraft 6                        # with fewer; run again, it flies what is missing
 python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
 
 An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
 osprey_observer, as the others do, and as the laws of `rise-di compare` do with their gains for the airframe file. A row an
 aircraft goes to build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where
-the airs of both uncertainties were, the picture goes to docs/images/learning.png. Two minutes a learning aircraft go by on
-one core; flights without damage, for false alarms, are at most two of 600 s in each air.
+the airs of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3 min of a core over
+all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each.
 """
 
 import csv
@@ -545,7 +545,7 @@ def plot(rows: Sequence[Row]) -> Figure:
 
 
 def main(
-    aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 60,
+    aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 50,
     cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
     results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
