@@ -10,8 +10,8 @@ import pytest
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design.change_test import change_test
 from flight_analysis.design.innovation_filters import Actuation, recording
-from flight_analysis.design.learner import with_channels_of
 from flight_bringup.scenarios import find_scenario
+from rise_di_controller.learning import with_channels_of
 from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learning in the air: a flight that learns beside the law alone, its replay, proposals that are wrong, and the fallback."""
 
+import copy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -33,7 +34,7 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
 from rise_di.learning import learn_again, learner
-from rise_di_controller.learning import changes
+from rise_di_controller.learning import changes, fallen_back
 from rise_di_controller.observer import PastTick, estimates_after
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -214,6 +215,17 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     refused = made.propose(0)
     assert refused.controller is None
     assert refused.sentence.startswith("q and V: found no model with coupling, expected one, as that which flies; p and r")
+
+
+def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:
+    start, learned = scenario().rise_di(), copy.copy(flown.learner)
+    (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
+    model = vary(start, change)
+    assert isinstance(model, RiseDiConfig)
+    fallen = fallen_back(start, model, [name in {"q", "V"} for name in start.outputs])
+    monkeypatch.setattr(design_learner, "change_test", lambda *arguments: [])
+    sentence = learned.propose(fallen.digest()).sentence
+    assert sentence == "no identification is due, and no part is tested for a change"  # the last proposal is not lost
 
 
 def test_flight_without_learner_is_refused() -> None:

@@ -14,7 +14,18 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import DESIGNED, Event, Learning, Proposal, Updates, changes, designed
+from rise_di_controller.learning import (
+    DESIGNED,
+    Event,
+    Learning,
+    Proposal,
+    Updates,
+    acting_inputs,
+    changes,
+    coupled,
+    designed,
+    fallen_back,
+)
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.package("rise_di_controller")
@@ -207,19 +218,36 @@ def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behin
         second_stage(scenario, bridge=True)
 
 
-def test_model_that_oscillates_gives_way_to_the_law_of_the_start_for_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_oscillates_flies_the_law_of_the_start_for_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight()
     flight.receive()
     flight.step()
+    whole = flight.controller.parameters
     monkeypatch.setattr(flight.controller, "oscillations", lambda: {"q": 0.25})
-    flight.step()
-    assert flight.controller.digest == START.digest()
-    monkeypatch.setattr(flight.controller, "oscillations", dict)
+    flight.step(1)
+    monkeypatch.undo()
+    fallen = flight.controller.parameters
+    assert isinstance(whole, RiseDiConfig)
+    assert isinstance(fallen, RiseDiConfig)
+    longitudinal = [name in {"q", "V"} for name in START.outputs]
+    assert fallen == fallen_back(START, whole, longitudinal)
+    assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
     flight.receive()
     flight.step()
-    assert flight.controller.digest == START.digest()
+    assert flight.controller.parameters == fallen
+    flight.now_ns += 10 * NANOSECONDS
+    flight.receive(designed(START, fallen) | {"observer.fade": 0.5})  # a later model of p and r
+    flight.step()
+    assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
-        "falls back to the law of the start: q oscillated at 4 Hz, for the rest of the flight",
-        "refused: q oscillated at 4 Hz under a learned model",
+        "falls back to the law of the start in q, V, for good: q oscillates at 4 Hz",
+        "refused: proposal: found a model of elevator, thrust, expected none of elevator, thrust: their outputs oscillated",
+        "flies model",
     ]
+
+
+def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
+    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    assert fallen_back(START, whole, [True] * 4) == START
+    assert coupled(whole, ["r"]) == [name in {"p", "r"} for name in START.outputs]

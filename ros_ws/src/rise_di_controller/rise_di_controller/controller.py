@@ -145,8 +145,10 @@ class Controller:
 
     def oscillations(self) -> dict[str, float]:
         """Periods, s, of the outputs that oscillate under a model learned in flight, more than before."""
-        periods = zip(self._parameters.outputs, self._oscillations.periods.tolist(), strict=True)
-        return {name: period for name, period in periods if period and not self._first_law}
+        if self._first_law or not self._oscillations.periods.any():
+            return {}
+        periods = zip(self._parameters.outputs, (self._learned * self._oscillations.periods).tolist(), strict=True)
+        return {name: period for name, period in periods if period}
 
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return (parameters.observer, parameters.feedforward) == (self._first.observer, self._first.feedforward)

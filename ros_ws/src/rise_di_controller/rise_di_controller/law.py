@@ -12,6 +12,8 @@ from flight_core.vectors import Array, array_namespace
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw
 from rise_di_controller.saturation import Limits, saturate
 
+MIN_GAIN = 0.01  # lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive
+
 
 class Sign(IntEnum):
     """How Sgn(e) of equation (21) is evaluated at the samples."""

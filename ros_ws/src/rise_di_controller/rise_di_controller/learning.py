@@ -6,12 +6,15 @@ Pure: for the node and for the loop in one process.
 """
 
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from flight_core.parameters import ParameterError, flatten, require
+import numpy as np
+
+from flight_core.parameters import SMALLEST, ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
 from rise_di_controller.controller import Controller, Prepared, prepared
+from rise_di_controller.law import MIN_GAIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
@@ -75,7 +78,7 @@ class Learning:
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
-        self._oscillated = ""  # why no model flies any more
+        self._barred = set[str]()  # inputs of the parts that oscillated: no model of these flies any more
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
 
     def ticked(self, now_ns: int) -> bool:
@@ -111,14 +114,23 @@ class Learning:
         if not self._simulated:
             taken = self._certify(controller, now_ns)
         if oscillations := controller.oscillations():
-            self._oscillated = " and ".join(
-                f"{name} oscillated at {1.0 / period:.2g} Hz" for name, period in oscillations.items()
-            )
-        if oscillations or controller.diverges():
-            why = f"{self._oscillated}, for the rest of the flight" if oscillations else "it diverges"
+            taken = self._end_oscillations(oscillations, controller, now_ns)
+        elif controller.diverges():
             taken = controller.first
-            self._take(controller, now_ns, prepared(taken), f"falls back to the law of the start: {why}")
+            self._take(controller, now_ns, prepared(taken), "falls back to the law of the start: it diverges")
         return taken
+
+    def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
+        """Take the law of the start, to the end of the flight, in the parts of the model whose outputs oscillate."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        bare = coupled(flown, periods)
+        self._barred |= {name for name, without in zip(flown.inputs, bare, strict=True) if without}
+        fallen = fallen_back(self._start, flown, bare)
+        rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
+        outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
+        self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start in {outputs}, for good: {rates}")
+        return fallen
 
     def _acts_ns(self, end_ns: int) -> int:
         return end_ns + nanoseconds(self._settings.latency)
@@ -141,10 +153,9 @@ class Learning:
         return _race(proposal, flown)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
-        if proposal.change and self._oscillated:
-            self._announce(Event(now_ns, {}, f"refused: {self._oscillated} under a learned model"))
-        elif proposal.change:
-            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
+        if proposal.change:
+            certificate = _certificate(controller.parameters, proposal.change, self._start, sorted(self._barred))
+            self._certificate = proposal, certificate
         else:
             self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
 
@@ -186,7 +197,9 @@ def _race(proposal: Proposal, flown: int) -> str:
     return f"found a proposal beside the parameters {proposal.flown}, expected {flown}: they changed meanwhile"
 
 
-def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
+def _certificate(
+    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig, barred: Sequence[str]
+) -> Generator[None, None, Prepared]:
     """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
@@ -201,6 +214,9 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
         ", ".join(proposed.observer.states),
         f"those of the start: {', '.join(start.observer.states)}",
     )
+    again = [name for name in acting_inputs(proposed) if name in barred]
+    expected = f"none of {', '.join(barred)}: their outputs oscillated"
+    require(not again, "proposal", f"a model of {', '.join(again)}", expected)
     least = start.observer.margin
     found = proposed.observer.margin
     require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
@@ -220,6 +236,73 @@ def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
         for parameters in (old, new)
     )
     return dict.fromkeys([*before, *OPTIONAL]) | after
+
+
+def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]) -> RiseDiConfig:
+    """A controller with the gains of `start` in some channels, without feedforward and observer there; not checked.
+
+    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
+    input scale, so that the law holds it.
+    """
+    law, own = start.law_params(), designed.law_params()
+    last, channels = own.K[-1], np.array(bare)
+    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
+    K[-1] = last
+    share = np.where(channels, law.K / K, 1.0)
+    scale = np.where(channels, law.input_scale * share, own.input_scale)
+    of_start, of_designed = (
+        (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
+        for part in (start, designed)
+    )
+    beta, Lambda, omega, softening = (
+        np.where(channels, kept * factor, taken)
+        for kept, taken, factor in zip(of_start, of_designed, (1.0 / share, 1.0, share, 1.0), strict=True)
+    )
+    changed: dict[str, Any] = {
+        "k_d": tuple((K[:-1] - last).tolist()),
+        "Lambda": tuple(Lambda.tolist()),
+        "beta": tuple(beta.tolist()),
+        "omega": tuple(omega.tolist()),
+        "softening": tuple(softening.tolist()),
+        "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
+    }
+    observer, feedforward = designed.observer, designed.feedforward
+    if channels.any() and observer is not None and feedforward is not None:
+        F = np.reshape(observer.F, (len(bare), -1)) * ~channels[:, None]
+        acting = feedforward.inputs or start.inputs
+        flown = tuple(name for name, without in zip(start.inputs, bare, strict=True) if name in acting and not without)
+        changed["observer"] = observer.model_copy(update={"F": tuple(F.ravel().tolist())})
+        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
+    return designed.model_copy(update=changed)
+
+
+def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
+    """The inputs with a feedforward or an observer: those of the parts with a model."""
+    feedforward, observer, inputs = parameters.feedforward, parameters.observer, parameters.inputs
+    fed = () if feedforward is None else feedforward.inputs or inputs
+    F = np.zeros(len(inputs)) if observer is None else np.array(observer.F)
+    return tuple(name for name, row in zip(inputs, F.reshape(len(inputs), -1), strict=True) if name in fed or row.any())
+
+
+def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
+    """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
+    acting = acting_inputs(flown)
+    if all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
+        return start
+    mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
+    return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
+
+
+def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
+    """Mask of the outputs that the model of the feedforward couples with some of them, (m,)."""
+    model = parameters.feedforward
+    assert model is not None  # noqa: S101 - a learned model flies
+    n = len(model.states)
+    A, gravity, B = (np.reshape(values, (n, -1)) != 0.0 for values in (model.A, model.gravity or np.zeros(n), model.B))
+    links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
+    reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
+    at = [model.states.index(name) for name in names]
+    return [bool(np.any(reached[model.states.index(output), at])) for output in parameters.outputs]
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:

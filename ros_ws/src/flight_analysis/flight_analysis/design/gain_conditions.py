@@ -24,13 +24,12 @@ from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 from rise_di_controller import law
 from rise_di_controller.decomposition import decompose
-from rise_di_controller.law import LawParams, Sign
+from rise_di_controller.law import MIN_GAIN, LawParams, Sign
 from rise_di_controller.linear_loop import Loop
 
 MIN_K = 1.5
 """1/s, lower bound of K, since (22) requires K > 1. A slower channel gets this K and a smaller input scale: the same loop."""
 
-MIN_GAIN = 0.01  # lower bound of k_d (1/s), k_g (1/s) and beta (units of y / s^2): (21), (22) require them to be positive
 K_G_MARGIN = 1.5  # factor of k_g above its bound rho^2 / (4 min(Lambda, 1)). Step 2 then leaves a third of the decay to step 3.
 MAX_STEP_3_FRACTION = 0.3  # fraction of the decay that all of step 3 uses, out of that third
 

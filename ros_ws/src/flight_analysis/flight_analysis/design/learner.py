@@ -7,15 +7,14 @@ refused with a sentence. The controller refuses parameters that fail its own che
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
-from flight_analysis.design.gain_conditions import MIN_GAIN
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import (
@@ -28,9 +27,10 @@ from flight_analysis.design.model_identification import (
     identify,
     with_entries,
 )
-from flight_core.parameters import SMALLEST, ParameterError, require
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
+from rise_di_controller.learning import fallen_back, with_channels_of
 from rise_di_controller.rise_di import RiseDiConfig
 
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
@@ -77,9 +77,10 @@ class Learner:
         self._first_ns: int | None = None
         self._prior, self._model = airframe, airframe  # of the next identification; what flies
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
-        self._dead: dict[tuple[str, ...], str] = {}  # inputs without effect by the outputs of their part
+        # Parts that fly the law of the start for good: their inputs without effect, "" where the part oscillated
+        self._dead: dict[tuple[str, ...], str] = {}
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
-        self._proposed = controller.digest()  # of what was proposed last
+        self._last, self._proposed = controller, controller.digest()  # what was proposed last
         self.identification: Identification | None = None  # the last one
 
     @property
@@ -121,12 +122,15 @@ class Learner:
         first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
 
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
-        controller fell back.
+        controller fell back. A part that the controller alone took back, because it oscillated, is not proposed again.
         """
         end_ns = self._record[-1][0] if self._record else 0
         length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
             return Proposal(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
+        if (fallen := self._fallen(flown)) is not None:
+            self._dead[fallen], self._proposed = "", flown
+            del self._known[fallen]
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
         found = [change for change in changes if change.found]
@@ -145,6 +149,7 @@ class Learner:
         sentences = [
             f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
             for part, name in (gone if lost else dead).items()
+            if name
         ]
         sentences += [
             f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}" for change in found if not change.dead
@@ -189,8 +194,18 @@ class Learner:
         new = [*gone, *(part for part, value in known.items() if value.end_ns == end_ns)]
         self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
         self._known, self._model, self._dead = known, model, gone
-        self._proposed = proposed.digest()
+        self._last, self._proposed = proposed, proposed.digest()
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
+
+    def _fallen(self, flown: int) -> tuple[str, ...] | None:
+        """The part that the controller flies by the law of the start, unlike the last proposal; None where it flies that."""
+        if flown == self._proposed:
+            return None
+        for part in self._known:
+            bare = [output in part for output in self._controller.outputs]
+            if fallen_back(self._controller, self._last, bare).digest() == flown:
+                return part
+        return None
 
     def _is_due(self, end_ns: int) -> bool:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""
@@ -226,43 +241,6 @@ class Learner:
             designed = self._design(designed, model)
         proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
         return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": start.model_dump()["learn"]}, "proposal")
-
-
-def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]) -> RiseDiConfig:
-    """A controller with the gains of `start` in some channels, without feedforward and observer there; not checked.
-
-    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
-    input scale, so that the law holds it.
-    """
-    law, own = start.law_params(), designed.law_params()
-    last, channels = own.K[-1], np.array(bare)
-    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
-    K[-1] = last
-    share = np.where(channels, law.K / K, 1.0)
-    scale = np.where(channels, law.input_scale * share, own.input_scale)
-    of_start, of_designed = (
-        (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
-        for part in (start, designed)
-    )
-    beta, Lambda, omega, softening = (
-        np.where(channels, kept * factor, taken)
-        for kept, taken, factor in zip(of_start, of_designed, (1.0 / share, 1.0, share, 1.0), strict=True)
-    )
-    changed: dict[str, Any] = {
-        "k_d": tuple((K[:-1] - last).tolist()),
-        "Lambda": tuple(Lambda.tolist()),
-        "beta": tuple(beta.tolist()),
-        "omega": tuple(omega.tolist()),
-        "softening": tuple(softening.tolist()),
-        "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
-    }
-    observer, feedforward = designed.observer, designed.feedforward
-    if channels.any() and observer is not None and feedforward is not None:
-        F = np.reshape(observer.F, (len(bare), -1)) * ~channels[:, None]
-        flown = tuple(name for name, without in zip(start.inputs, bare, strict=True) if not without)
-        changed["observer"] = observer.model_copy(update={"F": tuple(F.ravel().tolist())})
-        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
-    return designed.model_copy(update=changed)
 
 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:

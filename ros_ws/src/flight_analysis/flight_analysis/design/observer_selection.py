@@ -34,7 +34,7 @@ from control_laws.observer_design import (
     vane_correction,
 )
 from flight_analysis.closed_loop.margins import law_order, loop_of
-from flight_analysis.design.gain_conditions import MIN_GAIN, MIN_K, Condition, failing
+from flight_analysis.design.gain_conditions import MIN_K, Condition, failing
 from flight_analysis.design.gain_selection import with_feedforward
 from flight_analysis.design.nominal import nominal_model
 from flight_analysis.design.requirement import (
@@ -49,7 +49,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
-from rise_di_controller.law import gain
+from rise_di_controller.law import MIN_GAIN, gain
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law, spectral_radius
 from rise_di_controller.margins import loop_margins
 from rise_di_controller.observer import without_frozen
