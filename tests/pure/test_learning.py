@@ -283,6 +283,8 @@ def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
     flight.update()
     shown = [event for event in flight.events if event.kind == "learning"]
     assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines
+    (changed,) = (event.text for event in flight.events if event.kind == "parameter")
+    assert "observer.F = 76 values" in changed
 
 
 def test_page_shows_known_entries_and_measured_error_by_model(flown: Flown) -> None:

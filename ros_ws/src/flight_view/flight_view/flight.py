@@ -81,6 +81,7 @@ LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leav
 MAX_EVENTS, MAX_NOTES, MAX_CHANNELS, MAX_SPANS = 5000, 50, 200, 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
+MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
 SILENT = 1.0  # s without a sample after which the state is "no data"
 
 
@@ -431,7 +432,7 @@ class Flight:
                 # Before the first sample, starting nodes declare parameters.
                 new = message.new_parameters if self._first_ns is not None else []
                 changed = {entry.name: parameter_value(entry.value) for entry in (*new, *message.changed_parameters)}
-                text = ", ".join(f"{name} = {value}" for name, value in changed.items())
+                text = ", ".join(f"{name} = {_shown(value)}" for name, value in changed.items())
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
                     self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
@@ -480,6 +481,11 @@ class Flight:
         columns = [k for k, name in enumerate(ticks.names) if name.startswith(f"{group}.")]
         names = tuple(ticks.names[k].removeprefix(f"{group}.") for k in columns)
         return Signal(ticks.stamp_ns, names, ticks.values[:, columns].astype(float))
+
+
+def _shown(value: Any) -> str:
+    """The value of a parameter; of a matrix its size."""
+    return f"{len(value)} values" if isinstance(value, list) and len(value) > MAX_VALUES else str(value)
 
 
 def _text(text: str) -> str:
