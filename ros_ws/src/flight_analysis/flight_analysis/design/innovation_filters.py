@@ -181,23 +181,25 @@ class Passage:
         lifted = [bank.lifted(kind >> HOLD, [bool(kind >> j & 1) for j in range(HOLD)]) for kind in kinds.tolist()]
         self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
         own, driven = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]], slice(s, s + 2 * HOLD * m)
+        following = HOLD * m + np.append(np.arange(s), self._angles)  # z, and again its angles, in place of sin(x) - x
         for k, matrix in enumerate(lifted):
             of = np.flatnonzero(self._kind == k)
             forced = matrix[..., driven] @ inputs[..., of]
-            self._forced[..., of], self._states[of + 1, :, :s, 0] = forced[:, :-s], np.moveaxis(forced[:, -s:], -1, 0)
-        self._steps = [np.ascontiguousarray(matrix[:, -s:, own]) for matrix in lifted]
+            self._forced[..., of], self._states[of + 1, ..., 0] = forced[:, :-s], np.moveaxis(forced[:, following], -1, 0)
+        self._steps = [np.ascontiguousarray(matrix[:, following][..., own]) for matrix in lifted]
         self._outputs = [np.ascontiguousarray(matrix[:, :-s, own]) for matrix in lifted]
 
     def run(self, z: FloatArray, first: int = 0, last: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and z after them."""
-        (N, m, s), angles, steps = self._shape, self._angles, self._steps
+        (N, m, s), steps = self._shape, self._steps
         kind = self._kind[first:last]
         states = self._states[first : first + len(kind) + 1]
-        states[0, :, :s, 0] = z
-        for k, now, following in zip(kind.tolist(), states[:-1], states[1:], strict=True):
-            turned = now[:, angles]
-            np.subtract(np.sin(turned), turned, out=now[:, s:])
-            following[:, :s] += steps[k] @ now
+        states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
+        sine, moved = np.empty(states[0, :, s:].shape), np.empty(states[0].shape)
+        # the loop is half of a search: no array is made in it
+        for k, now, turned, following in zip(kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True):
+            np.subtract(np.sin(turned, sine), turned, turned)
+            np.add(following, np.matmul(steps[k], now, moved), following)
         r, x = self._forced[..., first : first + len(kind)].copy(), np.moveaxis(states[:-1, ..., 0], 0, -1)
         for k in np.unique(kind).tolist():
             of = kind == k
