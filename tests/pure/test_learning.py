@@ -3,6 +3,7 @@
 """Learning in the air: a flight that learns beside the law alone, its replay, proposals that are wrong, and the fallback."""
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -26,9 +27,10 @@ from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
 from flight_bringup.scenarios import find_scenario, written
 from flight_cli.cli import application
+from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Tape
+from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
@@ -147,6 +149,17 @@ def test_log_teaches_with_other_settings(flown: Flown) -> None:
     first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
     assert first.startswith("t = 10.00 s: B["), result.output
     assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
+
+
+def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
+    tape = read_run(flown.run).tape
+    ticks, t = tape["internals"], tape.time("internals")
+    changed = ticks.values.copy()
+    changed[(t > 5.0) & (t < 6.0), ticks.names.index("mode")] = Mode.INACTIVE
+    cut = replace(tape, signals={"internals": Signal(ticks.stamp_ns[t < 9.5], ticks.names, changed[t < 9.5])})
+    steps = learn_again(cut, scenario(learn={"updates": [3.0]})).steps
+    assert [step.t for step in steps] == pytest.approx([3.0, 9.0], abs=0.021)  # 3 s from the first tick of either engagement
+    assert [step.sentence for step in steps] == ["record: found 3.01 s, expected 10 s"] * 2
 
 
 def test_log_that_ends_before_first_update_is_refused(flown: Flown) -> None:

@@ -7,12 +7,15 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flight_bringup.graph import LEARNER, parameter_overrides, second_stage
 from flight_bringup.scenarios import find_scenario
+from flight_core.modes import Mode
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import StampedVector
 from rise_di_controller.controller import Controller
 from rise_di_controller.learning import (
     DESIGNED,
@@ -40,12 +43,21 @@ CHANGE = {name: value for name, value in FLATTENED if name.split(".")[0] in DESI
 
 
 class Flight:
-    """A controller that has not engaged, and the proposals of its flight."""
+    """An engaged controller, and the proposals of its flight."""
 
     def __init__(self, *, simulated: bool = False) -> None:
         self.controller, self.events = Controller(START), list[Event]()
         self.learning = Learning(START, self.events.append, simulated=simulated)
         self.now_ns = END_NS
+        self.engage()
+
+    def engage(self) -> None:
+        """A tick with y and y_m of now."""
+        now = StampedVector(self.now_ns, np.zeros(len(START.outputs)))
+        self.controller.take_y(now, self.now_ns)
+        self.controller.take_y_m(now, self.now_ns)
+        self.controller.tick(self.now_ns)
+        assert self.controller.mode is Mode.ENGAGED
 
     def receive(self, change: dict[str, Any] | None = None, **replaced: Any) -> None:
         """A proposal of now."""
@@ -204,6 +216,39 @@ def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None
 def test_latency_above_shortest_spacing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"learn\.latency: found 6 s, expected at most 5 s"):
         find_scenario("osprey_learn").vary(controller={"learn": {"latency": 6.0}})
+
+
+def test_stale_law_takes_no_model() -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step(3)
+    flight.now_ns += nanoseconds(START.max_age) + 1
+    flight.controller.tick(flight.now_ns)
+    flight.step()
+    assert flight.sentences == ["refused: found the mode HOLD, expected a model only while the law is engaged"]
+    assert flight.controller.digest == START.digest()
+
+
+def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagement_alone() -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step()
+    assert flight.controller.has_learned_model
+    released_ns = flight.now_ns = flight.now_ns + NANOSECONDS
+    flight.controller.tick(flight.now_ns, active=False)
+    u = flight.controller.state.u
+    assert flight.step(1) == 1
+    assert flight.sentences[-1] == "goes back to the law of the start: it was deactivated"
+    assert flight.controller.digest == START.digest()
+    assert flight.controller.state.u.tobytes() == u.tobytes()
+    assert flight.step(3) == 3  # said once
+    flight.now_ns += nanoseconds(3.0)
+    flight.engage()
+    flight.receive(stamp_ns=released_ns - 1)
+    assert flight.sentences[-1] == "refused: found a window that ends 3 s ago, expected 0 to 3 s"
+    flight.receive()
+    flight.step()
+    assert flight.sentences[-1] == "flies model"
 
 
 def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behind_a_bridge(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
 import psutil
 import pytest
 from rcl_interfaces.srv import GetParameters
@@ -18,16 +19,20 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario, written
+from flight_core.modes import Mode
 from flight_core.rates import nanoseconds
 from flight_log.tape_reader import read_run
 from flight_ros import reports
+from flight_ros.messages import to_message
 from flight_ros.reports import Report
-from flight_ros.topics import LEARNING, PROPOSAL, PUBLISH
+from flight_ros.topics import INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PUBLISH
 from rise_di.learning import learner
 from rise_di_controller.learning import Event, designed
 from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = pytest.mark.package("flight_learner")
+
+CHANNELS = (("y", "outputs"), ("u", "inputs"))  # of `internals`, and the parameter with their names
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
@@ -139,6 +144,36 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     said = command.output.count("t = ")
     command.until(lambda: command.output.count("t = ") > said)
     assert command.interrupt().end() == 130  # it flew on until then
+
+
+def test_deactivated_law_ends_the_record(start: Start, tmp_path: Path) -> None:
+    """The times of the identifications count from the next engagement, and the record before is forgotten."""
+    chosen, said = scenario(tmp_path, updates=[3.0]), list[str]()
+    controller = chosen.rise_di()
+    names = ("mode", "age", "parameters", *(f"{group}.{name}" for group, of in CHANNELS for name in getattr(controller, of)))
+
+    with peer(topics=()) as peer_node:
+        learning = ("--ros-args", "-p", f"scenario_file:={chosen.path}", "-p", "lockstep:=true")
+        start("flight_learner.main", *learning).wait_for("learner")
+        publish = peer_node.node.create_publisher(INTERNALS.type, INTERNALS.name, LOCKSTEP).publish
+        peer_node.node.create_subscription(
+            PROPOSAL.type, PROPOSAL.name, lambda raw: said.append(reports.decode(raw).sentence), LOCKSTEP, raw=True
+        )
+        peer_node.until(
+            lambda: peer_node.node.count_subscribers(INTERNALS.name) and peer_node.node.count_publishers(PROPOSAL.name)
+        )
+        for t, mode in (
+            (1, Mode.ENGAGED),
+            (3, Mode.ENGAGED),
+            (3.5, Mode.INACTIVE),
+            (5, Mode.ENGAGED),
+            (7, Mode.ENGAGED),
+            (8, Mode.ENGAGED),
+        ):
+            values = np.array([float(mode), 0.0, float(controller.digest()), *np.zeros(len(names) - 3)])
+            publish(to_message(nanoseconds(t), names, values, "controller#1"))
+        peer_node.until(lambda: said)
+    assert said == ["record: found 3.01 s, expected 10 s"]  # from 5 to 8 s
 
 
 def test_learner_refuses_a_scenario_that_does_not_learn(start: Start) -> None:

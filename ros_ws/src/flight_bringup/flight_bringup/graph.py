@@ -124,7 +124,8 @@ def second_stage(scenario: Scenario, *, bridge: bool = False) -> tuple[NodeSpec,
     if not bridge:
         require_guidable(scenario)
     learns = scenario.learns()
-    require(not (bridge and learns), "controller.learn", "a bridge", "a simulated aircraft: no autopilot was flown with it")
+    expected = "a simulated aircraft: models from flights of autopilots fail the learner's checks"
+    require(not (bridge and learns), "controller.learn", "a bridge", expected)
     stage = SECOND_STAGE_WITH_BRIDGE if bridge else SECOND_STAGE
     return (*stage, *_optional(scenario))
 

@@ -8,6 +8,7 @@ The search runs in a thread of low priority. The loop does not wait for it in re
 import os
 import threading
 import traceback
+from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -51,7 +52,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
             raise ParameterError("learner.scenario_file: found a scenario without controller.learn, expected one that learns")
         self._start = scenario.rise_di()
         assert self._start.learn is not None  # noqa: S101 - for the type checker
-        self._learner, self._updates = make(self._start), Updates(self._start.learn)
+        self._settings, self._new_learner = self._start.learn, partial(make, self._start)
         names = ("mode", "age", "parameters", *(f"y.{name}" for name in self._start.outputs))
         names += tuple(f"u.{name}" for name in self._start.inputs)
         self._internals = self.receive(
@@ -63,9 +64,15 @@ class LearnerNode(FlightNode[LearnerConfig]):
             qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
         )
         self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
-        self._identifications = Identifications(self._learner, self._start.outputs)
         self._search: threading.Thread | None = None
-        self._proposal, self._end_ns, self._flown, self._is_due = Proposal(None, ""), 0, 0, False
+        self._proposal, self._end_ns, self._flown = Proposal(None, ""), 0, 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with an empty record."""
+        self._learner, self._updates = self._new_learner(), Updates(self._settings)
+        self._identifications = Identifications(self._learner, self._start.outputs)
+        self._has_record = self._is_due = False
         self._said = "no model yet"
 
     def period_ns(self) -> int:
@@ -117,8 +124,13 @@ class LearnerNode(FlightNode[LearnerConfig]):
     def _take(self, sample: StampedVector, now_ns: int) -> None:
         mode, age, flown = sample.value[:3].tolist()
         y, u = np.split(sample.value[3:], 2)
+        if mode == Mode.INACTIVE:  # the next engagement begins with the law of the start
+            if self._has_record:
+                self._begin()
+            return
         if mode == Mode.ENGAGED:
             self._learner.take(sample.stamp_ns, y, u)
+        self._has_record = True
         self._end_ns, self._flown = sample.stamp_ns + round(age * NANOSECONDS), int(flown)
         self._is_due = self._updates.due(self._end_ns) or self._is_due
 

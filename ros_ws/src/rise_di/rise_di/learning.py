@@ -76,28 +76,39 @@ class LearnResult(NamedTuple):
 def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError.
 
-    Where the log has other settings of the learner than the scenario, or none, each proposal is taken as flown.
+    A deactivated law ends a record, as in flight. Where the log has other settings of the learner than the scenario, or none,
+    each proposal is taken as flown.
     """
     make, controller = learner(scenario, real_time=tape.start_ns > 0), scenario.rise_di()  # simulated time begins at 0
     require(make is not None, "controller.learn", "no section", "one")
     assert make is not None  # noqa: S101 - for the type checker
-    assert controller.learn is not None  # noqa: S101 - there is a learner
-    learned = make(controller)
-    assert isinstance(learned, Learner)  # noqa: S101 - `learner` makes no other
+    settings = controller.learn
+    assert settings is not None  # noqa: S101 - there is a learner
+
+    def begun() -> tuple[Learner, Updates]:
+        made = make(controller)
+        assert isinstance(made, Learner)  # noqa: S101 - `learner` makes no other
+        return made, Updates(settings)
+
     require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
-    ticks, updates, steps = tape["internals"], Updates(controller.learn), list[LearnStep]()
-    y, u, engaged = ticks.group("y").values, ticks.group("u").values, ticks["mode"] == Mode.ENGAGED
-    flown, proposed = ticks["parameters"], controller.digest()
-    is_of_log = bool(np.any(flown == proposed))
+    ticks, steps = tape["internals"], list[LearnStep]()
+    y, u, mode = ticks.group("y").values, ticks.group("u").values, ticks["mode"]
+    flown, start = ticks["parameters"], controller.digest()
+    is_of_log = bool(np.any(flown == start))
+    (learned, updates), proposed = begun(), start
     for k, stamp_ns in enumerate(ticks.stamp_ns.tolist()):
-        if engaged[k]:
+        if mode[k] == Mode.INACTIVE:
+            continue
+        if k and mode[k - 1] == Mode.INACTIVE:
+            (learned, updates), proposed = begun(), start
+        if mode[k] == Mode.ENGAGED:
             learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
         if updates.due(stamp_ns):
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (stamp_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
-    first = f"{controller.learn.updates[0]:g} s or more, the first of learn.updates"
+    first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
     require(bool(steps), "the log", f"{(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) / NANOSECONDS:.3g} s of ticks", first)
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)

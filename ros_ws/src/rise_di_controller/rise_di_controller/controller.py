@@ -93,6 +93,11 @@ class Controller:
         """Digest of the parameters in force."""
         return self._digest
 
+    @property
+    def has_learned_model(self) -> bool:
+        """Whether feedforward and observer are others than at the start, as a learner proposes them."""
+        return not self._first_law
+
     def restart(self) -> None:
         """Engage the law again with the next fresh y and y_m, from the u of then (bumpless transfer); a failsafe goes on."""
         if self._state.mode is Mode.ENGAGED:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_core.modes import Mode
 from flight_core.parameters import SMALLEST, ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
 from rise_di_controller.controller import Controller, Prepared, prepared
@@ -80,6 +81,7 @@ class Learning:
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
         self._barred = set[str]()  # inputs of the parts that oscillated: no model of these flies any more
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
+        self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
 
     def ticked(self, now_ns: int) -> bool:
         """Note a tick of the engaged law or of its failsafe; whether an identification begins with it."""
@@ -94,7 +96,7 @@ class Learning:
 
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
-        if refusal := self._refusal(proposal, now_ns, controller.digest):
+        if refusal := self._refusal(proposal, now_ns, controller):
             self._announce(Event(now_ns, {}, f"refused: {refusal}"))
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
@@ -105,8 +107,11 @@ class Learning:
     def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Certify, let the proposals act that are due, and fall back where the law diverges.
 
+        A deactivated law begins again with the parameters of the start: it may have been deactivated because of its model.
         Returns the parameters that the controller has taken; None where it keeps its own.
         """
+        if controller.mode is Mode.INACTIVE:
+            return self._begin_again(controller, now_ns)
         taken = None
         while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
             self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
@@ -132,10 +137,20 @@ class Learning:
         self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start in {outputs}, for good: {rates}")
         return fallen
 
+    def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Forget what is under way; the parameters of the start where a learned model flew."""
+        self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
+        self._due.clear()
+        self._received.clear()
+        if not controller.has_learned_model:
+            return None
+        self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
+        return self._start
+
     def _acts_ns(self, end_ns: int) -> int:
         return end_ns + nanoseconds(self._settings.latency)
 
-    def _refusal(self, proposal: Proposal, now_ns: int, flown: int) -> str:
+    def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
         """Why a proposal is not certified at all; empty for one that may be. Costs microseconds, whatever the proposal."""
         window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
         if proposal.start != self._digest:
@@ -143,14 +158,17 @@ class Learning:
         if self._simulated:
             known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
             return "" if known else f"found {window}, expected that of an identification that is due, once"
-        if not 0 <= now_ns - proposal.stamp_ns <= nanoseconds(self._settings.window):
-            return f"found {window}, expected 0 to {self._settings.window:g} s"
+        longest = nanoseconds(self._settings.window)
+        if self._since_ns is not None:
+            longest = min(longest, now_ns - self._since_ns)
+        if not 0 <= now_ns - proposal.stamp_ns <= longest:
+            return f"found {window}, expected 0 to {seconds(longest):.3g} s"
         if self._certificate is not None:
             return f"found {window} while another proposal is certified, expected one at a time"
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
             later = f"one that ends at least {seconds(self._spacing_ns):g} s after that of the last proposal"
             return f"found {window}, expected {later}"
-        return _race(proposal, flown)
+        return _unfit(proposal, controller)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
@@ -170,7 +188,7 @@ class Learning:
                 next(certificate)
         except StopIteration as end:
             self._certificate = None
-            refusal = _race(proposal, controller.digest)
+            refusal = _unfit(proposal, controller)
             if not refusal:
                 self._take(controller, now_ns, end.value, f"flies {proposal.sentence}")
                 return controller.parameters
@@ -190,11 +208,13 @@ class Learning:
         self._announce(Event(now_ns, change, sentence))
 
 
-def _race(proposal: Proposal, flown: int) -> str:
-    """The refusal of a proposal that lost the race with another change of the parameters; else empty."""
-    if proposal.flown == flown:
+def _unfit(proposal: Proposal, controller: Controller) -> str:
+    """The refusal of a proposal for a law that is not engaged, or that lost the race with another change; else empty."""
+    if controller.mode is not Mode.ENGAGED:
+        return f"found the mode {controller.mode.name}, expected a model only while the law is engaged"
+    if proposal.flown == controller.digest:
         return ""
-    return f"found a proposal beside the parameters {proposal.flown}, expected {flown}: they changed meanwhile"
+    return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
 
 
 def _certificate(
