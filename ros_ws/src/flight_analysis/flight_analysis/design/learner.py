@@ -8,6 +8,7 @@ refused with a sentence. The controller refuses parameters that fail its own che
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -80,7 +81,8 @@ class Learner:
         # Parts that fly the law of the start for good: their inputs without effect, "" where the part oscillated
         self._dead: dict[tuple[str, ...], str] = {}
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
-        self._last, self._proposed = controller, controller.digest()  # what was proposed last
+        self._flew = self._last = controller  # the last proposal that flew, and the last one
+        self._proposed = controller.digest()  # of the last one
         self.identification: Identification | None = None  # the last one
 
     @property
@@ -128,9 +130,7 @@ class Learner:
         length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
             return Proposal(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
-        if (fallen := self._fallen(flown)) is not None:
-            self._dead[fallen], self._proposed = "", flown
-            del self._known[fallen]
+        self._note_fallback(flown)
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
         found = [change for change in changes if change.found]
@@ -197,15 +197,19 @@ class Learner:
         self._last, self._proposed = proposed, proposed.digest()
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
-    def _fallen(self, flown: int) -> tuple[str, ...] | None:
-        """The part that the controller flies by the law of the start, unlike the last proposal; None where it flies that."""
+    def _note_fallback(self, flown: int) -> None:
+        """Give up a part that the controller flies by the law of the start, unlike the model that was proposed or flew."""
         if flown == self._proposed:
-            return None
-        for part in self._known:
-            bare = [output in part for output in self._controller.outputs]
-            if fallen_back(self._controller, self._last, bare).digest() == flown:
-                return part
-        return None
+            self._flew = self._last
+            return
+        for model, part in product((self._last, self._flew), tuple(self._known)):
+            fallen = fallen_back(self._controller, model, [output in part for output in self._controller.outputs])
+            if fallen.digest() == flown:
+                self._dead[part] = ""
+                del self._known[part]
+                if model is self._last:  # else the controller refused that, too
+                    self._last, self._proposed = fallen, flown
+                return
 
     def _is_due(self, end_ns: int) -> bool:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""
