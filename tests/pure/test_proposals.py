@@ -263,7 +263,7 @@ def test_learner_starts_beside_the_nodes_of_a_scenario_that_learns_but_not_behin
         second_stage(scenario, bridge=True)
 
 
-def test_part_that_oscillates_flies_the_law_of_the_start_for_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engagement(monkeypatch: pytest.MonkeyPatch) -> None:
     flight = Flight()
     flight.receive()
     flight.step()
@@ -286,10 +286,18 @@ def test_part_that_oscillates_flies_the_law_of_the_start_for_the_flight(monkeypa
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
-        "falls back to the law of the start in q, V, for good: q oscillates at 4 Hz",
+        "falls back to the law of the start in q, V, to the end of the engagement: q oscillates at 4 Hz",
         "refused: proposal: found a model of elevator, thrust, expected none of elevator, thrust: their outputs oscillated",
         "flies model",
     ]
+    flight.now_ns += NANOSECONDS
+    flight.controller.tick(flight.now_ns, active=False)
+    flight.step(1)
+    flight.now_ns += NANOSECONDS
+    flight.engage()
+    flight.receive()
+    flight.step()
+    assert acting_inputs(flight.controller.parameters) == START.inputs  # type: ignore[arg-type]
 
 
 def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:

@@ -126,7 +126,7 @@ class Learning:
         return taken
 
     def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
-        """Take the law of the start, to the end of the flight, in the parts of the model whose outputs oscillate."""
+        """Take the law of the start, to the end of the engagement, in the parts of the model whose outputs oscillate."""
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
@@ -134,7 +134,8 @@ class Learning:
         fallen = fallen_back(self._start, flown, bare)
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
         outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
-        self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start in {outputs}, for good: {rates}")
+        what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
+        self._take(controller, now_ns, prepared(fallen), what)
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
@@ -142,6 +143,7 @@ class Learning:
         self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
         self._due.clear()
         self._received.clear()
+        self._barred.clear()
         if not controller.has_learned_model:
             return None
         self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
