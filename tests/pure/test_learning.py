@@ -214,7 +214,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     entry = Entry("B", "q", "elevator", 56.15, 0.1, 0.01, 56.15)
 
     def part(outputs: tuple[str, ...], *entries: Entry) -> Part:
-        return Part(start.inputs, outputs, entries, worse, better, "", 0.0)
+        return Part(start.inputs, outputs, entries, worse, better, "", 0.0, gusts=False)
 
     whole = part(NAMES, entry, Entry("B", "p", "elevator", 0.0, 0.3, 0.01, 29.0))
     found = [(whole,), (part(("q", "V"), entry), part(("p", "r"), entry))]
@@ -246,6 +246,18 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     again = learned.propose(fallen.digest()).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
+
+
+def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
+    white, flown = Prediction(np.ones(2), np.ones(2), 1.0), load_airframe("osprey")
+    effects = Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)
+    part = Part(("elevator", "thrust"), ("q", "V"), effects, white, white, "", 0.0, gusts=True)
+    assert design_learner.weaker(part, flown).startswith("B[q, elevator]: found 70 % of that of the model that flies")
+    # a first model, one without gusts, and one that is within the deviation that is allowed
+    assert design_learner.weaker(part, None) == ""
+    assert design_learner.weaker(part._replace(gusts=False), flown) == ""
+    near = effects[0]._replace(error=-0.09), effects[1]
+    assert design_learner.weaker(part._replace(entries=near), flown) == ""
 
 
 def test_flight_without_learner_is_refused() -> None:

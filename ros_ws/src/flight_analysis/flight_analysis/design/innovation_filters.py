@@ -29,14 +29,15 @@ DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observ
 MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
 HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
-GUST_TIME = 0.5  # s, decay of the rate of a gust
-LEAST_RATE = 1e-4  # m/s^2 per root s, noise of that rate where there is no gust: negligible
+GUST_TIME, RATE_TIME = 0.5, 0.2  # s, decay of the rate of a gust, and of the change of that rate
+LEAST_RATE = 1e-4  # m/s^3 per root s, noise of that change where there is no gust: negligible
 LEVELS = np.array(
     [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
-    + [(0.03, strength) for strength in (2.5, 5.0, 10.0, 20.0, 40.0)]
+    + [(0.03, strength) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
 )
 """Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of moderate turbulence, and
-noise of its rate, m/s^2 per root s. A gust is smooth: noise of the rate explains a gust, noise of the wind does not."""
+noise of the change of its rate, m/s^3 per root s. A gust is smooth: with noise of the wind, or of its rate, the model has
+gusts as fast as the inputs, and the effects of the inputs come out too weak."""
 
 
 class Recording(NamedTuple):
@@ -231,34 +232,36 @@ def filter_bank(
     *,
     near: bool = False,
 ) -> FilterBank:
-    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, rate, ..].
+    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, v, a, ..].
 
-        w_dot = rate - w / wind_time + noise,  rate_dot = -rate / GUST_TIME + noise
+        w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,  a_dot = -a / RATE_TIME + noise
 
     The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`. Models `near` the
     first one have gains exact to first order.
     """
     wind_time, noise = wind_model(names.winds, speed)
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
-    x, w, rate = np.split(np.arange(n + 2 * G), [n, n + G])
-    A, B, gravity = np.zeros((N, n + 2 * G, n + 2 * G)), np.zeros((N, n + 2 * G, m)), np.zeros((n + 2 * G, n + 2 * G))
+    s = n + 3 * G
+    x, w, v, a = np.split(np.arange(s), [n, n + G, n + 2 * G])
+    A, B, gravity = np.zeros((N, s, s)), np.zeros((N, s, m)), np.zeros((s, s))
     A[:, x[:, None], x], A[:, x[:, None], w], B[:, x], gravity[:n, :n] = model.A, model.wind, model.B, model.gravity
-    A[:, w, w], A[:, w, rate], A[:, rate, rate] = -1.0 / wind_time, 1.0, -1.0 / GUST_TIME
+    A[:, w, w], A[:, v, v], A[:, a, a] = -1.0 / wind_time, -1.0 / GUST_TIME, -1.0 / RATE_TIME
+    A[:, w, v] = A[:, v, a] = 1.0
     each = model._replace(
         A=A[:, None],
         B=B[:, None],
-        C=np.hstack([model.C, np.zeros((m, 2 * G))]),
+        C=np.hstack([model.C, np.zeros((m, 3 * G))]),
         gravity=gravity,
-        wind=np.zeros((n + 2 * G, 0)),
-        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(2 * G)]),
-        size=np.concatenate([model.size, np.ones(2 * G)]),
+        wind=np.zeros((s, 0)),
+        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(3 * G)]),
+        size=np.concatenate([model.size, np.ones(3 * G)]),
     )
-    of_wind = tuple(f"{kind}.{axis}" for kind in ("wind", "rate") for axis in names.winds)
+    of_wind = tuple(f"{kind}.{axis}" for kind in ("wind", "rate", "change") for axis in names.winds)
     sampled = observer_design.aircraft_model(each, names._replace(states=names.states + of_wind, winds=()), np.zeros(0))
-    gust, gust_rate = (
+    gust, change = (
         strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
     )
-    loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, gust_rate + LEAST_RATE], axis=-1)
+    loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, 0.0 * gust, change + LEAST_RATE], axis=-1)
     weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
     L = observer_design.aircraft_correction(sampled, each, weights, corrections_near if near else correction_of)
     # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1

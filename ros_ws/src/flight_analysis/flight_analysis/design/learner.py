@@ -20,11 +20,13 @@ from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import (
     KNOWN,
+    MAX_DEVIATION,
     MAX_WHITENESS,
     PRIOR,
     Identification,
     Part,
     Unknown,
+    best_known,
     identify,
     with_entries,
 )
@@ -174,7 +176,8 @@ class Learner:
                 )
                 continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
-            if not rough and (refusal := part.refusal or not_white(part)):
+            before = model if part.outputs in known.keys() - self._changed else None
+            if not rough and (refusal := part.refusal or not_white(part) or weaker(part, before)):
                 refusals.append(refusal)
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
@@ -265,6 +268,21 @@ def not_white(found: Part) -> str:
         return ""
     name = found.outputs[worst]
     return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
+
+
+def weaker(found: Part, flown: Airframe | None) -> str:
+    """The effect that a record of gusts has weaker than the model that flies, if by more than MAX_DEVIATION.
+
+    Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
+    """
+    if flown is None or not found.gusts:
+        return ""
+    for entry in best_known(found.entries, found.outputs):
+        share = entry.value / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
+        if share < 1.0 - MAX_DEVIATION:
+            expected = f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
+            return f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, {expected}"
+    return ""
 
 
 def sentence(found: Part) -> str:

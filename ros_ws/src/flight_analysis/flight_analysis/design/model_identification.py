@@ -495,6 +495,7 @@ class Part(NamedTuple):
     after: Prediction
     refusal: str  # why this part must not be used, one sentence; empty if it may
     delay: float  # s, of its inputs
+    gusts: bool  # whether FEW of its seconds, or more, are of gusts
 
 
 class Identification(NamedTuple):
@@ -557,7 +558,8 @@ def identify(
             no_better(*predictions),
         )
         refusal, delay = next(filter(None, sentences), ""), recorded.period * search.delay(fit)
-        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay)
+        gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
+        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts)
 
     found = [(search, search.fit(known & ~validating, step)) for search in map(search_of, every)]
     parts = [part_of(*each) for each in found]
@@ -647,11 +649,15 @@ def model_yaml(found: Identification, origin: str) -> str:
 # Reasons against a model, each a sentence, or empty where there is none
 
 
+def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
+    """The best known effect of an input on each output."""
+    effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
+    return [min((entry for entry in effects if entry.row == output), key=lambda one: one.deviation) for output in outputs]
+
+
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
     """The output whose inputs are known worst, if the best known effect on it has a deviation above MAX_DEVIATION."""
-    effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
-    best = [min((entry for entry in effects if entry.row == output), key=lambda one: one.deviation) for output in outputs]
-    worst = max(best, key=lambda one: one.deviation)
+    worst = max(best_known(entries, outputs), key=lambda one: one.deviation)
     if worst.deviation <= MAX_DEVIATION:
         return ""
     # information adds up with the square of the amplitude
