@@ -176,7 +176,7 @@ class Learner:
                 )
                 continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
-            before = model if part.outputs in known.keys() - self._changed else None
+            before = model if part.outputs in known.keys() - self._changed and not lost else None
             if not rough and (refusal := part.refusal or not_white(part) or weaker(part, before)):
                 refusals.append(refusal)
                 continue
