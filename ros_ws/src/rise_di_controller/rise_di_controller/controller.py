@@ -62,7 +62,7 @@ class Controller:
         self._first_law, self._learned = True, _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
         self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
-        self._oscillations = divergence.Oscillations(self._least)
+        self._oscillations, self._learns = divergence.Oscillations(self._least), parameters.history_ticks() > 0
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
@@ -186,7 +186,8 @@ class Controller:
         self._number += self.has_internals
         e = inputs.y - inputs.y_m
         self._errors = divergence.step(self._errors, e, inputs.dt, first_law=self._first_law)
-        self._oscillations.take(e, inputs.dt, None if self._first_law else self._learned)
+        if self._learns:
+            self._oscillations.take(e, inputs.dt, None if self._first_law else self._learned)
         age = seconds(now_ns - inputs.stamp_ns)
         limits, digest = self._guard, self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
