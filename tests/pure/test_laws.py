@@ -63,7 +63,7 @@ def sections() -> dict[str, dict[str, Any]]:
     rise = SERVO.rise_di()
     leading = with_feedforward(rise, AIRFRAME).model_dump()
     gains = gains_by_rule(model_for(AIRFRAME, rise, NOISE), tuple(AIRFRAME.gusts), speed=25.0)
-    observed = with_aircraft_observer(rise, AIRFRAME, gains, NOISE, 0.02).controller.model_dump()
+    observed = with_aircraft_observer(rise, AIRFRAME, [gains], NOISE, 0.02).controller.model_dump()
     extended = {key: observed[key] for key in ("feedforward", "observer")}
     pi, l1 = SECTIONS["pi"], SECTIONS["l1"]
     return {

@@ -53,7 +53,7 @@ def with_observer(controller: RiseDiConfig) -> Scenario:
 def by_rule(margin: float = 0.03) -> observer_selection.SelectedObserver:
     model = model_for(OSPREY, SERVO.controller, NOISE)
     gains = gains_by_rule(model, tuple(OSPREY.gusts), OSPREY.speed)
-    return with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, margin)
+    return with_aircraft_observer(SERVO.rise_di(), OSPREY, [gains], NOISE, margin)
 
 
 @cache
@@ -94,6 +94,20 @@ def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> No
         assert is_stable(plant, law, loop, np.full(4, margin))
         assert not is_stable(plant, law, loop, np.full(4, selected.delay_margin + 0.001))  # the search ends within 0.1 ms
     assert np.prod(by_rule(0.045).relaxation) > np.prod(by_rule(0.03).relaxation)
+
+
+def test_gain_set_that_the_margins_change_least_is_taken() -> None:
+    gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
+    narrow = gains._replace(weights=gains.weights._replace(effort=1.5 * gains.weights.effort))
+    weak = gains._replace(weights=gains.weights._replace(effort=4.0 * gains.weights.effort))
+
+    def selected(*sets: observer_selection.ObserverGains) -> observer_selection.SelectedObserver:
+        return with_aircraft_observer(SERVO.rise_di(), OSPREY, sets, NOISE, 0.045, uncertain=False)
+
+    taken = selected(gains, narrow)
+    assert taken.place == 1
+    assert taken.controller == selected(narrow).controller
+    assert selected(weak, weak).place == 0  # neither needs any
 
 
 def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -137,17 +151,15 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
     flipped = OSPREY.with_matrices(OSPREY.matrix_a(), -OSPREY.matrix_b(), np.ones((8, 3)))
     gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
     with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
-        with_aircraft_observer(SERVO.rise_di(), flipped, gains, NOISE, 0.03)
+        with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
     monkeypatch.setattr(observer_selection, "MAX_RELAXATION", 1.2)  # the search up to 18 takes half a minute
     with pytest.raises(ParameterError, match=r"^--margin: delay margin \(ms\): found .*, expected at least 500"):
-        with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.5)
-    with pytest.raises(ParameterError, match=r"^--margin: found factors with a product of 1, expected less than 1$"):
-        with_aircraft_observer(SERVO.rise_di(), OSPREY, gains, NOISE, 0.03, uncertain=False, below=1.0)
+        with_aircraft_observer(SERVO.rise_di(), OSPREY, [gains], NOISE, 0.5)
     with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
         with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)
     calm = OSPREY.model_copy(update={"gusts": {}})
     with pytest.raises(ParameterError, match=r"^airframe osprey: found no gusts, expected the effect of wind"):
-        with_aircraft_observer(SERVO.rise_di(), calm, gains, NOISE, 0.03)
+        with_aircraft_observer(SERVO.rise_di(), calm, [gains], NOISE, 0.03)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,7 +16,6 @@ from flight_analysis.design.effectors import LAW_INPUT, Effectors, design_alloca
 from flight_analysis.design.gain_selection import GainAssessment, LoopSetting, Selection, Study
 from flight_analysis.design.nominal import sizes
 from flight_analysis.design.observer_selection import (
-    SelectedObserver,
     gains_beside_sketch,
     gains_by_rule,
     gains_of_search,
@@ -28,7 +26,7 @@ from flight_analysis.design.requirement import OBSERVER_REQUIREMENT, PHASE_MARGI
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import tuned_gains
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
-from flight_core.parameters import ParameterError, require
+from flight_core.parameters import require
 from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
@@ -305,23 +303,12 @@ def observed(
     if sketched:
         candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
     if searched and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
-        origins = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
+        titles = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
         of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
-        candidates = list(zip(of_search, origins, strict=True))
-    selected: tuple[SelectedObserver, str] | None = None
-    refusal, least = None, math.inf
-    for gains, origin in candidates:
-        try:  # of those that need the least relaxation the first, which has the least cost
-            found = with_aircraft_observer(
-                controller, model, gains, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds, below=least
-            )
-            selected, least = (found, origin), float(np.prod(found.relaxation))
-        except ParameterError as error:  # another gain set may have the margin
-            refusal = error
-    if selected is None:
-        assert refusal is not None  # noqa: S101 - there is a candidate
-        raise refusal
-    found, origin = selected
+        candidates = list(zip(of_search, titles, strict=True))
+    sets, origins = zip(*candidates, strict=True)
+    found = with_aircraft_observer(controller, model, sets, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds)
+    origin = origins[found.place]
     factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
     lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""

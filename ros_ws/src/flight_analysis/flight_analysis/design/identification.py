@@ -370,7 +370,7 @@ def that_learns(selection: Selection, condition: FlightCondition, Omega: FloatAr
     rough = sketch(name, Omega[np.ix_(rows, columns)], start.outputs, start.inputs, condition.speed)
     noise, axes = np.array([NOISE[output] for output in start.outputs]), tuple(rough.gusts)
     gains = gains_beside_sketch(model_for(rough, start, noise), start.outputs, axes, condition.speed)
-    designed = with_aircraft_observer(start, rough, gains, noise, margin, uncertain=False).controller
+    designed = with_aircraft_observer(start, rough, [gains], noise, margin, uncertain=False).controller
     assert designed.observer is not None  # noqa: S101 - it was designed
     observer = designed.observer.model_copy(update={"part": 0.0})
     sections = {"feedforward": designed.feedforward, "observer": observer, "learn": LearnConfig()}

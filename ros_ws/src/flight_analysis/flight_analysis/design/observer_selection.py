@@ -8,8 +8,7 @@ then `effort` is raised, and K and the integral are lowered, in the channel in w
 the extended-state observer are taken as slower.
 """
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from itertools import product
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -149,12 +148,13 @@ class SelectedObserver(NamedTuple):
     phase_margin: float  # rad, the least of the nominal linear loop
     fraction: float  # the least of what is found over what is needed
     relaxation: FloatArray  # (m,) factors by which the search raised `effort` and lowered K and the integral; 1: not at all
+    place: int = 0  # of its gain set
 
 
 def with_aircraft_observer(
     controller: RiseDiConfig,
     airframe: Airframe,
-    gains: ObserverGains,
+    sets: Sequence[ObserverGains],
     noise: FloatArray,
     margin: float,
     needed: Requirement = OBSERVER_REQUIREMENT,
@@ -162,14 +162,14 @@ def with_aircraft_observer(
     *,
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
-    below: float = math.inf,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
+    Of several gain sets it is the one that the margins change least, by the product of the factors, of equal ones the first.
     `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
     WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
     a schedule then, and the margins at these speeds too. Raises ParameterError for an airframe with another D or without a
-    wind, one that a feedforward refuses, and for margins that no relaxation with a product `below` this reaches.
+    wind, one that a feedforward refuses, and for margins that no relaxation reaches.
     """
     require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
     rows, columns = law_order(airframe, controller)
@@ -178,32 +178,37 @@ def with_aircraft_observer(
     base = with_feedforward(controller.model_copy(update={"observer": None, "schedule": None}), airframe)
     names = Names(tuple(airframe.states), controller.inputs, controller.outputs, tuple(airframe.gusts))
 
-    def designer(model: NominalModel) -> Callable[[FloatArray], ObserverDesign]:
+    def designer(model: NominalModel, gains: ObserverGains) -> Callable[[FloatArray], ObserverDesign]:
         observer = aircraft_observer(model, names, gains.weights)
         sampled = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
         return lambda slower: observer._replace(F=feedback_gain(sampled, model, slower * gains.weights.effort))
 
-    def at(ratio: float) -> AtSpeed:
+    def at(ratio: float, gains: ObserverGains) -> AtSpeed:
         frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
         model, feedforward = model_for(frame, controller, noise), with_feedforward(base, frame).feedforward
         assert feedforward is not None  # noqa: S101 - it was added
         plant = LinearPlant(model.A + model.gravity, model.B, model.C)
         scale = np.array([1.0 if name == "V" else ratio**-2.0 for name in controller.outputs])
-        return AtSpeed(ratio, plant, feedforward, scale, designer(model))
+        return AtSpeed(ratio, plant, feedforward, scale, designer(model, gains))
 
-    model, others = model_for(airframe, controller, noise), []
+    model = model_for(airframe, controller, noise)
     if speeds is not None:
         require(not vanes, "speeds", f"the vanes {', '.join(vanes)}", "none: they read the model of the trim speed")
         require("V" in controller.outputs, "speeds", f"the outputs {', '.join(controller.outputs)}", "V among them")
-        others = [at(ratio) for ratio in speeds]
     A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF * uncertain, WORST_SEED)
     read = [[float(name == state) for state in airframe.states] for name in vanes]
     plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *read]))
-    section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
-    selected = _within_margin(base, model, plant, gains, designer(model), margin, needed, section, others, below)
-    if not others:
+
+    others = [[at(ratio, gains) for ratio in speeds or ()] for gains in sets]
+    searches = []
+    for gains, elsewhere in zip(sets, others, strict=True):
+        section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
+        design = designer(model, gains)
+        searches.append(_within_margin(base, model, plant, gains, design, margin, needed, section, elsewhere))
+    selected = _least_relaxed(searches)
+    if speeds is None:
         return selected
-    slow, fast = (there.model(selected.relaxation).model_dump() for there in others)
+    slow, fast = (there.model(selected.relaxation).model_dump() for there in others[selected.place])
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     scheduled = RiseDiConfig.validate_mapping(selected.controller.model_dump() | {"schedule": schedule}, "controller")
     return selected._replace(controller=scheduled)
@@ -329,7 +334,9 @@ def with_extended_state_observer(
         changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
         return extended_state_observer(model, names, changed)
 
-    return _within_margin(base, model, LinearPlant(none[None], Omega[None], eye), gains, design, margin, needed)
+    return _least_relaxed(
+        [_within_margin(base, model, LinearPlant(none[None], Omega[None], eye), gains, design, margin, needed)]
+    )
 
 
 def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) -> None:
@@ -338,6 +345,25 @@ def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) 
     except DecompositionError as error:
         raise ParameterError(f"{where}: found a C B without a D ({error}), expected D = {list(controller.D)}") from None
     require(list(controller.D) == D, where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
+
+
+def _least_relaxed(searches: Sequence[Generator[float, None, SelectedObserver]]) -> SelectedObserver:
+    """The end of the search that needs the least relaxation: the one that has reached the least goes on.
+
+    Raises ParameterError where each search does, that of the last.
+    """
+    reached, refusal = dict.fromkeys(range(len(searches)), 1.0), ParameterError("found no gains, expected a set")
+    while reached:
+        place = min(reached, key=reached.__getitem__)
+        try:
+            reached[place] = next(searches[place])
+        except StopIteration as end:
+            selected: SelectedObserver = end.value
+            return selected._replace(place=place)
+        except ParameterError as error:  # another gain set may have the margins
+            refusal = error
+            del reached[place]
+    raise refusal
 
 
 def _within_margin(
@@ -350,10 +376,10 @@ def _within_margin(
     needed: Requirement,
     vanes: VanesConfig | None = None,
     others: Sequence[AtSpeed] = (),
-    below: float = math.inf,
-) -> SelectedObserver:
+) -> Generator[float, None, SelectedObserver]:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
+    Yields the product of the factors before each step, and at the end. Raises ParameterError for margins out of reach.
     The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
     The damping asked for is at most the damping of the zeros of the aircraft: no feedback moves a zero.
     """
@@ -402,8 +428,7 @@ def _within_margin(
     selected = best(np.ones((1, m)))
     fractions = [selected.fraction]
     while True:
-        factor = float(np.prod(selected.relaxation))
-        require(factor < below, "--margin", f"factors with a product of {factor:.3g}", f"less than {below:.3g}")
+        yield float(np.prod(selected.relaxation))
         ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
         if selected.relaxation.max() > MAX_RELAXATION or ended:
             lacking = _lacking(selected, nominal, loop, margin, needed)
