@@ -165,7 +165,7 @@ def with_aircraft_observer(
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
-    Of several gain sets it is the one that the margins change least, by the product of the factors, of equal ones the first.
+    Of several gain sets the margins choose: the least product of the factors of `relaxation`, then the first.
     `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
     WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
     a schedule then, and the margins at these speeds too. Raises ParameterError for an airframe with another D or without a
@@ -348,9 +348,9 @@ def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) 
 
 
 def _least_relaxed(searches: Sequence[Generator[float, None, SelectedObserver]]) -> SelectedObserver:
-    """The end of the search that needs the least relaxation: the one that has reached the least goes on.
+    """The result of the search with the least relaxation: the least relaxed search takes the next step.
 
-    Raises ParameterError where each search does, that of the last.
+    Raises the ParameterError of the last search where none has a result.
     """
     reached, refusal = dict.fromkeys(range(len(searches)), 1.0), ParameterError("found no gains, expected a set")
     while reached:
@@ -388,7 +388,7 @@ def _within_margin(
     needed = above_zeros(needed, nominal)
 
     def delayed(controller: RiseDiConfig, plant: LinearPlant) -> tuple[list[LinearLaw], float]:
-        """The laws with any vanes in use, and the least delay margin, s."""
+        """The laws, for every set of vanes in use, and the least delay margin, s."""
         laws = _laws(controller)
         return laws, min(delay_margin(plant, law, loop, longest=DELAYS * margin) for law in laws)
 
@@ -406,7 +406,7 @@ def _within_margin(
         return min(of_delay(delay), of_margins(flown, laws, there.plant)[1])
 
     def best(relaxations: FloatArray) -> SelectedObserver:
-        """The first of those with the largest fraction; margins only where the delay margin does not rule them out."""
+        """The first with the largest fraction; loop margins only where the delay margin leaves a chance."""
         controllers = [_parameters(base, model, gains, design(relaxation), relaxation, vanes) for relaxation in relaxations]
         each, found = [delayed(controller, nominal) for controller in controllers], dict[int, SelectedObserver]()
         for k in sorted(range(len(each)), key=lambda k: -of_delay(each[k][1])):
