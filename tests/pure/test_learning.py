@@ -341,6 +341,19 @@ def test_report_has_error_by_model(flown: Flown) -> None:
     assert [span["rms"] for span in flight.summary["models"]] == [before.rms, under.rms]
 
 
+def test_error_by_model_is_that_of_the_engaged_law(flown: Flown) -> None:
+    tape = read_flight(flown.run).tape
+    ticks, t = tape["internals"], tape.time("internals")
+    changed, since = ticks.values.copy(), SWITCH + 2.0  # s, from which on the law is deactivated
+    changed[t >= since, ticks.names.index("mode")] = Mode.INACTIVE
+    changed[t >= since + 2.0, ticks.names.index("parameters")] = changed[0, ticks.names.index("parameters")]
+    signals = {**tape.signals, "internals": Signal(ticks.stamp_ns, ticks.names, changed)}
+    before, under = errors_by_model(replace(tape, signals=signals))  # none after the release
+    truth = error(tape, SWITCH, since)
+    assert [under.rms[name] for name in NAMES] == pytest.approx(truth, rel=1e-2)
+    assert before.stop == SWITCH
+
+
 def test_report_draws_what_was_identified_with_its_deviations(flown: Flown) -> None:
     flight, found = read_flight(flown.run), flown.learner.identification
     assert found is not None

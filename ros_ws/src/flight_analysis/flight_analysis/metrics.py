@@ -304,18 +304,23 @@ def error_metrics(errors: ArrayLike, times: FloatArray | None = None) -> ErrorMe
 
 
 def errors_by_model(tape: Tape) -> list[ModelSpan]:
-    """Rms of `best_error` before the first model of a learner and under each model; empty for a tape without a learner."""
+    """Rms of `best_error` before the first model of a learner and under each model; empty for a tape without a learner.
+
+    The time in which the law is not engaged does not count.
+    """
     if "learned" not in tape or "internals" not in tape:
         return []
     _, error = best_error(tape)
     t, ticks, flown = (error.stamp_ns - tape.start_ns) / 1e9, tape.time("internals"), tape["internals"]["parameters"]
     changes = np.flatnonzero(np.diff(flown, prepend=np.nan) != 0.0)
     digests = list(dict.fromkeys(flown[changes].tolist()))
+    engaged = tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)] == Mode.ENGAGED
     spans = []
     for digest, (start, stop) in zip(flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True):
-        within = (t >= start) & (t < stop)
+        within = (t >= start) & (t < stop) & engaged
         rms = {name: error_metrics(error[name][within]).rms for name in error.names}
-        spans.append(ModelSpan(digests.index(digest), start, stop, rms))
+        if within.any():
+            spans.append(ModelSpan(digests.index(digest), start, stop, rms))
     return spans
 
 
