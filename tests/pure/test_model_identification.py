@@ -129,6 +129,19 @@ def test_the_true_model_is_left_alone() -> None:
     assert abs(found.after.log_likelihood - found.before.log_likelihood) < 0.02
 
 
+def test_innovations_of_the_levels_found_last_are_those_of_a_passage_with_them() -> None:
+    recorded = innovation_filters.recording(flight("gust", 0.5), OSPREY)
+    model = innovation_filters.filter_model(OSPREY, ACTUATORS, recorded)
+    search = model_identification.Search(recorded, model, innovation_filters.blocks(model)[0], OSPREY, 0.0)
+    theta = np.full(len(search.prior), 0.05)
+    levels = search.levels(theta)
+    assert len(set(levels.tolist())) > 1
+    for asked, at in ((theta, levels), (theta, 0 * levels), (0.0 * theta, levels)):
+        expected = search.innovations(search.models(asked[None], at), at)
+        for values, again in zip(search.passed(asked, at), expected, strict=True):
+            np.testing.assert_allclose(values, again, rtol=1e-9)
+
+
 def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     scenario = servo("calm", 0.3, duration=20.0, pulses={}, coordinated_turn=None)
     found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, ACTUATORS)

@@ -83,6 +83,24 @@ class Innovations(NamedTuple):
     log_likelihood: FloatArray  # (T,) of a sample, up to a constant
 
 
+class Normalised(NamedTuple):
+    """Innovations of N models."""
+
+    r: FloatArray  # (N, T, m) in units of y, NaN where y is lost
+    e: FloatArray  # (N, T, m) of covariance I where a model is right
+    half_log_det: FloatArray  # (N, T) of the covariance of r
+
+
+def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
+    """Innovations r, (N, T, m), with covariances (N, levels, m, m); `place` is the level of a sample among these, (T,)."""
+    root = np.linalg.cholesky(covariance)
+    inverse, half_log_det = np.linalg.inv(root), np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
+    e = np.empty_like(r)
+    for k in np.unique(place).tolist():
+        e[:, place == k] = r[:, place == k] @ np.swapaxes(inverse[:, k], -1, -2)
+    return Normalised(r, e, half_log_det[:, place])
+
+
 class Models(NamedTuple):
     """The filters of N models, and their inputs."""
 
@@ -196,6 +214,7 @@ class Search:
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
         of_A, of_B = map(np.count_nonzero, self._units)
+        self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None  # theta, levels and innovations of `levels`
         self.count = of_A + of_B  # of the entries that are identified
         self.believe(np.repeat([PRIOR, unknown.effect], [of_A, of_B]))
 
@@ -256,30 +275,37 @@ class Search:
         precision, log_det = np.linalg.inv(bank.covariance[:, 0]), np.linalg.slogdet(bank.covariance[:, 0])[1]
         length = self._spans[0].stop // HOLD
         flight = Passage(bank, self._y, u, np.zeros(-(-len(self._y) // HOLD), dtype=np.int64))
-        z, found = np.repeat(models.begin, len(LEVELS), axis=0), []
+        z, found, r_found = np.repeat(models.begin, len(LEVELS), axis=0), list[int](), list[FloatArray]()
         for k in range(len(self._spans)):
             r, after = flight.run(z, k * length, (k + 1) * length)
             gain = -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1) / 2.0
             found.append(int(np.argmax(gain >= gain.max() - CHANGE)))
+            r_found.append(r[found[-1]])
             z = np.repeat(after[found[-1]][None], len(LEVELS), axis=0)
+        passed = normalised(np.concatenate(r_found)[None, : len(self._y)], models.bank.covariance, self._of_span(found))
+        self._passed = theta.tobytes(), np.array(found), passed
         return np.array(found)
 
-    def innovations(self, models: Models, levels: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Innovations of N models at given levels, and normalised, (N, T, m), and half the log of det S, (N, T)."""
-        bank, T = models.bank, len(self._y)
-        place = np.repeat(np.searchsorted(models.levels, levels), self._spans[0].stop)[:T]
-        r = Passage(bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][:, :T]
-        root = np.linalg.cholesky(bank.covariance)
-        inverse, half_log_det = np.linalg.inv(root), np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
-        normalised = np.empty_like(r)
-        for k in range(len(models.levels)):
-            normalised[:, place == k] = r[:, place == k] @ np.swapaxes(inverse[:, k], -1, -2)
-        return r, normalised, half_log_det[:, place]
+    def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
+        """The value of its span for each sample, (T,)."""
+        return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
+
+    def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
+        """Innovations of N models at given levels."""
+        place = self._of_span(np.searchsorted(models.levels, levels))
+        r = Passage(models.bank, self._y, models.u, place[::HOLD]).run(models.begin)[0][:, : len(self._y)]
+        return normalised(r, models.bank.covariance, place)
+
+    def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
+        """Innovations of a theta, (p,), at given levels: those of the last passage of `levels` where it was the same."""
+        if self._passed is not None and self._passed[0] == theta.tobytes() and np.array_equal(self._passed[1], levels):
+            return self._passed[2]
+        return self.innovations(self.models(theta[None], levels), levels)
 
     def predicted(self, theta: FloatArray, levels: NDArray[np.int64]) -> Innovations:
         """The innovations of a theta, (p,)."""
-        (r,), (normalised,), (weight,) = self.innovations(self.models(theta[None], levels), levels)
-        return Innovations(r, normalised, -np.sum(normalised**2, axis=1) / 2.0 - weight)
+        (r,), (e,), (half_log_det,) = self.passed(theta, levels)
+        return Innovations(r, e, -np.sum(e**2, axis=1) / 2.0 - half_log_det)
 
     def fit(
         self,
@@ -311,8 +337,9 @@ class Search:
         _, theta, hessian = min(ends, key=lambda end: end[0])
         deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
         nominal = np.where(self._errors, 0.0, theta)
-        before, after = (self.levels(each) if levels is None else levels for each in (nominal, theta))
-        return Fit(theta, deviation, self.predicted(nominal, before), self.predicted(theta, after), after)
+        before = self.predicted(nominal, self.levels(nominal) if levels is None else levels)
+        flown = self.levels(theta) if levels is None else levels
+        return Fit(theta, deviation, before, self.predicted(theta, flown), flown)
 
     def _ends(
         self,
@@ -358,7 +385,7 @@ class Search:
     def cost(self, theta: FloatArray, used: NDArray[np.bool_]) -> float:
         """The cost of `fit` for the best levels of a theta, (p,)."""
         levels = self.levels(theta)
-        (cost,), _, _ = self._costs(self.models(theta[None], levels), levels, used, theta[None])
+        (cost,), _, _ = self._costs(self.passed(theta, levels), used, theta[None])
         return float(cost)
 
     def _step(
@@ -371,7 +398,7 @@ class Search:
         """
         size, moving = len(theta), np.flatnonzero(free)
         models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels, near=True)
-        costs, e, half_log_det = self._costs(models, levels, used, theta[None])
+        costs, e, half_log_det = self._costs(self.innovations(models, levels), used, theta[None])
         rms, J = np.sqrt(np.mean(e[0] ** 2, axis=0)), np.zeros((size, e[0].size))
         J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
         hessian, slope = J @ J.T + np.diag(self.prior**-2), J @ (e[0] / rms).ravel() + theta / self.prior**2
@@ -379,7 +406,7 @@ class Search:
         tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self.bound, free), self._lower, self.bound)
         expected = -float(slope @ (tried[0] - theta)) / 2.0
         for several in (tried[:1], tried[1:]):
-            lower, _, _ = self._costs(self.models(several, levels), levels, used, several)
+            lower, _, _ = self._costs(self.innovations(self.models(several, levels), levels), used, several)
             progressed = float(costs[0] - lower.min())
             if progressed >= GOOD * expected:
                 break
@@ -430,7 +457,7 @@ class Search:
 
         RECOVERY spans afterwards do not count either.
         """
-        _, (e,), _ = self.innovations(self.models(theta[None], levels), levels)
+        _, (e,), _ = self.passed(theta, levels)
         square = np.array([np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans])
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
@@ -440,11 +467,10 @@ class Search:
         return ~np.repeat(left_out, self._spans[0].stop)[: len(self._y)]
 
     def _costs(
-        self, models: Models, levels: NDArray[np.int64], used: NDArray[np.bool_], thetas: FloatArray
+        self, found: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
-        _, normalised, half_log_det = self.innovations(models, levels)
-        e, total = normalised[:, used], np.sum(half_log_det[:, used], axis=1)
+        e, total = found.e[:, used], np.sum(found.half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total
         costs = costs + np.sum((thetas / self.prior) ** 2, axis=1) / 2.0
         return np.where(np.isfinite(costs), costs, np.inf), e, total
