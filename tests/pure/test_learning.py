@@ -208,6 +208,19 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     identified.assert_called_once()
 
 
+def test_only_part_of_a_proposal_that_was_refused_is_proposed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen = scenario(learn={"updates": [10.0]})
+    made, start = made_learner(chosen), chosen.rise_di()
+    worse, better = (Prediction(np.ones(2), np.ones(2), value) for value in (1.0, 2.0))
+    aileron = Entry("B", "p", "aileron", 85.94, 0.1, 0.01, 85.94)
+    part = Part(("aileron", "rudder"), ("p", "r"), (aileron,), worse, better, "", 0.0, gusts=False)
+    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+    sentences = [made.propose(start.digest()).sentence for _ in range(2)]  # the start flies on
+    assert sentences == ["B[p, aileron] +10 +- 1 %"] * 2
+
+
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
     made, start = made_learner(scenario()), scenario().rise_di()
     better, worse = (Prediction(np.ones(4), np.ones(4), value) for value in (2.0, 1.0))

@@ -201,9 +201,13 @@ class Learner:
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
     def _note_fallback(self, flown: int) -> None:
-        """Give up a part that the controller flies by the law of the start, unlike the model that was proposed or flew."""
+        """Give up a part that the controller flies by the law of the start, unlike the model that was proposed or flew.
+
+        Where all parts fly it, their proposal was refused, the law diverged, or the last part oscillated: none is given up.
+        """
         if flown == self._proposed:
             self._flew = self._last
+        if flown in {self._proposed, self._controller.digest()}:
             return
         for model, part in product((self._last, self._flew), tuple(self._known)):
             fallen = fallen_back(self._controller, model, [output in part for output in self._controller.outputs])
