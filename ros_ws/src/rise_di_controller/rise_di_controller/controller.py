@@ -139,11 +139,6 @@ class Controller:
         known = self._vanes_moved | (seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time)
         self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
 
-    @property
-    def first(self) -> ControllerConfig:
-        """The parameters of the start."""
-        return self._first
-
     def diverges(self) -> bool:
         """Whether a law with a model that was learned in flight diverges."""
         return not self._first_law and divergence.diverges(self._errors, self._least, self._learned)

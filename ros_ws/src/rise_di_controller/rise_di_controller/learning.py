@@ -121,7 +121,7 @@ class Learning:
         if oscillations := controller.oscillations():
             taken = self._end_oscillations(oscillations, controller, now_ns)
         elif controller.diverges():
-            taken = controller.first
+            taken = self._start
             self._take(controller, now_ns, prepared(taken), "falls back to the law of the start: it diverges")
         return taken
 
