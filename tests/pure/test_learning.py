@@ -345,6 +345,18 @@ def test_page_shows_known_entries_and_measured_error_by_model(flown: Flown) -> N
     assert [float(row[column]) for row in rows] == pytest.approx(rms, rel=0.01)  # three digits
 
 
+def test_page_has_the_error_of_the_engaged_law_alone(flown: Flown) -> None:
+    flight = Flight(flown.run)
+    flight.update()
+    before = flight.models["rows"]
+    names = read_run(flown.run).tape["internals"].names
+    released = np.full((100, len(names)), 9.0)  # errors after the end, with parameters of their own
+    released[:, names.index("mode")] = Mode.INACTIVE
+    flight._take_errors(10**12 + np.arange(100), names, released)
+    assert flight.models["rows"][0] == before[0]
+    assert [row[-4:] for row in flight.models["rows"]] == [row[-4:] for row in before]
+
+
 def test_report_has_error_by_model(flown: Flown) -> None:
     flight = read_flight(flown.run)
     before, under = errors_by_model(flight.tape)

@@ -108,8 +108,8 @@ class _Flown(NamedTuple):
     digest: float
     start_ns: int
     stop_ns: int
-    ticks: int
-    squares: Mapping[str, float]  # sums of e^2 by output
+    ticks: int  # engaged
+    squares: Mapping[str, float]  # of these, sums of e^2 by output
 
 
 class Flight:
@@ -207,8 +207,9 @@ class Flight:
         spans = []
         for span, stop_ns in zip(self._flown, ends_ns, strict=True):
             start, stop = ((stamp_ns - self.start_ns) / NANOSECONDS for stamp_ns in (span.start_ns, stop_ns))
-            rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
-            spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
+            if span.ticks:
+                rms = {name: math.sqrt(square / span.ticks) for name, square in span.squares.items()}
+                spans.append(ModelSpan(digests.index(span.digest), start, stop, rms)._asdict())
         units = dict.fromkeys(self._flown[0].squares, NO_UNIT) | ({} if self.scenario is None else display_units(self.scenario))
         headings, rows = model_rows(spans, units)
         return {"headings": ["", *headings], "rows": rows}
@@ -377,7 +378,7 @@ class Flight:
             self._take_modes(stamp_ns, values[:, names.index("mode")])
         if (
             topic.name == "internals"
-            and "parameters" in names
+            and {"mode", "parameters"} <= set(names)
             and math.isfinite(digest := values[-1, names.index("parameters")])
         ):
             self.digest = int(digest)
@@ -389,17 +390,18 @@ class Flight:
             self.described += 1
 
     def _take_errors(self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray) -> None:
-        """Sum the squares of e under each set of parameters."""
-        flown = values[:, names.index("parameters")]
+        """Sum the squares of e in the engaged ticks under each set of parameters."""
+        flown, engaged = values[:, names.index("parameters")], values[:, names.index("mode")] == Mode.ENGAGED
         errors = {_text(name[2:]): values[:, k] for k, name in enumerate(names[:MAX_CHANNELS]) if name.startswith("e.")}
         for rows in np.split(np.arange(len(flown)), np.flatnonzero(np.diff(flown)) + 1):
             digest, start_ns, stop_ns = float(flown[rows[0]]), int(stamp_ns[rows[0]]), int(stamp_ns[rows[-1]])
-            squares = {name: float(np.sum(e[rows] ** 2)) for name, e in errors.items()}
-            span = _Flown(digest, start_ns, stop_ns, len(rows), squares)
+            counted = rows[engaged[rows]]
+            squares = {name: float(np.sum(e[counted] ** 2)) for name, e in errors.items()}
+            span = _Flown(digest, start_ns, stop_ns, len(counted), squares)
             if self._flown and (before := self._flown[-1]).digest == digest:
                 self._flown.pop()
                 total = {name: square + before.squares[name] for name, square in squares.items()}
-                span = before._replace(stop_ns=stop_ns, ticks=before.ticks + len(rows), squares=total)
+                span = before._replace(stop_ns=stop_ns, ticks=before.ticks + len(counted), squares=total)
             if len(self._flown) < MAX_SPANS:
                 self._flown.append(span)
 
