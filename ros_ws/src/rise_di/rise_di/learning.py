@@ -90,26 +90,29 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         assert isinstance(made, Learner)  # noqa: S101 - `learner` makes no other
         return made, Updates(settings)
 
-    require("internals" in tape, "the log", "no sample of internals", "a flight with a controller that engaged")
+    flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
+    require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
     ticks, steps = tape["internals"], list[LearnStep]()
     y, u, mode = ticks.group("y").values, ticks.group("u").values, ticks["mode"]
+    instants_ns = ticks.stamp_ns + np.round(ticks["age"] * NANOSECONDS).astype(np.int64)
     flown, start = ticks["parameters"], controller.digest()
     is_of_log = bool(np.any(flown == start))
-    (learned, updates), proposed = begun(), start
-    for k, stamp_ns in enumerate(ticks.stamp_ns.tolist()):
+    (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
+    for k, (stamp_ns, now_ns) in enumerate(zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)):
         if mode[k] == Mode.INACTIVE:
             continue
         if k and mode[k - 1] == Mode.INACTIVE:
-            (learned, updates), proposed = begun(), start
+            (learned, updates), proposed, begin_ns = begun(), start, now_ns
+        longest_ns = max(longest_ns, now_ns - begin_ns)
         if mode[k] == Mode.ENGAGED:
             learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
-        if updates.due(stamp_ns):
+        if updates.due(now_ns):
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
-            t = (stamp_ns - tape.start_ns) / NANOSECONDS
+            t = (now_ns - tape.start_ns) / NANOSECONDS
             steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
-    require(bool(steps), "the log", f"{(ticks.stamp_ns[-1] - ticks.stamp_ns[0]) / NANOSECONDS:.3g} s of ticks", first)
+    require(bool(steps), "the log", f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller", first)
     last = learned.identification
     return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
 
