@@ -17,7 +17,7 @@ LEAST_RATE = 0.1  # rad/s, the same of other outputs: five times that of the law
 
 WINDOW, STEP = 10.0, 0.02  # s, length of the record of e, and of the means in it: a loop with servos oscillates slower
 TEST = 50  # means between two tests for an oscillation, 1 s
-LIKENESS = 0.7  # correlation of e with e a period later: above 0.9 in a limit cycle, at most 0.4 in turbulence and gusts
+LIKENESS = 0.7  # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
 GROWN = 1.5  # of the largest rms error over WINDOW before: below this the law of the start is not clearly better
 HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 

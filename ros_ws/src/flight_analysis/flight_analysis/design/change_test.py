@@ -44,7 +44,7 @@ def change_test(
     """The gain G of log-likelihood of each part of the aircraft by a change of its entries, and an input without effect.
 
         J(theta; s) = -sum log p(y_k | y_1 .. y_k-1, theta) + |theta / s|^2 / 2,    theta relative to the flown model
-        G = min J(theta; max(deviation, LEAST_DEVIATION)) - min J(theta; FREE_DEVIATION)
+        G = min J(theta; deviation) - min J(theta; FREE_DEVIATION),    LEAST_DEVIATION <= deviation <= FREE_DEVIATION
 
     Where G > MAX_GAIN, the input j is dead if the flown model with B[:, j] = 0 has a first J lower by more than MAX_GAIN, and a
     -sum log p at most DEAD_WITHIN above the changed one. Winds, and the angles at the begin of the record, are free in each J.
