@@ -208,7 +208,8 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     sentence = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
     assert sentence == "no identification is due, and no part is tested for a change"
     identified.assert_not_called()
-    made.propose(0)  # other parameters fly: the proposal was refused, or the controller fell back
+    # other parameters fly: the proposal was refused, or the controller fell back
+    assert made.propose(0).sentence == "each part flies the law of the start from before on"
     identified.assert_called_once()
 
 

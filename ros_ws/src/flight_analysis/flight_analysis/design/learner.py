@@ -189,7 +189,7 @@ class Learner:
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
             )
         if not sentences:
-            return Proposal(None, "; ".join(refusals))
+            return Proposal(None, "; ".join(refusals) or "each part flies the law of the start from before on")
         try:
             proposed = self._designed(model, known, gone)
         except ParameterError as error:
