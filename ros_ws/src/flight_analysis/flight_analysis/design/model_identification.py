@@ -326,13 +326,8 @@ class Search:
         if begin is None:
             ends = self._ends(starts, used, levels, progress)
         else:
-            theta, coarse = np.clip(begin, self._lower, self.bound), self.coarse
-            fitted, free = coarse.fitted(), np.ones(len(begin), dtype=bool)
-            for _ in range(START_STEPS):
-                progress()
-                theta, _, progressed = coarse._step(theta, coarse.levels(theta), fitted, free)
-                if progressed < START_PROGRESS:
-                    break
+            free = np.ones(len(begin), dtype=bool)
+            theta = self._started(np.clip(begin, self._lower, self.bound), None, free, progress)
             ends = [self._refined(theta, levels, used, progress)]
         _, theta, hessian = min(ends, key=lambda end: end[0])
         deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -355,15 +350,23 @@ class Search:
         fixed[self._winds] = False
         found = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
         for level in starts:
-            theta, uniform = np.zeros(len(self.prior)), np.full(len(coarse._spans), level)
-            for _ in range(START_STEPS):
-                progress()
-                theta, _, progressed = coarse._step(theta, uniform, fitted, fixed)
-                if progressed < START_PROGRESS:
-                    break
+            theta = self._started(np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress)
             found.append((coarse.cost(theta, fitted), theta))
         best = sorted(found, key=lambda start: start[0])[:REFINED]
         return [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
+
+    def _started(
+        self, theta: FloatArray, levels: NDArray[np.int64] | None, free: NDArray[np.bool_], progress: Callable[[], None]
+    ) -> FloatArray:
+        """Theta, (p,), after steps on means over the shortest lag, with the level of a span by theta or with `levels`."""
+        coarse = self.coarse
+        fitted = coarse.fitted()
+        for _ in range(START_STEPS):
+            progress()
+            theta, _, progressed = coarse._step(theta, coarse.levels(theta) if levels is None else levels, fitted, free)
+            if progressed < START_PROGRESS:
+                break
+        return theta
 
     def _refined(
         self,
