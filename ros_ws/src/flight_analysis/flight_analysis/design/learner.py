@@ -156,28 +156,16 @@ class Learner:
         sentences += [
             f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}" for change in found if not change.dead
         ]
-        channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
-        identified = self.identification = identify(
-            self.recording(),
-            self._prior,
-            self._actuation,
-            channels,
-            at_bound=AT_BOUND,
-            unknown=self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE),
-        )
+        identified = self.identification = self._identified()
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
         for part in identified.parts:
             if any(is_within(part.outputs, without) or is_within(without, part.outputs) for without in gone):
                 continue
-            if any(is_within(part.outputs, whole) for whole in known.keys() - {part.outputs}):
-                refusals.append(
-                    f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that which flies"
-                )
-                continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
             before = model if part.outputs in known.keys() - self._changed and not lost else None
-            if not rough and (refusal := part.refusal or not_white(part) or weaker(part, before)):
+            of_flight = "" if rough else part.refusal or not_white(part) or weaker(part, before)
+            if refusal := uncoupled(part, known) or of_flight:
                 refusals.append(refusal)
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
@@ -228,6 +216,12 @@ class Learner:
                 self._planned.append(last + self._window_ns)
         return due
 
+    def _identified(self) -> Identification:
+        """A and B from the record, about the prior."""
+        channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
+        unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
+        return identify(self.recording(), self._prior, self._actuation, channels, at_bound=AT_BOUND, unknown=unknown)
+
     def _changes(self, end_ns: int) -> list[Change]:
         """Tests of the parts whose window ended RECORD ago or earlier."""
         tested = {part: known for part, known in self._known.items() if part not in self._changed}
@@ -272,6 +266,13 @@ def not_white(found: Part) -> str:
         return ""
     name = found.outputs[worst]
     return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
+
+
+def uncoupled(found: Part, known: Iterable[tuple[str, ...]]) -> str:
+    """The refusal of a part alone where the flown model couples the part with another; empty where it does not."""
+    if not any(is_within(found.outputs, whole) for whole in known if whole != found.outputs):
+        return ""
+    return f"{' and '.join(found.outputs)}: found no model with coupling, expected one, as that which flies"
 
 
 def weaker(found: Part, flown: Airframe | None) -> str:
