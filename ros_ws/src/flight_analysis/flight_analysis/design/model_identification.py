@@ -433,10 +433,13 @@ class Search:
         return names + [*self.names.winds, *angles, "delay"][: len(self.prior) - len(names)]
 
     def joined(self, parts: Iterable[tuple["Search", Fit]]) -> FloatArray:
-        """Theta, (p,), from those of parts: the mean where several have a parameter, 0 where none has it."""
+        """Theta, (p,), without errors, with winds, angles and delay of parts: means over the parts.
+
+        A part that is searched apart from the parts with which it couples has wrong errors.
+        """
         known: dict[str, list[float]] = {}
         for part, fit in parts:
-            for name, value in zip(part.named(), fit.theta.tolist(), strict=True):
+            for name, value in list(zip(part.named(), fit.theta.tolist(), strict=True))[part.count :]:
                 known.setdefault(name, []).append(value)
         return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
 
