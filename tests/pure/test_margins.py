@@ -26,6 +26,7 @@ from rise_di_controller.margins import (
     disk_phase,
     loop_margins,
     loop_transfer,
+    phase_margins,
     scaled_norm,
     slow_modes,
 )
@@ -224,6 +225,7 @@ def test_uncertain_aircraft_have_the_margins_of_each() -> None:
     _, columns = law_order(airframe, scenario.controller)
     plants = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], nominal.C)
     together = loop_margins(plants, law, loop)
+    np.testing.assert_array_equal(phase_margins(plants, law, loop), together.phase)
     for k in (0, 7, 20):
         alone = loop_margins(LinearPlant(plants.A[k], plants.B[k], plants.C), law, loop)
         for name, value in alone._asdict().items():

@@ -28,6 +28,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from rise_di.gain_design import observed
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -147,13 +148,27 @@ def test_extended_state_observer_needs_no_model_and_lowers_every_error() -> None
     assert (observed < 0.6 * alone).all()  # measured 0.37, 0.33, 0.21, 0.42 in q, V, p, r
 
 
+def test_loop_much_slower_than_that_of_a_search_starts_from_rule_and_shows_progress() -> None:
+    # Behind an autopilot: 100 ms of total lag in q, where the search had 38 ms. The loop has to be stable, no more: the margins
+    # take half a minute.
+    behind, texts = SERVO.rise_di().model_copy(update={"delay": 0.065}), list[str]()
+    any_margins = Requirement(phase=0.01, gain=1.01, sensitivity=1e6, damping=1e-9)
+    controller, origin = observed(behind, SERVO, OSPREY, 0.0, any_margins, uncertain=False, progress=texts.append)
+    assert origin.startswith("observer of osprey: gains by a rule from the lags")
+    assert controller.observer is not None
+    assert all(text.startswith("observer: ") for text in texts)
+    assert len(texts) > 1
+
+
 def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     flipped = OSPREY.with_matrices(OSPREY.matrix_a(), -OSPREY.matrix_b(), np.ones((8, 3)))
     gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
     with pytest.raises(ParameterError, match=r"found a C B with D = \[-1, -1, -1, -1\], expected D = \[1, 1, 1, 1\]"):
         with_aircraft_observer(SERVO.rise_di(), flipped, [gains], NOISE, 0.03)
     monkeypatch.setattr(observer_selection, "MAX_RELAXATION", 1.2)  # the search up to 18 takes half a minute
-    with pytest.raises(ParameterError, match=r"^--margin: delay margin \(ms\): found .*, expected at least 500"):
+    with pytest.raises(
+        ParameterError, match=r"^--margin: delay margin \(ms\): .*, expected at least 500.*; give the loop less delay"
+    ):
         with_aircraft_observer(SERVO.rise_di(), OSPREY, [gains], NOISE, 0.5)
     with pytest.raises(ParameterError, match=r"^Omega: found a C B with D"):
         with_extended_state_observer(SERVO.rise_di(), -Omega(), NOISE, SIZE, 0.03)

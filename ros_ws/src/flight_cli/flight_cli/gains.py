@@ -110,7 +110,7 @@ def gains(
     )
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     answers: dict[str, Assessment]
-    with console.status("selecting gains on uncertain airframes"), options(*loop, *PARTS):
+    with console.status("selecting gains on uncertain airframes") as status, options(*loop, *PARTS):
         if check:
             for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
                 require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
@@ -139,6 +139,7 @@ def gains(
                 phase_margin=phase_margin,
                 accept=accept,
                 mixing=mixing,
+                progress=status.update,
             )
             engineering, origin = selection.engineering, selection.origin
             answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}

@@ -10,7 +10,7 @@ on z = exp(j w T), 0 < w <= pi / T. Sources: K. J. Astrom, R. M. Murray, "Feedba
 sensitivity; P. Seiler, A. Packard, P. Gahinet, "An Introduction to Disk Margins", IEEE Control Systems 40(5), 2020.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -123,19 +123,23 @@ def loop_margins(plant: LinearPlant, law: LinearLaw, loop: Loop, *, together: bo
     exact for m <= 3 and at most the disk margin for more inputs. Without `together` the figures of all inputs at once are NaN,
     which saves a third of the time.
     """
-    shape = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (plant.A, plant.B, law.A)))
-    count = int(np.prod(shape))
-
-    def each(matrix: FloatArray) -> FloatArray:
-        return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(count, *matrix.shape[-2:])
-
-    A, B, laws = each(plant.A), each(plant.B), [each(matrix) for matrix in law]
-    parts = []
-    for k in range(0, count, BATCH):
-        of = slice(k, k + BATCH)
-        aircraft, its_law = LinearPlant(A[of], B[of], plant.C), LinearLaw(*(matrix[of] for matrix in laws))
-        parts.append(_margins(_schur_form(aircraft, its_law, loop), loop.period, together=together))
+    shape = _batch_shape(plant, law)
+    parts = [_margins(form, loop.period, together=together) for form in _schur_forms(plant, law, loop)]
     return Margins(*(np.concatenate(values).reshape((*shape, *values[0].shape[1:])) for values in zip(*parts, strict=True)))
+
+
+def phase_margins(plant: LinearPlant, law: LinearLaw, loop: Loop) -> FloatArray:
+    """The `phase` of `loop_margins` alone, (..., m), without the search for gain margins and peaks."""
+    parts = []
+    for form in _schur_forms(plant, law, loop):
+        w, S = _on_grid(form, loop.period)
+        phase, _ = _phase_margins(form, w, _loop_of_sensitivity(S), loop.period)
+        parts.append(np.where(_stable(form)[:, None], phase, 0.0))
+    return np.concatenate(parts).reshape(*_batch_shape(plant, law), -1)
+
+
+def _batch_shape(plant: LinearPlant, law: LinearLaw) -> tuple[int, ...]:
+    return np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (plant.A, plant.B, law.A)))
 
 
 class _SchurForm(NamedTuple):
@@ -148,6 +152,21 @@ class _SchurForm(NamedTuple):
     @property
     def eigenvalues(self) -> ComplexArray:
         return np.asarray(np.einsum("...ii->...i", self.T))
+
+
+def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_SchurForm]:
+    """The closed loops of an aircraft, or of N, in batches."""
+    shape = _batch_shape(plant, law)
+    count = int(np.prod(shape))
+
+    def each(matrix: FloatArray) -> FloatArray:
+        return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(count, *matrix.shape[-2:])
+
+    A, B, laws = each(plant.A), each(plant.B), [each(matrix) for matrix in law]
+    for k in range(0, count, BATCH):
+        of = slice(k, k + BATCH)
+        aircraft, its_law = LinearPlant(A[of], B[of], plant.C), LinearLaw(*(matrix[of] for matrix in laws))
+        yield _schur_form(aircraft, its_law, loop)
 
 
 def _schur_form(plant: LinearPlant, law: LinearLaw, loop: Loop) -> _SchurForm:
@@ -179,10 +198,8 @@ def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
 
 def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
     """Margins of the aircraft of a batch."""
-    eigenvalues, m = form.eigenvalues, form.R.shape[-1]
-    stable = np.max(np.abs(eigenvalues), axis=1) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE
-    w = _frequencies(eigenvalues, period)
-    S = _balanced(_sensitivity(form, np.exp(1j * w * period)))
+    stable, m = _stable(form), form.R.shape[-1]
+    w, S = _on_grid(form, period)
     near = _around_peaks(S, w)
     every = np.concatenate([S, _balanced(_sensitivity(form, np.exp(1j * near * period)))], axis=1)
     diagonal = np.einsum("NFii->NFi", every)
@@ -191,7 +208,7 @@ def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
         norm, norm_half = _largest_norm(every), _largest_norm(np.asarray(every - np.eye(m) / 2.0))
     with np.errstate(divide="ignore"):
         disk, disk_all = 1.0 / np.max(np.abs(diagonal - 0.5), axis=1), 1.0 / norm_half
-        L = 1.0 / np.einsum("NFii->NFi", S) - 1.0
+    L = _loop_of_sensitivity(S)
     phase, crossover = _phase_margins(form, w, L, period)
     decrease, increase = _gain_margins(form, w, L, period)
     each = stable[:, None]
@@ -205,8 +222,24 @@ def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
         np.where(each, disk, 0.0),
         np.where(stable, norm, np.inf),
         np.where(stable, disk_all, 0.0),
-        np.array([min([1.0, *_slow_modes(row, period).damping]) for row in eigenvalues]),
+        np.array([min([1.0, *_slow_modes(row, period).damping]) for row in form.eigenvalues]),
     )
+
+
+def _stable(form: _SchurForm) -> NDArray[np.bool_]:
+    return np.asarray(np.max(np.abs(form.eigenvalues), axis=1) <= 1.0 + SPECTRAL_RADIUS_TOLERANCE)
+
+
+def _on_grid(form: _SchurForm, period: float) -> tuple[FloatArray, ComplexArray]:
+    """The grids of the aircraft, (N, F), rad/s, and S on them, balanced, (N, F, m, m)."""
+    w = _frequencies(form.eigenvalues, period)
+    return w, _balanced(_sensitivity(form, np.exp(1j * w * period)))
+
+
+def _loop_of_sensitivity(S: ComplexArray) -> ComplexArray:
+    """L_i = 1 / S_ii - 1, (N, F, m)."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.einsum("NFii->NFi", S) - 1.0)
 
 
 def _frequencies(eigenvalues: ComplexArray, period: float) -> FloatArray:

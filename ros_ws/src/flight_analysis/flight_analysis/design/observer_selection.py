@@ -50,7 +50,7 @@ from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.decomposition import DecompositionError, signs
 from rise_di_controller.law import MIN_GAIN, gain
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law, spectral_radius
-from rise_di_controller.margins import loop_margins
+from rise_di_controller.margins import loop_margins, phase_margins
 from rise_di_controller.observer import without_frozen
 from rise_di_controller.params import ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
 from rise_di_controller.rise_di import RiseDiConfig, SpeedConfig
@@ -62,6 +62,7 @@ RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file ch
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
 PATIENCE, PROGRESS = 20, 1.01  # the search ends after so many steps in which the margins do not grow by this factor
+MEND = "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without an observer"
 DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 
 WORST_OF, WORST_UNCERTAINTY, WORST_SEED = 50, 0.3, 1  # uncertain aircraft whose least phase margin counts
@@ -162,14 +163,16 @@ def with_aircraft_observer(
     *,
     uncertain: bool = True,
     speeds: tuple[float, float] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> SelectedObserver:
     """The controller with the feedforward and the observer of an airframe, and the gains of the law beside it.
 
     Of several gain sets the margins choose: the least product of the factors of `relaxation`, then the first.
     `vanes` has the noise of each vane, rms per sample in rad, by its channel, alpha or beta. The phase margin is also that of
     WORST_OF uncertain aircraft where the airframe is `uncertain`. `speeds` are two ratios to the trim speed: the controller has
-    a schedule then, and the margins at these speeds too. Raises ParameterError for an airframe with another D or without a
-    wind, one that a feedforward refuses, and for margins that no relaxation reaches.
+    a schedule then, and the margins at these speeds too. `progress` gets a sentence before a step of the search. Raises
+    ParameterError for an airframe with another D or without a wind, one that a feedforward refuses, and for margins that no
+    relaxation reaches.
     """
     require(bool(airframe.gusts), f"airframe {airframe.name}", "no gusts", "the effect of wind: the observer estimates it")
     rows, columns = law_order(airframe, controller)
@@ -205,7 +208,7 @@ def with_aircraft_observer(
         section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
         design = designer(model, gains)
         searches.append(_within_margin(base, model, plant, gains, design, margin, needed, section, elsewhere))
-    selected = _least_relaxed(searches)
+    selected = _least_relaxed(searches, progress)
     if speeds is None:
         return selected
     slow, fast = (there.model(selected.relaxation).model_dump() for there in others[selected.place])
@@ -347,7 +350,9 @@ def _require_signs(Omega: FloatArray, controller: ControllerConfig, where: str) 
     require(list(controller.D) == D, where, f"a C B with D = {D}", f"D = {list(controller.D)}, that of the controller")
 
 
-def _least_relaxed(searches: Sequence[Generator[float, None, SelectedObserver]]) -> SelectedObserver:
+def _least_relaxed(
+    searches: Sequence[Generator[SelectedObserver, None, SelectedObserver]], progress: Callable[[str], None] = lambda _: None
+) -> SelectedObserver:
     """The result of the search with the least relaxation: the least relaxed search takes the next step.
 
     Raises the ParameterError of the last search where none has a result.
@@ -356,13 +361,19 @@ def _least_relaxed(searches: Sequence[Generator[float, None, SelectedObserver]])
     while reached:
         place = min(reached, key=reached.__getitem__)
         try:
-            reached[place] = next(searches[place])
+            now = next(searches[place])
         except StopIteration as end:
             selected: SelectedObserver = end.value
             return selected._replace(place=place)
         except ParameterError as error:  # another gain set may have the margins
             refusal = error
             del reached[place]
+        else:
+            reached[place] = float(np.prod(now.relaxation))
+            found = (
+                f"least margin {now.fraction:.0%} of the needed" if now.fraction < 1.0 else "margins met, uncertain aircraft"
+            )
+            progress(f"observer: {found}, K and integral / {', '.join(f'{factor:.2f}' for factor in now.relaxation)}")
     raise refusal
 
 
@@ -376,10 +387,10 @@ def _within_margin(
     needed: Requirement,
     vanes: VanesConfig | None = None,
     others: Sequence[AtSpeed] = (),
-) -> Generator[float, None, SelectedObserver]:
+) -> Generator[SelectedObserver, None, SelectedObserver]:
     """The first relaxation with the margins: steps in the channel that gains most, or in all where none gains.
 
-    Yields the product of the factors before each step, and at the end. Raises ParameterError for margins out of reach.
+    Yields the state of the search before a step, and at the end. Raises ParameterError for margins out of reach.
     The plant is the nominal aircraft, then uncertain aircraft, if any: the channel with the least phase margin there is next.
     The damping asked for is at most the damping of the zeros of the aircraft: no feedback moves a zero.
     """
@@ -421,19 +432,19 @@ def _within_margin(
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
-        each = (loop_margins(uncertain, law, loop_of(controller), together=False) for law in _laws(controller))
-        return np.asarray(np.min([margins.phase.min(axis=0) for margins in each], axis=0))
+        each = [phase_margins(uncertain, law, loop_of(controller)).min(axis=0) for law in _laws(controller)]
+        return np.asarray(np.min(each, axis=0))
 
     steps = RELAXATION ** np.eye(m)
     selected = best(np.ones((1, m)))
     fractions = [selected.fraction]
     while True:
-        yield float(np.prod(selected.relaxation))
+        yield selected
         ended = len(fractions) > PATIENCE and selected.fraction < PROGRESS * fractions[-1 - PATIENCE]
         if selected.relaxation.max() > MAX_RELAXATION or ended:
             lacking = _lacking(selected, nominal, loop, margin, needed)
             elsewhere = "speeds: found less than the margins at another speed, expected speeds nearer to that of the trim"
-            raise ParameterError(elsewhere if others and not lacking else f"--margin: {lacking or _phases(needed)}")
+            raise ParameterError(elsewhere if others and not lacking else f"--margin: {lacking or _phases(needed)}; {MEND}")
         if selected.fraction < 1.0:
             stepped = best(selected.relaxation * steps)
             selected = stepped if stepped.fraction > selected.fraction else best(selected.relaxation[None] * RELAXATION)
