@@ -235,8 +235,9 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
         return Part(start.inputs, outputs, entries, worse, better, "", 0.0, gusts=False)
 
     whole = part(NAMES, entry, Entry("B", "p", "elevator", 0.0, 0.3, 0.01, 29.0))
-    found = [(whole,), (part(("q", "V"), entry), part(("p", "r"), entry))]
-    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=found.pop(0)))
+    parts = [(whole,), (part(("q", "V"), entry), part(("p", "r"), entry))]
+    identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
+    monkeypatch.setattr(design_learner, "identify", identified)
     monkeypatch.setattr(made, "_design", lambda *_: start)
     for k in range(1001):
         made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
@@ -246,6 +247,8 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     refused = made.propose(0)
     assert refused.controller is None
     assert refused.sentence.startswith("q and V: found no model with coupling, expected one, as that which flies; p and r")
+    # the search begins at the model that flies too
+    assert [call.kwargs["flown"] for call in identified.call_args_list] == [None, made.model]
 
 
 def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,13 +133,26 @@ def test_innovations_of_the_levels_found_last_are_those_of_a_passage_with_them()
     recorded = innovation_filters.recording(flight("gust", 0.5), OSPREY)
     model = innovation_filters.filter_model(OSPREY, ACTUATORS, recorded)
     search = model_identification.Search(recorded, model, innovation_filters.blocks(model)[0], OSPREY, 0.0)
-    theta = np.full(len(search.prior), 0.05)
+    aircraft = servo("gust", 0.5).aircraft.sampled_airframe()
+    theta = search.of_model(aircraft)
+    np.testing.assert_allclose(search.with_errors(theta[None]).A[0], aircraft.matrix_a()[:4, :4], rtol=1e-12)
+    np.testing.assert_allclose(search.with_errors(theta[None]).B[0], aircraft.matrix_b()[:4, :2], rtol=1e-12)
     levels = search.levels(theta)
     assert len(set(levels.tolist())) > 1
     for asked, at in ((theta, levels), (theta, 0 * levels), (0.0 * theta, levels)):
         expected = search.innovations(search.models(asked[None], at), at)
         for values, again in zip(search.passed(asked, at), expected, strict=True):
             np.testing.assert_allclose(values, again, rtol=1e-9)
+
+
+def test_search_goes_on_from_the_model_that_flew_where_others_begin_worse() -> None:
+    recorded = innovation_filters.recording(flight("calm", 0.5), OSPREY)
+    model = innovation_filters.filter_model(OSPREY, ACTUATORS, recorded)
+    search = model_identification.Search(recorded, model, innovation_filters.blocks(model)[1], OSPREY, 0.0)
+    flown = search.of_model(servo("calm", 0.5).aircraft.sampled_airframe())
+    used = search.fitted()
+    alone, both = (search.cost(search.fit(used, starts=(), flown=also).theta, used) for also in (None, flown))
+    assert both < search.cost(flown, used) < alone  # from 0 alone the search ends in another minimum
 
 
 def test_flight_without_excitation_refused_with_channel_and_factor() -> None:

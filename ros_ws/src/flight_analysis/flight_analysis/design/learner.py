@@ -217,10 +217,11 @@ class Learner:
         return due
 
     def _identified(self) -> Identification:
-        """A and B from the record, about the prior."""
+        """A and B from the record, about the prior; the search begins at the model that flies too."""
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
-        return identify(self.recording(), self._prior, self._actuation, channels, at_bound=AT_BOUND, unknown=unknown)
+        found, flown = self.recording(), self.model
+        return identify(found, self._prior, self._actuation, channels, at_bound=AT_BOUND, unknown=unknown, flown=flown)
 
     def _changes(self, end_ns: int) -> list[Change]:
         """Tests of the parts whose window ended RECORD ago or earlier."""

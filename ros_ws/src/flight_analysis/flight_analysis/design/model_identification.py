@@ -287,7 +287,7 @@ class Search:
         return np.array(found)
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
-        """The value of its span for each sample, (T,)."""
+        """Values of the spans for the samples, (T,)."""
         return np.repeat(np.asarray(values), self._spans[0].stop)[: len(self._y)]
 
     def innovations(self, models: Models, levels: NDArray[np.int64]) -> Normalised:
@@ -297,7 +297,7 @@ class Search:
         return normalised(r, models.bank.covariance, place)
 
     def passed(self, theta: FloatArray, levels: NDArray[np.int64]) -> Normalised:
-        """Innovations of a theta, (p,), at given levels: those of the last passage of `levels` where it was the same."""
+        """Innovations of a theta, (p,), at given levels, without a new passage after `levels` of this theta."""
         if self._passed is not None and self._passed[0] == theta.tobytes() and np.array_equal(self._passed[1], levels):
             return self._passed[2]
         return self.innovations(self.models(theta[None], levels), levels)
@@ -314,6 +314,7 @@ class Search:
         starts: Sequence[int] = STARTS,
         levels: NDArray[np.int64] | None = None,
         begin: FloatArray | None = None,
+        flown: FloatArray | None = None,
     ) -> Fit:
         """The theta that minimises N/2 sum_i log mean r_i^2 + sum log det S / 2 + |theta / prior|^2 / 2 where `used`, (T,).
 
@@ -321,10 +322,11 @@ class Search:
         wind explains a wrong model. So the search begins several times, with a level of `starts` in a span, on means over
         the shortest lag. From the REFINED best starts, or 0, the search goes on with the level of a span by theta, or with
         `levels`, and the strengths of the winds are free. At last spans without a level to explain them do not count, nor
-        a few gusts. With a theta to `begin` at, (p,), it begins there alone.
+        a few gusts. A theta to `begin` at, (p,), is the only start. The theta of the model that has `flown` is a
+        further start.
         """
         if begin is None:
-            ends = self._ends(starts, used, levels, progress)
+            ends = self._ends(starts, flown, used, levels, progress)
         else:
             free = np.ones(len(begin), dtype=bool)
             theta = self._started(np.clip(begin, self._lower, self.bound), None, free, progress)
@@ -333,12 +335,13 @@ class Search:
         deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
         nominal = np.where(self._errors, 0.0, theta)
         before = self.predicted(nominal, self.levels(nominal) if levels is None else levels)
-        flown = self.levels(theta) if levels is None else levels
-        return Fit(theta, deviation, before, self.predicted(theta, flown), flown)
+        winds = self.levels(theta) if levels is None else levels
+        return Fit(theta, deviation, before, self.predicted(theta, winds), winds)
 
     def _ends(
         self,
         starts: Sequence[int],
+        flown: FloatArray | None,
         used: NDArray[np.bool_],
         levels: NDArray[np.int64] | None,
         progress: Callable[[], None],
@@ -351,6 +354,9 @@ class Search:
         found = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
         for level in starts:
             theta = self._started(np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress)
+            found.append((coarse.cost(theta, fitted), theta))
+        if flown is not None and flown.any():
+            theta = self._started(flown, None, np.ones(len(flown), dtype=bool), progress)
             found.append((coarse.cost(theta, fitted), theta))
         best = sorted(found, key=lambda start: start[0])[:REFINED]
         return [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
@@ -442,6 +448,16 @@ class Search:
             for name, value in list(zip(part.named(), fit.theta.tolist(), strict=True))[part.count :]:
                 known.setdefault(name, []).append(value)
         return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
+
+    def of_model(self, airframe: Airframe) -> FloatArray:
+        """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the bounds."""
+        A, B, inputs = airframe.matrix_a(), airframe.matrix_b(), list(airframe.inputs)
+        theta = np.zeros(len(self.prior))
+        for k, entry in enumerate(self.nominal_entries()):
+            row = airframe.index(entry.row)
+            own = A[row, airframe.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
+            theta[k] = (own - entry.nominal) / entry.unit
+        return np.clip(theta, self._lower, self.bound)
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
@@ -560,18 +576,21 @@ def identify(
     progress: Callable[..., None] = lambda **_: None,
     at_bound: int = 0,
     unknown: Unknown = KNOWN,
+    flown: Airframe | None = None,
 ) -> Identification:
     """The model of a flight, with the reason why it must not be used if there is one.
 
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
-    airframe's order; `at_bound` how many entries of a part may lie at their bound; `unknown` what else is identified;
-    `progress` is called with the steps `completed` of the search, and their largest number `total`.
+    airframe's order; `at_bound` how many entries of a part may lie at their bound; `unknown` what else is identified; `flown`
+    the model in flight, a further start of the search; `progress` is called with the steps `completed` of
+    the search, and their largest number `total`.
     """
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every, done = blocks(model), count(1)
-    total = len(every) * (len(STARTS) * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
+    starts = len(STARTS) + (flown is not None)
+    total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
 
     def search_of(block: Block, *, coupled: bool = False) -> Search:
@@ -593,7 +612,10 @@ def identify(
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts)
 
-    found = [(search, search.fit(known & ~validating, step)) for search in map(search_of, every)]
+    found = []
+    for search in map(search_of, every):
+        also = None if flown is None else search.of_model(flown)
+        found.append((search, search.fit(known & ~validating, step, flown=also)))
     parts = [part_of(*each) for each in found]
     first, last = (joined([getattr(fit, key) for _, fit in found], every) for key in ("before", "after"))
     others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
