@@ -128,6 +128,16 @@ def test_learned_model_lowers_errors_without_jump_of_u(flown: Flown) -> None:
     assert (run / "log" / "learner.log").read_text(encoding="utf-8").splitlines() == lines
 
 
+def test_feedforward_goes_on_in_the_turn_that_was_commanded_before_the_switch(flown: Flown) -> None:
+    """The model flies in a turn from 15 s on. The reference is a flight in which it flew before the turn, too."""
+    (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
+    model = vary(scenario().rise_di(), change)
+    before = simulate(scenario(**model.model_dump() | {"learn": None}))
+    learned, whole = (tape["internals"]["u_ff.rudder"][-600:] for tape in (read_run(flown.run).tape, before))
+    # sideslip of the two models in the first seconds of the turn; with a wings-level begin the difference is 0.8 rad
+    assert np.max(np.abs(learned - whole)) < 0.1
+
+
 def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flown, tmp_path: Path) -> None:
     model = tmp_path / "model.yaml"
     result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--write", str(model)])

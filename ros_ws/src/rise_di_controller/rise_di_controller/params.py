@@ -425,6 +425,13 @@ class ControllerConfig(NodeConfig):
         """The arrays of the feedforward, None where there is none."""
         return None if self.feedforward is None else self.feedforward.nominal(self.outputs, self.inputs, self.D)
 
+    def _flown_nominal(self) -> Nominal | None:
+        """The nominal model along y_m. Beside an observer of part 0 no input is added: only a learner needs the states."""
+        nominal = self.nominal()
+        if nominal is None or self.observer is None or self.observer.part > 0.0:
+            return nominal
+        return nominal._replace(acts=np.zeros(len(self.inputs))) if self.history_ticks() else None
+
     def digest(self) -> int:
         """Hash of the parameters of the law and its guard, 0 to 2^48 - 1, exact as a float64.
 
@@ -451,7 +458,7 @@ class ControllerConfig(NodeConfig):
             ),
             history=self.history_ticks(),
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
-            nominal=None if self.observer is not None and self.observer.part == 0.0 else self.nominal(),
+            nominal=self._flown_nominal(),
             vanes=tuple(self._model_states().index(name) for name in self.vanes),
         )
 
