@@ -195,7 +195,7 @@ def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_l
     flight = Flight(simulated=True)
     acts_ns = END_NS + nanoseconds(4.0)
     for now_ns in range(0, acts_ns + 1, NANOSECONDS):
-        flight.learning.ticked(now_ns)
+        flight.learning.ticked(flight.controller, now_ns)
         assert flight.learning.waits(now_ns) is (now_ns >= acts_ns)
     flight.receive()
     flight.receive()
@@ -204,6 +204,14 @@ def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_l
     assert not flight.learning.waits(acts_ns)
     assert flight.learning.step(flight.controller, acts_ns) is not None
     assert flight.sentences[1:] == ["flies model"]
+
+
+def test_simulated_time_waits_for_no_proposal_of_a_deactivated_law() -> None:
+    flight = Flight(simulated=True)
+    flight.learning.ticked(flight.controller, 0)
+    flight.controller.tick(flight.now_ns, active=False)
+    assert not flight.learning.ticked(flight.controller, flight.now_ns)  # an identification is due
+    assert not flight.learning.waits(flight.now_ns + nanoseconds(60.0))
 
 
 def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None:

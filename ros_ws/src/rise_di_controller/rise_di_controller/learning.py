@@ -83,9 +83,9 @@ class Learning:
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
         self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
 
-    def ticked(self, now_ns: int) -> bool:
-        """Note a tick of the engaged law or of its failsafe; whether an identification begins with it."""
-        due = self._updates.due(now_ns)
+    def ticked(self, controller: Controller, now_ns: int) -> bool:
+        """Note a tick; whether an identification begins with it. None begins while the law is deactivated."""
+        due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
         if due and self._simulated:
             self._due.append(now_ns)
         return due

@@ -152,7 +152,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         before = self._controller.mode
         output = self._controller.tick(now_ns, late_ns, active=self._active)
         if self._learning is not None and output is not None and self._controller.has_internals:
-            self._learning.ticked(now_ns)
+            self._learning.ticked(self._controller, now_ns)
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
         self._tell_vanes()

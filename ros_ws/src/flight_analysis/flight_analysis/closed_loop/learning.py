@@ -124,7 +124,7 @@ class LearningLoop:
             return None
         if controller.mode is Mode.ENGAGED:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u)
-        if not self._learning.ticked(now_ns):
+        if not self._learning.ticked(controller, now_ns):
             return None
         proposal = self._learner.propose(controller.digest)
         self._learning.receive(as_received(proposal, self._parameters, now_ns, controller.digest), controller, now_ns)
