@@ -34,7 +34,7 @@ from typer.testing import CliRunner
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
 from flight_analysis.closed_loop.margins import linear_loop
-from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
@@ -266,6 +266,18 @@ def test_missions_need_route_and_airframe_with_matrices() -> None:
         define(program, 2, 0.3, 7, 2)
     with pytest.raises(ParameterError, match=r"airframe: found jsbsim:c172p, expected an airframe with matrices"):
         define(find_scenario("jsbsim_c172p_route"), 2, 0.3, 7, 2)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "sentence"),
+    [
+        (find_scenario("osprey_learn"), r"^controller\.learn: found a section, expected none"),
+        (find_scenario("osprey_servo").vary(aircraft={"sensors": {"delay": 0.004}}), r"^sensors\.delay: found"),
+    ],
+)
+def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(scenario: Scenario, sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        define(scenario, 2, 0.3, 7, 2)
 
 
 def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> None:

@@ -174,10 +174,11 @@ def define(
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
+    course = build_course(scenario)
     if scenario.guidance is not None:
         from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 
-        missions.build(scenario, build_course(scenario))
+        missions.build(scenario, course)
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
@@ -188,9 +189,8 @@ def define(
     require(scenario.guidance is None or not own, "score", "a unit", "none: the score of a mission is its cross-track error")
     if scenario.guidance is None:
         score_units(outputs, scenario.aircraft.channels().outputs, own)
-    if not scenario.aircraft.is_jsbsim:
-        of_airframe = spread._replace(entries=equipment.of_matrices(spread.entries))
-        sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, of_airframe)
+    of_airframe = spread._replace(entries=equipment.of_matrices(spread.entries))
+    sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, of_airframe)
     values = {
         "name": scenario.name,
         "sections": {
