@@ -162,6 +162,13 @@ def test_flight_without_excitation_refused_with_channel_and_factor() -> None:
     assert re.match(pattern, found.refusal)
 
 
+def test_flight_without_noise_that_is_mostly_at_rest_has_deviations() -> None:
+    """At rest the innovations are 0. The seconds that move are then no outliers."""
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 20.0})  # p moves from 11 s on
+    found = identify(innovation_filters.recording(simulate(scenario), OSPREY), OSPREY, Actuation(np.zeros(4), 0.0))
+    assert all(0.0 < entry.deviation < 0.3 for entry in found.entries)
+
+
 def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     """The elevator rolls this aircraft with a tenth of the effect of the ailerons, and its roll pitches it."""
     A, B = OSPREY.matrix_a(), OSPREY.matrix_b()

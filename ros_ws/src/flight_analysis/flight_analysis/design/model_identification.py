@@ -481,9 +481,10 @@ class Search:
         """
         _, (e,), _ = self.passed(theta, levels)
         square = np.array([np.nansum(e[span] ** 2) / max(np.isfinite(e[span]).sum(), 1) for span in self._spans])
+        largest = UNEXPLAINED * np.median(square[square > 0.0]) if square.any() else np.inf  # 0 at rest, without noise
         unexplained, gusts = (
             np.convolve(spans, np.ones(RECOVERY + 1))[: len(levels)] > 0.0
-            for spans in (square > UNEXPLAINED * np.median(square), LEVELS[levels, 1] > 0.0)
+            for spans in (square > largest, LEVELS[levels, 1] > 0.0)
         )
         left_out = unexplained | gusts if np.mean(gusts) < FEW else unexplained
         return ~np.repeat(left_out, self._spans[0].stop)[: len(self._y)]
