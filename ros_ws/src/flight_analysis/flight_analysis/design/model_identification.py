@@ -707,12 +707,12 @@ def model_yaml(found: Identification, origin: str) -> str:
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
     """The best known effect of an input on each output."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
-    return [min((entry for entry in effects if entry.row == output), key=lambda one: one.deviation) for output in outputs]
+    return [min((entry for entry in effects if entry.row == output), key=lambda effect: effect.deviation) for output in outputs]
 
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
     """The output whose inputs are known worst, if the best known effect on it has a deviation above MAX_DEVIATION."""
-    worst = max(best_known(entries, outputs), key=lambda one: one.deviation)
+    worst = max(best_known(entries, outputs), key=lambda effect: effect.deviation)
     if worst.deviation <= MAX_DEVIATION:
         return ""
     # information adds up with the square of the amplitude
