@@ -347,7 +347,7 @@ def _fly(
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
         started = control_law.engage(measure(now, *measured), params)
-        law = jax.tree.map(lambda one, like: jnp.broadcast_to(one, like.shape).astype(like.dtype), started, now.law)
+        law = jax.tree.map(lambda value, like: jnp.broadcast_to(value, like.shape).astype(like.dtype), started, now.law)
         return law, now.u, now.command
 
     def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array, Array]:

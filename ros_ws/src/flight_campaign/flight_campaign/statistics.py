@@ -111,7 +111,7 @@ class Tally(Config):
 
     def __add__(self, other: Self) -> Self:
         names = list(self.figures) or list(other.figures)
-        worst = sorted((*self.worst, *other.worst), key=lambda one: -math.inf if one.score is None else -one.score)
+        worst = sorted((*self.worst, *other.worst), key=lambda flight: -math.inf if flight.score is None else -flight.score)
         return type(self)(
             flights=self.flights + other.flights,
             diverged=self.diverged + other.diverged,

@@ -170,7 +170,7 @@ def _search(residuals: Any, values: FloatArray, order: int, amplitude: float) ->
         start = np.array([delay, lag, Omega, damping, stiffness, zero * Omega])[:order]
         scale = np.array([0.05, 0.05, 5.0 * abs(size), 10.0, 100.0, 50.0 * abs(size)])[:order]
         fits.append(least_squares(residuals, start, bounds=(LOWER[:order], UPPER[:order]), x_scale=scale, max_nfev=60))
-    best = min(fits, key=lambda one: float(one.cost))
+    best = min(fits, key=lambda fit: float(fit.cost))
     if order == ORDERS[0] and best.x[1] * best.x[3] > 1.0:
         delay, lag, Omega, damping = best.x
         start = np.array([delay, 1.0 / damping, Omega / (lag * damping), 1.0 / lag])  # the same response

@@ -502,7 +502,7 @@ def _search(
             least_squares(residuals, np.clip(start[fitted], *bounds), bounds=bounds, x_scale=SCALE[fitted], ftol=TOLERANCE)
             for start in starts
         ),
-        key=lambda one: float(one.cost),
+        key=lambda fit: float(fit.cost),
     )
     jacobian = np.zeros((len(best.fun), len(free)))
     jacobian[:, fitted] = best.jac
