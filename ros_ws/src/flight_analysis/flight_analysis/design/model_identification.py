@@ -40,7 +40,8 @@ from flight_core.vectors import FloatArray
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
-MAX_ERROR = 0.6  # 1, bound of a relative error: two standard deviations
+MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
+MAX_FACTOR = 2.5  # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either way
 
 FOLLOWS = 10.0  # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up to 3
 COUPLED_GAIN = 20.0  # of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
@@ -171,6 +172,11 @@ class Entry(NamedTuple):
         return f"{self.matrix}[{self.row}, {self.column}]"
 
     @property
+    def largest(self) -> float:
+        """The upper bound of the error."""
+        return MAX_FACTOR - 1.0 if self.nominal else MAX_ERROR
+
+    @property
     def value(self) -> float:
         """After the flight, SI."""
         return self.nominal + self.unit * self.error
@@ -225,11 +231,12 @@ class Search:
         if self.coarse is not self:
             self.coarse.believe(deviation)
         self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
-        self.bound = MAX_ERROR / PRIOR * self.prior
-        self._lower = -self.bound
+        self._errors = np.arange(len(self.prior)) < len(deviation)
+        self._upper = MAX_ERROR / PRIOR * self.prior
+        self._lower = -self._upper
+        self._upper[self._errors] = deviation / PRIOR * [entry.largest for entry in self.nominal_entries()]
         if len(of_delay):  # no u acts before it is sent
             self._lower[-1] = max(self._lower[-1], -self._delay / self._delay_deviation)
-        self._errors = np.arange(len(self.prior)) < len(deviation)
         self._winds = slice(len(deviation), len(deviation) + len(of_winds))
         self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
 
@@ -329,7 +336,7 @@ class Search:
             ends = self._ends(starts, flown, used, levels, progress)
         else:
             free = np.ones(len(begin), dtype=bool)
-            theta = self._started(np.clip(begin, self._lower, self.bound), None, free, progress)
+            theta = self._started(np.clip(begin, self._lower, self._upper), None, free, progress)
             ends = [self._refined(theta, levels, used, progress)]
         _, theta, hessian = min(ends, key=lambda end: end[0])
         deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
@@ -412,7 +419,7 @@ class Search:
         J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
         hessian, slope = J @ J.T + np.diag(self.prior**-2), J @ (e[0] / rms).ravel() + theta / self.prior**2
         slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
-        tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self.bound, free), self._lower, self.bound)
+        tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free), self._lower, self._upper)
         expected = -float(slope @ (tried[0] - theta)) / 2.0
         for several in (tried[:1], tried[1:]):
             lower, _, _ = self._costs(self.innovations(self.models(several, levels), levels), used, several)
@@ -457,7 +464,7 @@ class Search:
             row = airframe.index(entry.row)
             own = A[row, airframe.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
             theta[k] = (own - entry.nominal) / entry.unit
-        return np.clip(theta, self._lower, self.bound)
+        return np.clip(theta, self._lower, self._upper)
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
@@ -725,12 +732,12 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
 
 
 def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> str:
-    """The entries at the bound of the search, if more than `allowed`."""
-    at_bound = [entry.name for entry in entries if abs(entry.error) >= MAX_ERROR]
+    """The entries at a bound of the search, if more than `allowed`."""
+    at_bound = [entry.name for entry in entries if not -MAX_ERROR < entry.error < entry.largest]
     if len(at_bound) > allowed:
         return (
-            f"airframe {name}: found {', '.join(at_bound)} at the bound of +-{100 * MAX_ERROR:g} %, expected a log of this"
-            " airframe, in calm air if its effect of wind is not known"
+            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, {1.0 - MAX_ERROR:g} or {MAX_FACTOR:g}"
+            " times the nominal value, expected a log of this airframe, in calm air if its effect of wind is not known"
         )
     return ""
 
