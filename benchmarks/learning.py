@@ -45,6 +45,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, tuning
+from flight_campaign.learning import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_campaign.tuned_gains import load, tuned_file
 from flight_core.outcome import COMPLETED
@@ -241,15 +242,15 @@ def fly(name: str, number: int, chosen: Scenario) -> Learned:
     for change in tape.changes:
         controller = vary(controller, change)
     assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
-    taken = [event for event in events if event.change]
+    account = learned(tape, events)
     dead = [event for event in events if "has no effect" in event.sentence]
     found = dead[0].sentence.partition(" has no effect")[0].split()[-1] if dead else ""
     summary = Row(
         name,
         number,
-        first=taken[0].stamp_ns / 1e9 if taken else math.nan,
-        models=len(taken),
-        refused=sum(not event.change for event in events),
+        first=account.first_model,
+        models=account.models,
+        refused=account.refused,
         alarms=sum("changed, log-likelihood" in event.sentence for event in events),
         found=found,
         found_at=dead[0].stamp_ns / 1e9 if dead else math.nan,

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -33,6 +34,7 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
+from flight_analysis.closed_loop.learning import Learn, Proposal
 from flight_analysis.closed_loop.margins import linear_loop
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
@@ -41,7 +43,7 @@ from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines, equipment
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
-from flight_campaign.campaign_report import overview, write_page
+from flight_campaign.campaign_report import figure_rows, overview, write_page
 from flight_campaign.influence import chance_level, rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
@@ -271,13 +273,44 @@ def test_missions_need_route_and_airframe_with_matrices() -> None:
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
     [
-        (find_scenario("osprey_learn"), r"^controller\.learn: found a section, expected none"),
+        (find_scenario("jsbsim_c172p_learn"), r"^airframe: found jsbsim:c172p, expected an airframe with matrices"),
+        (
+            replace(find_scenario("osprey_route"), controller=find_scenario("osprey_learn").controller),
+            r"^guidance: found a section beside controller.learn, expected none",
+        ),
         (find_scenario("osprey_servo").vary(aircraft={"sensors": {"delay": 0.004}}), r"^sensors\.delay: found"),
     ],
 )
 def test_scenario_that_campaign_cannot_fly_is_refused_before_its_folder(scenario: Scenario, sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         define(scenario, 2, 0.3, 7, 2)
+
+
+def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path) -> None:
+    """The learner of the first one proposes a model, that of the second one without an observer."""
+    scenario = find_scenario("osprey_learn").vary(
+        flight={"duration": 2.0},
+        aircraft={"rate": 100.0, "step": 0.005},
+        controller={"learn": {"updates": [1.0], "latency": 0.5}},
+    )
+    model = find_scenario("osprey_observer").rise_di()
+
+    def learner(flown: Scenario) -> Learn:
+        proposed = model.model_copy(update={"observer": None}) if flown.aircraft.uncertainty.number else model
+        made = SimpleNamespace(take=lambda *_: None, propose=lambda _: Proposal(proposed, "given"))
+        return lambda _: made
+
+    (folder := tmp_path / "learn").mkdir()
+    campaign = Campaign.begin(folder, define(scenario, 2, 0.3, 7))
+    assert list(campaign.fly(engines.threads(1), learner)) == [1, 1]  # each aircraft is a chunk
+    rows, tally = campaign.rows().collect(), campaign.tally(0)
+    assert rows.select("first_model", "models", "refused", "fallbacks").rows() == [(1.5, 1, 0, 0), (None, 0, 1, 0)]
+    assert tally.without_model() == 1
+    assert figure_rows(tally, {})[-4] == ["first model (s)", *["1.5"] * 5]
+    again = campaign.definition.aircraft_scenario(0)
+    true = error(simulate(again, learn=learner(again)))
+    assert [rows["rms.q"][0], rows["max.p"][0]] == [np.sqrt(np.mean(true["q"] ** 2)), np.abs(true["p"]).max()]
+    assert again.aircraft.sampled_airframe().matrix_b()[2, 0] == rows["B[q,elevator]"][0]
 
 
 def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> None:

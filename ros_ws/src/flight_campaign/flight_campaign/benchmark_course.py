@@ -69,7 +69,7 @@ def build_course(scenario: Scenario) -> Course:
     aircraft, controller = scenario.aircraft, scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
     fixed = getattr(controller, "learn", None) is None
-    require(fixed, "controller.learn", "a section", "none: a campaign does not learn, rise-di fly --in-process does")
+    require(fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn")
     at_trim = controller.guard().over_speed is None
     require(
         at_trim, "controller.schedule", "models at other speeds", "none: the aircraft of a campaign fly at their trim speed"

@@ -17,10 +17,11 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Distribution, Spread, WindEffect, drawn_entries, gust_directions, sampled_matrices
 from flight_analysis.closed_loop.margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
-from flight_campaign import equipment
+from flight_campaign import equipment, learning
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
+from flight_campaign.learning import Learned, MakeLearner
 from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
-CHUNK = 1000  # aircraft computed at once
+CHUNK = 1000  # aircraft computed at once; those that learn fly one by one, each a chunk
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
 
 
@@ -159,7 +160,7 @@ def define(
     aircraft: int,
     uncertainty: float,
     seed: int,
-    chunk: int,
+    chunk: int | None = None,
     sweep: Sweep | None = None,
     wind: WindEffect | None = None,
     spread: Spread | None = None,
@@ -168,17 +169,20 @@ def define(
     """The definition of a campaign over a scenario.
 
     `wind` and `spread` None: those of the scenario's `aircraft.uncertainty`. `units` replaces units of the
-    score by output, SI.
+    score by output, SI. `chunk` None: CHUNK, or 1 with a learner.
 
     Raises ParameterError if a campaign cannot fly it.
     """
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
-    course = build_course(scenario)
-    if scenario.guidance is not None:
-        from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
+    if scenario.learns():
+        learning.require_flyable(scenario)
+    else:
+        course = build_course(scenario)
+        if scenario.guidance is not None:
+            from flight_campaign import missions  # noqa: PLC0415 - JAX, which the command needs only for flights
 
-        missions.build(scenario, course)
+            missions.build(scenario, course)
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
@@ -200,7 +204,7 @@ def define(
         "uncertainty": uncertainty,
         "wind": scenario.aircraft.uncertainty.wind if wind is None else wind,
         "seed": seed,
-        "chunk": chunk,
+        "chunk": chunk or (1 if scenario.learns() else CHUNK),
         "sweep": sweep,
         "entries": dict(spread.entries),
         "distribution": spread.distribution,
@@ -212,14 +216,17 @@ def define(
     return definition
 
 
-def fly_chunk(text: str, job: Job) -> bytes:
+def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     """Fly a chunk of a campaign: its definition as JSON, the job -> its rows as Parquet. It has no other inputs.
 
-    Raises ParameterError for a chunk that does not fit into memory.
+    `learner` makes the learner of a scenario. Raises ParameterError for a chunk that does not fit into memory.
     """
     definition = Definition.model_validate_json(text)
     try:
-        figures = fly_chunk_figures(text, job)
+        if learner is not None and definition.scenario().learns():
+            figures = fly_learning(definition, job, learner)
+        else:
+            figures = fly_chunk_figures(text, job)
     except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
         if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
             raise
@@ -255,6 +262,26 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
         figures |= {f"{kind}.{name}": row for name, row in zip(names, values, strict=True)}
     entries = drawn_entries(airframe, A[:count], B[:count]) | {name: value[:count] for name, value in equipped.items()}
     return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
+
+
+def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chunk:
+    """Fly a chunk of a campaign with learners, one aircraft after another."""
+    case, chunk = job
+    first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
+    scenario = definition.scenario(case)
+    airframe = load_airframe(scenario.aircraft.airframe)
+    A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
+    entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
+    flown = [learning.fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    outputs = scenario.controller.outputs
+    rms = np.array([[flight.rms[name] for flight in flown] for name in outputs])
+    figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
+    for kind in ("rms", "max", "slew"):
+        values = [getattr(flight, kind) for flight in flown]
+        figures |= {f"{kind}.{name}": np.array([of[name] for of in values]) for name in values[0]}
+    for name in Learned._fields:
+        figures[name] = np.array([float(getattr(flight.learned, name)) for flight in flown])
+    return Chunk(first, np.array([flight.diverged for flight in flown]), figures, entries)
 
 
 class _Shared(NamedTuple):
@@ -307,9 +334,12 @@ class Campaign:
         """The chunks without a file."""
         return [job for job in self.definition.jobs() if not self._path(job).exists()]
 
-    def fly(self, engine: Engine) -> Iterator[int]:
-        """Fly the missing chunks; yields the number of flights of each completed one."""
-        for job, table in engine(partial(fly_chunk, self.definition.model_dump_json()), self.missing()):
+    def fly(self, engine: Engine, learner: MakeLearner | None = None) -> Iterator[int]:
+        """Fly the missing chunks; yields the number of flights of each completed one.
+
+        `learner` makes the learner of a scenario.
+        """
+        for job, table in engine(partial(fly_chunk, self.definition.model_dump_json(), learner=learner), self.missing()):
             _write(self._path(job), table)
             yield self.definition.size(job)
 

@@ -25,7 +25,7 @@ from flight_analysis.report.summary import NO_UNIT, NO_VALUE, QUANTITY_UNITS, Co
 from flight_analysis.report.tables import Table
 from flight_campaign import equipment
 from flight_campaign.campaign import MARGIN_AIRCRAFT, Campaign, Definition
-from flight_campaign.statistics import EDGES, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
+from flight_campaign.statistics import EDGES, FIRST_MODEL, LOSS_OF_TRACK_SCORE, PER_DECADE, Figure, Tally
 from flight_core.files import display_path, write_file, writing
 from flight_core.vectors import FloatArray
 
@@ -35,12 +35,19 @@ SPREAD = {"median": 0.5, "95 %": 0.95, "99 %": 0.99}
 ENTRIES_SHOWN = 6
 RERUN = 3  # scenarios are written for so many of the worst aircraft of a case
 FIGURE_HEADINGS = ("mean", *SPREAD, "worst")
+OF_LEARNER = {FIRST_MODEL: "first model (s)", "models": "models that flew", "refused": "models refused"}
 
 
 OVERVIEW_LEGEND = (
     "phase and gain margin, sensitivity: of the worst input, the others closed; disk and delay margin: of all inputs at once."
     f" Nominal aircraft, in parentheses the worst of the first {MARGIN_AIRCRAFT} or fewer by their A and B;"
     " lags and delay of the controller's section"
+)
+
+
+LEARNER_LEGEND = (
+    "first model: when it flew; models refused: by the learner, which tells why in the flight, or by the controller; fallbacks:"
+    " to the law of the start, in all outputs or in some. The margins above are those of the law of the start"
 )
 
 
@@ -99,6 +106,9 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
     of_equipment = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
     of_matrices = {name: part for name, part in corner.items() if name not in known}
     write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), of_matrices, definition.wind)))
+    learn = getattr(scenario.controller, "learn", None)
+    if learn is not None and learn.prior is None:  # the learner begins with the airframe, not with the corner
+        scenario = scenario.vary(controller={"learn": {"prior": scenario.aircraft.airframe}})
     cornered = equipment.with_equipment(scenario, of_equipment).vary(aircraft={"airframe": str(airframe)})
     write_file(path, scenario_yaml(cornered))
     return ranked | {"command": _command(path)}
@@ -135,6 +145,8 @@ def write_page(
         f" Score: {score_meaning(scenario, definition.score_units)}; loss of track: a score above {LOSS_OF_TRACK_SCORE:g}."
     )
     tables = [overview(definition, tallies, margins), _ends(labels, cases)]
+    if scenario.learns():
+        tables.append(_without_model(labels, tallies))
     tables += [_figures(label, tally, units) for label, tally in zip(labels, tallies, strict=True)]
     tables.append(_worst(labels, cases))
     tables += [influence_table(label, case) for label, case in zip(labels, cases, strict=True) if case["influence"]["entries"]]
@@ -198,6 +210,11 @@ def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
     return Table("Outcomes", columns, rows)
 
 
+def _without_model(labels: Sequence[str], tallies: Sequence[Tally]) -> Table:
+    rows = [[label, str(tally.without_model()), str(tally.flights)] for label, tally in zip(labels, tallies, strict=True)]
+    return Table("Aircraft that learn", [Column("", "without a model"), Column("", "of")], rows, LEARNER_LEGEND)
+
+
 def _figures(label: str, tally: Tally, units: Mapping[str, DisplayUnit]) -> Table:
     columns = [Column("", head) for head in FIGURE_HEADINGS]
     return Table(label, columns, figure_rows(tally, units), "of flights that did not diverge; slew: mean abs(u_dot)")
@@ -209,7 +226,7 @@ def figure_rows(tally: Tally, units: Mapping[str, DisplayUnit]) -> list[list[str
     for name, figure in tally.figures.items():
         label, factor = _label(name, units)
         values = (figure.mean, *(figure.quantile(share) for share in SPREAD.values()), figure.largest)
-        rows.append([label, *(f"{value * factor:.3g}" for value in values)])
+        rows.append([label, *(f"{value * factor:.3g}" if figure.count else NO_VALUE for value in values)])
     return rows
 
 
@@ -217,7 +234,7 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
     """A figure's name with its unit, and the factor from SI."""
     kind, _, channel = name.partition(".")
     if not channel:
-        return name, 1.0
+        return OF_LEARNER.get(name, name), 1.0
     shown = units.get(channel, NO_UNIT)
     return f"{kind} {channel} ({shown.unit}{'/s' * (kind == 'slew')})", shown.factor
 

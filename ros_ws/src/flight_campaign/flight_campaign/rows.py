@@ -26,7 +26,7 @@ class Chunk(NamedTuple):
 
 
 def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
-    """The table of a chunk as Parquet (zstd), SI; the figures of a diverged aircraft are null."""
+    """The table of a chunk as Parquet (zstd), SI; figures of a diverged aircraft, and NaN, are null."""
     import polars as pl  # noqa: PLC0415
 
     count, stream = len(chunk.diverged), io.BytesIO()
@@ -42,7 +42,7 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
             **chunk.entries,
         }
     )
-    table = table.with_columns(pl.when(~diverged).then(pl.col(name)).alias(name) for name in chunk.figures)
+    table = table.with_columns(pl.when(~diverged).then(pl.col(name).fill_nan(None)).alias(name) for name in chunk.figures)
     table.write_parquet(stream)
     return stream.getvalue()
 

@@ -25,6 +25,9 @@ SCORE_UNIT = {ANGULAR_RATE: 0.010, SPEED: 0.1}  # rad/s, m/s
 
 SCORE_UNIT_OF = {"p": 0.020}  # rad/s, by channel; it replaces that of its unit
 
+FIRST_MODEL = "first_model"
+"""A figure of aircraft with a learner; NaN without a model."""
+
 LOSS_OF_TRACK_SCORE = 10.0  # a higher score is a loss of track; 1 to 4 is usual
 QUANTILES = (0.5, 0.95, 0.99)
 WORST_KEPT = 10  # number of worst flights in a tally
@@ -41,7 +44,8 @@ class Figure(Config):
 
     @classmethod
     def of(cls, values: FloatArray) -> Self:
-        """Of values >= 0, shape (N,)."""
+        """Of values >= 0, shape (N,); NaN does not count."""
+        values = values[~np.isnan(values)]
         if not len(values):
             return cls()
         places, counts = np.unique(np.searchsorted(EDGES, values, side="right") - 1, return_counts=True)
@@ -73,7 +77,9 @@ class Figure(Config):
         wanted, below = share * self.count, 0
         for place, number in self.bins.items():
             if below + number >= wanted:
-                low, high = EDGES[max(place, 0)], EDGES[min(place + 1, len(EDGES) - 1)]
+                if place < 0:
+                    return 0.0
+                low, high = EDGES[place], EDGES[min(place + 1, len(EDGES) - 1)]
                 return min(float(low * (high / low) ** ((wanted - below) / number)), self.largest)
             below += number
         return self.largest
@@ -120,9 +126,13 @@ class Tally(Config):
             worst=tuple(worst[:WORST_KEPT]),
         )
 
+    def without_model(self) -> int | None:
+        """Number of flights without a model, diverged ones excluded; None without learners."""
+        return self.flights - self.diverged - self.figures[FIRST_MODEL].count if FIRST_MODEL in self.figures else None
+
     def summary(self) -> dict[str, Any]:
         """The statistics as figures of a file, SI."""
-        shares = {}
+        shares: dict[str, Any] = {} if (without := self.without_model()) is None else {"without_model": without}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):
             share, low, high = self.share(count)
             shares[word] = {"count": count, "share": share, "low": low, "high": high}

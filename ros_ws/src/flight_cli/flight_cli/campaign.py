@@ -36,6 +36,7 @@ from flight_cli.output import (
 from flight_core.files import display_path, writing
 from flight_core.installation import require_package
 from flight_core.parameters import require
+from rise_di.learning import learner
 
 OF_DEFINITION = (
     *("aircraft", "uncertainty", "entry", "distribution", "score", "wind", "seed", "sweep", "duration", "chunk", "runs"),
@@ -82,11 +83,12 @@ def campaign(
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, help="Aircraft computed at once. Use more on a GPU."),
+        typer.Option(min=1, help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU."),
     ] = None,
-    engine: Annotated[EngineName, typer.Option(help="Threads of this process, or processes and hosts of dask.")] = (
-        EngineName.THREADS
-    ),
+    engine: Annotated[
+        EngineName | None,
+        typer.Option(help="Threads of this process, or processes and hosts of dask; by default dask with a learner."),
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Threads or processes; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, as in tcp://host:8786.")] = None,
     runs: Annotated[Path, typer.Option(help="Folder that the campaign's folder is made in.")] = Path("runs"),
@@ -97,6 +99,8 @@ def campaign(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else.")] = False,
 ) -> None:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a scenario, many at once.
+
+    Aircraft with a learner fly one by one on each core, as by rise-di fly --in-process, half a minute each.
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; --resume continues it.
     """
@@ -113,6 +117,7 @@ def campaign(
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
+        learner(chosen)  # refuses what the aircraft could not learn with
         swept = None if sweep is None else _parse_sweep(sweep)
         spread = chosen.aircraft.uncertainty.spread()
         if entry is not None:
@@ -121,8 +126,10 @@ def campaign(
             spread = spread._replace(distribution=distribution)
         units = None if score is None else _named_numbers("--score", score, "q=0.02")
         with options("sweep", "score"):
-            definition = define(chosen, aircraft, uncertainty, seed, chunk or CHUNK, swept, wind, spread, units)
+            definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
+    if engine is None:
+        engine = EngineName.DASK if monte_carlo.definition.scenario().learns() else EngineName.THREADS
     flies = engines.threads(workers) if engine is EngineName.THREADS else engines.dask(workers, scheduler)
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
     figures, results = write_results(monte_carlo)
@@ -172,8 +179,8 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     seconds, begin, done = definition.scenario().flight.duration, time.monotonic(), 0
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
-            task = bar.add_task("aircraft", total=total, completed=there, shown="compiling")
-            for flights in monte_carlo.fly(engine):
+            task = bar.add_task("aircraft", total=total, completed=there, shown="starting")
+            for flights in monte_carlo.fly(engine, learner):
                 done += flights
                 speed = done * seconds / (time.monotonic() - begin)
                 bar.update(task, completed=there + done, shown=f"{speed:,.0f} aircraft-seconds per second")
@@ -210,6 +217,8 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
         share, low, high = tally.share(count)
         console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
+    if (without := tally.without_model()) is not None:
+        console.print(f"without a model: {without} of {tally.flights}; fallbacks: to the law of the start")
     for flight in figures["fly_again"]:
         score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"
         console.print(

@@ -14,10 +14,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
-from flight_campaign.campaign import CHUNK, Campaign, Sweep, define
+from flight_campaign.campaign import Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import write_results
 from flight_core.arguments import FilePath, as_count, as_number, as_path
 from flight_core.parameters import ParameterError, require
+from rise_di.learning import learner
 
 if TYPE_CHECKING:
     import polars as pl
@@ -54,7 +55,7 @@ def fly_campaign(
     seed: int = 1,
     sweep: Mapping[str, ArrayLike] | None = None,
     duration: float | None = None,
-    chunk: int = CHUNK,
+    chunk: int | None = None,
     workers: int | None = None,
     runs: FilePath = "runs",
     progress: Progress | None = None,
@@ -74,8 +75,9 @@ def fly_campaign(
         seed: Seed of the aircraft.
         sweep: A parameter of the controller, or its value in a channel, and its factors: {"beta[V]": [0.5, 1.0, 2.0]}.
         duration: Seconds to fly; None: those of the scenario.
-        chunk: Aircraft computed at once. More are faster on a GPU.
-        workers: Threads; None: one a core.
+        chunk: Aircraft computed at once; None: 1000, with a learner 1. More are faster on a GPU.
+        workers: Threads, with a learner processes; None: one a core. A script with a learner calls the function
+            under `if __name__ == "__main__":`.
         runs: Folder that the folder of the campaign is made in.
         progress: Called with the flights so far and all flights, after each chunk.
 
@@ -89,18 +91,22 @@ def fly_campaign(
         spread = spread._replace(distribution=distribution)
     units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
     definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units)
-    flies, report = _threads(workers), _progress(progress)
+    learner(chosen)  # refuses what the aircraft could not learn with
+    flies, report = _engine(definition, workers), _progress(progress)
     folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
     return _fly(Campaign.begin(folder, definition), flies, report)
 
 
 def resume_campaign(folder: FilePath, *, workers: int | None = None, progress: Progress | None = None) -> CampaignResult:
     """Fly the aircraft that an interrupted campaign has not flown. Raises ParameterError for a folder without a campaign."""
-    return _fly(Campaign.resume(as_path(folder, "folder", "the folder of a campaign")), _threads(workers), _progress(progress))
+    campaign = Campaign.resume(as_path(folder, "folder", "the folder of a campaign"))
+    return _fly(campaign, _engine(campaign.definition, workers), _progress(progress))
 
 
-def _threads(workers: int | None) -> engines.Engine:
-    return engines.threads(None if workers is None else as_count(workers, "workers", 1))
+def _engine(definition: Definition, workers: int | None) -> engines.Engine:
+    """Threads of this process; with a learner, processes of this machine."""
+    make = engines.dask if definition.scenario().learns() else engines.threads
+    return make(None if workers is None else as_count(workers, "workers", 1))
 
 
 def _progress(progress: Progress | None) -> Progress:
@@ -130,7 +136,7 @@ def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> Camp
     definition, missing = campaign.definition, campaign.missing()
     total = definition.aircraft * definition.cases
     flown = total - sum(definition.size(job) for job in missing)
-    for flights in campaign.fly(engine):
+    for flights in campaign.fly(engine, learner):
         flown += flights
         progress(flown, total)
     figures, _ = write_results(campaign)

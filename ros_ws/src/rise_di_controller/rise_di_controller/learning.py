@@ -26,6 +26,10 @@ OPTIONAL = ("feedforward.inputs", "feedforward.gravity")
 """Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
 
 
+FLIES, REFUSED = "flies", "refused"
+"""First words of the sentence of an event: a proposal is taken, a proposal fails a check."""
+
+
 class Proposal(NamedTuple):
     """What a learner found in its window, as the controller receives it."""
 
@@ -97,7 +101,7 @@ class Learning:
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
         if refusal := self._refusal(proposal, now_ns, controller):
-            self._announce(Event(now_ns, {}, f"refused: {refusal}"))
+            self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
         else:
@@ -192,7 +196,7 @@ class Learning:
             self._certificate = None
             refusal = _unfit(proposal, controller)
             if not refusal:
-                self._take(controller, now_ns, end.value, f"flies {proposal.sentence}")
+                self._take(controller, now_ns, end.value, f"{FLIES} {proposal.sentence}")
                 return controller.parameters
         except ArithmeticError as error:
             refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
@@ -201,7 +205,7 @@ class Learning:
         else:
             return None
         self._certificate = None
-        self._announce(Event(now_ns, {}, f"refused: {refusal}"))
+        self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
         return None
 
     def _take(self, controller: Controller, now_ns: int, new: Prepared, sentence: str) -> None:

@@ -26,7 +26,7 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.learning import Event, Learning, Proposal
+from rise_di_controller.learning import REFUSED, Event, Learning, Proposal
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -240,7 +240,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _say(self, event: Event) -> None:
         """Log and publish what became of a proposal."""
         sentence = bounded(event.sentence)
-        if event.change or not sentence.startswith("refused"):
+        if event.change or not sentence.startswith(REFUSED):
             self.get_logger().info(sentence)
         else:
             self.get_logger().warning(sentence)
