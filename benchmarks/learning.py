@@ -5,12 +5,14 @@
 python -m benchmarks.learning                                     # every cell, 50 aircraft: at most 90 min on two idle cores
 python -m benchmarks.learning --aircraft 6                        # with fewer; run again, it flies what is missing
 python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
+python -m benchmarks.learning --aircraft 20 --lockstep 2          # two of each cell also over topics in lockstep
 
 An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
 osprey_observer, as the others do, and as the laws of `rise-di compare` do with their gains for the airframe file. A row an
 aircraft goes to build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where
 the airs of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3 min of a core over
-all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each.
+all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each. In lockstep the
+flight that learns is flown again over topics, recorded, and compared with that in one process to the byte.
 """
 
 import csv
@@ -43,7 +45,8 @@ from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.fly import fly_over_topics
+from flight_bringup.scenarios import find_scenario, written
 from flight_campaign import fleet, tuning
 from flight_campaign.learning import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
@@ -52,6 +55,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from flight_log.tape_reader import read_run
 from rise_di.gain_design import observed
 from rise_di.learning import learner
 from rise_di_controller.learning import Event
@@ -137,6 +141,7 @@ class Row(NamedTuple):
     update: float = 0.0  # s of a core, mean: identification, test for a change and design
     longest: float = 0.0  # s of a core, the same
     replayed: int = 0
+    lockstep: float = math.nan  # 1: equal to the byte in lockstep; NaN where not flown
     events: str = ""
     revision: str = ""  # of the code that flew
 
@@ -228,8 +233,8 @@ class Learned(NamedTuple):
     row: Row
 
 
-def fly(name: str, number: int, chosen: Scenario) -> Learned:
-    """Fly a scenario that learns."""
+def fly(name: str, number: int, chosen: Scenario, *, lockstep: bool) -> Learned:
+    """Fly a scenario that learns, and again in `lockstep`."""
     make, events, timed = learner(chosen), list[Event](), list[Timed]()
     assert make is not None  # noqa: S101 - for the type checker
 
@@ -257,9 +262,25 @@ def fly(name: str, number: int, chosen: Scenario) -> Learned:
         update=float(np.mean(timed[0].steps)),
         longest=max(timed[0].steps),
         replayed=int(replay(tape).equal()),
+        lockstep=float(equals_in_lockstep(tape, chosen)) if lockstep else math.nan,
         events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
     )
     return Learned(tape, controller.model_copy(update={"learn": None}), summary)
+
+
+def equals_in_lockstep(tape: Tape, chosen: Scenario) -> bool:
+    """Whether a flight over topics in lockstep records the same samples to the byte, and replays to the bit."""
+    with TemporaryDirectory() as folder:
+        run = Path(folder, "run")
+        outcome = fly_over_topics(written(chosen, Path(folder, "flown.yaml")), run, lambda *_: None, lockstep=True)
+        recorded = read_run(run).tape
+        same = (
+            name in recorded
+            and signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes()
+            and signal.values.tobytes() == recorded[name].values.tobytes()
+            for name, signal in tape.signals.items()
+        )
+        return outcome == COMPLETED and all(same) and replay(run).equal()
 
 
 def start_of(chosen: Scenario) -> RiseDiConfig:
@@ -287,7 +308,7 @@ def frozen(controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
     return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
 
 
-def learn(name: str, cell: Cell, number: int) -> Row:
+def learn(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
     """A learner beside what does not learn."""
     with TemporaryDirectory() as folder:
         chosen = learning(cell, number, LEARNED)
@@ -300,7 +321,7 @@ def learn(name: str, cell: Cell, number: int) -> Row:
             Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")), encoding="utf-8")
             Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)), encoding="utf-8")
             chosen = with_prior(learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder)
-        flown = fly(name, number, chosen)
+        flown = fly(name, number, chosen, lockstep=lockstep)
         flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
         if cell.kind == "rough":
             others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
@@ -345,7 +366,7 @@ def coupled(number: int) -> Airframe:
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
-def damage(name: str, cell: Cell, number: int) -> Row:
+def damage(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
     """A learner beside the others when elevator and aileron lose half of their effect, or one surface all of it."""
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
@@ -355,7 +376,8 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
     actuators[key] = [DAMAGED if channel in hit else math.inf for channel in inputs]
     chosen = learning(cell, number, END, actuators=actuators)
-    flown, start, aircraft = fly(name, number, chosen), start_of(chosen), chosen.aircraft.sampled_airframe()
+    flown, start = fly(name, number, chosen, lockstep=lockstep), start_of(chosen)
+    aircraft = chosen.aircraft.sampled_airframe()
     B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
     controllers = {"alone": start, "file": file_design(OSPREY)}
@@ -367,9 +389,9 @@ def damage(name: str, cell: Cell, number: int) -> Row:
     return flown.row._replace(**found, dead=dead, lost=lost)
 
 
-def alarms(name: str, cell: Cell, number: int) -> Row:
+def alarms(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
     """A learner in a long flight without any damage."""
-    return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
+    return fly(name, number, learning(cell, number, ALARM_FLIGHT), lockstep=lockstep).row
 
 
 FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
@@ -380,9 +402,9 @@ def count(name: str, aircraft: int) -> int:
     return min(math.ceil(CELLS[name].share * aircraft), CELLS[name].most)
 
 
-def flown_rows(names: Sequence[str], number: int) -> list[Row]:
+def flown_rows(names: Sequence[str], number: int, lockstep: int) -> list[Row]:
     """The rows of an aircraft in some cells."""
-    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
+    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number, lockstep=number < lockstep) for name in names]
 
 
 def code() -> list[str]:
@@ -424,6 +446,9 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence_data.Row]:
         if chosen:
             yield row(f"{name}: aircraft", float(len(chosen)))
             yield row(f"{name}: replay equal", float(np.mean([each.replayed for each in chosen])), at_least=1.0)
+            if known := [each.lockstep for each in chosen if not math.isnan(each.lockstep)]:
+                yield row(f"{name}: flights in lockstep", float(len(known)))
+                yield row(f"{name}: lockstep equal to the byte", float(np.mean(known)), at_least=1.0)
             yield row(f"{name}: update, mean", float(np.mean([each.update for each in chosen])), "s", at_most=UPDATE)
             yield row(f"{name}: update, longest", max(each.longest for each in chosen), "s")
             yield from CELL_FIGURES[cell.kind](name, cell, chosen)
@@ -548,6 +573,7 @@ def plot(rows: Sequence[Row]) -> Figure:
 def main(
     aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 50,
     cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
+    lockstep: Annotated[int, typer.Option(min=0, help="Aircraft of a cell that also fly in lockstep over topics.")] = 0,
     results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
@@ -561,7 +587,8 @@ def main(
     begun = evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
     flown_by = evidence_data.revision(*code())
     rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence_data.DIRTY)]
-    known = {(each.cell, each.number) for each in rows}
+    known = {(each.cell, each.number) for each in rows if each.number >= lockstep or not math.isnan(each.lockstep)}
+    rows = [each for each in rows if (each.cell, each.number) in known]
     # aircraft by aircraft, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
     for n in range(aircraft):
@@ -571,7 +598,7 @@ def main(
                 shared = "" if CELLS[name].kind == "learn" else name
                 cases.setdefault((n, CELLS[name].uncertainty, shared), []).append(name)
     with ProcessPoolExecutor(jobs) as pool:
-        pending = [pool.submit(flown_rows, names, n) for (n, _, _), names in cases.items()]
+        pending = [pool.submit(flown_rows, names, n, lockstep) for (n, _, _), names in cases.items()]
         for future in track(as_completed(pending), "aircraft", total=len(pending)):
             rows += [each._replace(revision=flown_by) for each in future.result()]
             write(results, rows)
