@@ -53,7 +53,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._truth_encoder = self.encoder(self._simulator.truth_names)
         if self.parameters.lockstep:
             self._number = 0  # of the next sample
-            self._u_received = True
+            self._u_received, self._completed = True, False
             self._recorded_ns = 0
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
@@ -96,7 +96,10 @@ class AircraftNode(FlightNode[AircraftConfig]):
         if not self._u_received and not self._take_u((self._number - 1) * self.period_ns()):
             return False
         self._u_received = True
-        if self._finished() or self._ahead_of_log():
+        if self._finished():
+            self._complete()
+            return False
+        if self._ahead_of_log():
             return False
         waits_ns = -(-self._number * self.period_ns() // self._control_ns) * self._control_ns  # the next instant that needs a u
         until_ns = min(waits_ns, self._end_ns or waits_ns)
@@ -109,10 +112,14 @@ class AircraftNode(FlightNode[AircraftConfig]):
         for message in messages:  # together: each y by itself would wake up the controller
             self._publish_y(message)
         self._u_received = until_ns % self._control_ns != 0
-        if self._finished():
+        return True
+
+    def _complete(self) -> None:
+        """Tell that the flight is complete: with the u of its last instant."""
+        if not self._completed:
+            self._completed = True
             self.publish_state(NodeState.COMPLETED)
             self.get_logger().info(f"flight completed at t = {seconds((self._number - 1) * self.period_ns()):g} s")
-        return True
 
     def _finished(self) -> bool:
         return self._end_ns is not None and self._number * self.period_ns() > self._end_ns

@@ -240,12 +240,12 @@ def _follow_lockstep(
     progress: Progress,
     announce: Callable[[str], None],
 ) -> Steps:
-    """The real-time factor counts from the first instant in the log. The flight ends when the log is complete."""
+    """The real-time factor counts from the first instant in the log. The flight ends with the last u, and a complete log."""
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
     t, last_change, text = 0.0, time.monotonic(), "lockstep, starting"
     timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
     first: tuple[float, float] | None = None  # monotonic and flight time, s
-    while t < end:
+    while t < end or not processes.is_completed():
         if (reason := processes.ended_early()) is not None:
             return reason
         now = time.monotonic()

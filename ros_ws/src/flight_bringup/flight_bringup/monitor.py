@@ -65,6 +65,10 @@ class FlightMonitor(Client):
         """Whether the aircraft has taken a u."""
         return self._state(node, pid) == NodeState.FLYING
 
+    def is_completed(self, node: str, pid: int) -> bool:
+        """Whether the aircraft has completed a lockstep flight."""
+        return self._state(node, pid) == NodeState.COMPLETED
+
     def _state(self, node: str, pid: int) -> str:
         for received in self._node_state.take():
             self._states[received.message.key] = received.message.value

@@ -281,6 +281,10 @@ class FlightProcesses:
         """Whether the aircraft has taken a u."""
         return any(self._monitor.is_flying(name, pid) for name, pid in self._nodes() if name == AIRCRAFT.executable)
 
+    def is_completed(self) -> bool:
+        """Whether the aircraft has completed a lockstep flight, the u of its last instant included."""
+        return any(self._monitor.is_completed(name, pid) for name, pid in self._nodes() if name == AIRCRAFT.executable)
+
     def last_words(self, node: NodeSpec) -> str:
         """The last line of a node on a topic that it waits for, or on a refused sample; empty without one."""
         lines = [line for process in self.processes if node.executable in self._names(process) for line in process.lines]
