@@ -36,7 +36,7 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
 from rise_di.learning import learn_again, learner
-from rise_di_controller.learning import acting_inputs, changes, fallen_back
+from rise_di_controller.learning import acting_inputs, changes, given_up
 from rise_di_controller.observer import PastTick, estimates_after
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -267,7 +267,7 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
     model = vary(start, change)
     assert isinstance(model, RiseDiConfig)
-    fallen = fallen_back(start, model, [name in {"q", "V"} for name in start.outputs])
+    fallen = given_up(start, model, ["q", "V"])
     learned = copy.deepcopy(flown.learner)
     # all but this part is as proposed
     assert learned.propose(fallen.digest()) == Proposal(None, "no identification is due, and no part is tested for a change")
@@ -277,6 +277,15 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     again = learned.propose(fallen.digest()).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
+    restarted = made_learner(scenario())  # it has proposed nothing yet
+    restarted._record = learned._record
+    restarted._first_ns = learned._first_ns
+    fresh = restarted.propose(given_up(start, start, ["q", "V"]).digest()).controller
+    assert fresh is not None
+    assert acting_inputs(fresh) == ("aileron", "rudder")
+    none_left = given_up(start, fresh, ["p", "r"]).digest()
+    sentences = [restarted.propose(none_left).sentence for _ in range(2)]
+    assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
 
 
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:

@@ -28,6 +28,8 @@ from rise_di_controller.learning import (
     coupled,
     designed,
     fallen_back,
+    given_up,
+    outputs_without,
 )
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
@@ -283,20 +285,23 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert isinstance(whole, RiseDiConfig)
     assert isinstance(fallen, RiseDiConfig)
     longitudinal = [name in {"q", "V"} for name in START.outputs]
-    assert fallen == fallen_back(START, whole, longitudinal)
+    assert fallen == given_up(START, whole, ["q", "V"])
+    assert outputs_without(fallen) == ("q", "V")
+    assert outputs_without(given_up(START, fallen, ["r", "p"])) == START.outputs
+    assert changes(fallen, fallen_back(START, whole, longitudinal)) == {"learn.without": None}
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive()
+    flight.receive(CHANGE | {"observer.fade": 0.5})  # all parts, as of a learner that was started again
     flight.step()
-    assert flight.controller.parameters == fallen
+    assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     flight.now_ns += 10 * NANOSECONDS
-    flight.receive(designed(START, fallen) | {"observer.fade": 0.5})  # a later model of p and r
+    flight.receive(designed(START, fallen))  # a later model of p and r
     flight.step()
     assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
     assert flight.sentences[1:] == [
         "falls back to the law of the start in q, V, to the end of the engagement: q oscillates at 4 Hz",
-        "refused: proposal: found a model of elevator, thrust, expected none of elevator, thrust: their outputs oscillated",
-        "flies model",
+        "flies model, without q, V",
+        "flies model, without q, V",
     ]
     flight.now_ns += NANOSECONDS
     flight.controller.tick(flight.now_ns, active=False)
@@ -311,4 +316,17 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
 def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
     assert fallen_back(START, whole, [True] * 4) == START
+    assert fallen_back(START, START, [True, False, False, False]) == START
+    flight = Flight()
+    flight.controller.retune(given_up(START, whole, START.outputs))
+    flight.receive()
+    flight.step()
+    refused = "refused: proposal: found no model, expected one of other outputs than q, p, r, V, by learn.without"
+    assert flight.sentences == [refused]
+    flight.now_ns += 10 * NANOSECONDS
+    flight.receive({}, sentence="")  # nothing to say
+    assert flight.sentences == [refused]
+    flight.controller.tick(flight.now_ns + NANOSECONDS, active=False)
+    flight.step(1)
+    assert flight.controller.parameters == START
     assert coupled(whole, ["r"]) == [name in {"p", "r"} for name in START.outputs]

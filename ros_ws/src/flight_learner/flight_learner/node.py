@@ -104,8 +104,9 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self._publish(reports.encode(report, "proposal"))
             if (found := self._identifications.next(self._proposal)) is not None:
                 self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
-            self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
-            self.get_logger().info(self._said)
+            if proposal.sentence:
+                self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
+                self.get_logger().info(self._said)
             advanced = True
         while self._search is None and self._internals.poll(now_ns, 1):
             advanced = True

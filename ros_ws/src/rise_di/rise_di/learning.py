@@ -110,7 +110,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
-            steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
+            if proposal.sentence:
+                steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
     first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
     require(bool(steps), "the log", f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller", first)
     last = learned.identification

@@ -83,7 +83,6 @@ class Learning:
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
         self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
-        self._barred = set[str]()  # inputs of the parts that oscillated: no model of these flies any more
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
         self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
 
@@ -125,8 +124,9 @@ class Learning:
         if oscillations := controller.oscillations():
             taken = self._end_oscillations(oscillations, controller, now_ns)
         elif controller.diverges():
-            taken = self._start
-            self._take(controller, now_ns, prepared(taken), "falls back to the law of the start: it diverges")
+            taken = given_up(self._start, self._start, outputs_without(controller.parameters))
+            what = "falls back to the law of the start: it diverges"
+            self._take(controller, now_ns, prepared(taken), what)
         return taken
 
     def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
@@ -134,8 +134,7 @@ class Learning:
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
-        self._barred |= {name for name, without in zip(flown.inputs, bare, strict=True) if without}
-        fallen = fallen_back(self._start, flown, bare)
+        fallen = given_up(self._start, flown, [name for name, without in zip(flown.outputs, bare, strict=True) if without])
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
         outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
         what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
@@ -147,8 +146,7 @@ class Learning:
         self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
         self._due.clear()
         self._received.clear()
-        self._barred.clear()
-        if not controller.has_learned_model:
+        if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self._start):
             return None
         self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
         return self._start
@@ -178,9 +176,8 @@ class Learning:
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
-            certificate = _certificate(controller.parameters, proposal.change, self._start, sorted(self._barred))
-            self._certificate = proposal, certificate
-        else:
+            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
+        elif proposal.sentence:
             self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
@@ -196,7 +193,9 @@ class Learning:
             self._certificate = None
             refusal = _unfit(proposal, controller)
             if not refusal:
-                self._take(controller, now_ns, end.value, f"{FLIES} {proposal.sentence}")
+                without = outputs_without(end.value.parameters)
+                what = f"{FLIES} {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
+                self._take(controller, now_ns, end.value, what)
                 return controller.parameters
         except ArithmeticError as error:
             refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
@@ -223,9 +222,7 @@ def _unfit(proposal: Proposal, controller: Controller) -> str:
     return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
 
 
-def _certificate(
-    flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig, barred: Sequence[str]
-) -> Generator[None, None, Prepared]:
+def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
     """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
     foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
     require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
@@ -240,12 +237,16 @@ def _certificate(
         ", ".join(proposed.observer.states),
         f"those of the start: {', '.join(start.observer.states)}",
     )
-    again = [name for name in acting_inputs(proposed) if name in barred]
-    expected = f"none of {', '.join(barred)}: their outputs oscillated"
-    require(not again, "proposal", f"a model of {', '.join(again)}", expected)
     least = start.observer.margin
     found = proposed.observer.margin
     require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
+    if without := outputs_without(flown):
+        others = f"one of other outputs than {', '.join(without)}, by learn.without"
+        require(proposed.feedforward is not None, "proposal", "no feedforward", others)
+        bare = coupled(proposed, without)
+        proposed = fallen_back(start, proposed, bare)
+        require(not all(bare), "proposal", "no model", others)
+        yield
     try:
         yield from proposed.checks()
     except ParameterError as error:
@@ -312,11 +313,25 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
     """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
-    acting = acting_inputs(flown)
-    if all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
+    acting, is_first = acting_inputs(flown), (flown.observer, flown.feedforward) == (start.observer, start.feedforward)
+    if is_first or all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
         return start
     mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
     return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
+
+
+def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
+    """Outputs without a model to the end of the engagement, by `learn.without`."""
+    learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
+    return () if learn is None else learn.without or ()
+
+
+def given_up(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]) -> RiseDiConfig:
+    """What flies, with the law of the start in some outputs to the end of the engagement, added to `learn.without`."""
+    fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
+    assert start.learn is not None  # noqa: S101 - a controller that learns
+    without = tuple(name for name in start.outputs if name in {*outputs_without(flown), *outputs})
+    return fallen.model_copy(update={"learn": start.learn.model_copy(update={"without": without or None})})
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:

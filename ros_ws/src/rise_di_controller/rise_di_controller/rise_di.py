@@ -74,6 +74,10 @@ class LearnConfig(Config):
     prior: str | None = Field(
         default=None, description="the airframe file of the rough model, as `rise-di learn` writes it; none: the airframe's own"
     )
+    without: tuple[str, ...] | None = Field(
+        default=None,
+        description="outputs that learn no model; the controller adds those of a part that oscillates, until it is deactivated",
+    )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
         description="in lockstep and in one process: from the end of a window until the controller takes the model, s",
@@ -130,6 +134,8 @@ class RiseDiConfig(ControllerConfig):
             require(not self.vanes, "learn", "observer.vanes beside it", "none: a learner designs the observer of y alone")
             rising = list(self.learn.updates) == sorted(set(self.learn.updates))
             require(rising, "learn.updates", self.learn.updates, "rising times")
+            known = set(self.learn.without or ()) <= set(self.outputs)
+            require(known, "learn.without", self.learn.without, f"outputs among {', '.join(self.outputs)}")
             spacing = self.learn.spacing()
             least = f"at most {spacing:g} s, the shortest time between two identifications"
             require(self.learn.latency <= spacing, "learn.latency", f"{self.learn.latency:g} s", least)

@@ -8,7 +8,7 @@ refused with a sentence. The controller refuses parameters that fail its own che
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from itertools import product
+from itertools import chain, combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from flight_analysis.design.model_identification import (
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from rise_di_controller.learning import fallen_back, with_channels_of
+from rise_di_controller.learning import given_up, outputs_without, with_channels_of
 from rise_di_controller.rise_di import RiseDiConfig
 
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
@@ -80,8 +80,11 @@ class Learner:
         self._first_ns: int | None = None
         self._prior, self._model = airframe, airframe  # of the next identification; what flies
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
-        # Parts that fly the law of the start for good: their inputs without effect, "" where the part oscillated
+        # Parts that fly the law of the start for good: their inputs without effect, "" for outputs of `learn.without`
         self._dead: dict[tuple[str, ...], str] = {}
+        self._start = controller  # with the `learn.without` of what flies
+        self._has_ended = False
+        self._give_up(controller)
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
         self._flew = self._last = controller  # the last proposal that flew, and the last one
         self._proposed = controller.digest()  # of the last one
@@ -126,23 +129,24 @@ class Learner:
         first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
 
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
-        controller fell back. A part that the controller alone took back, because it oscillated, is not proposed again.
+        controller fell back. Outputs that the controller took back, because they oscillated, are not proposed again. Where no
+        part is left, nothing is identified, and the sentence says so once.
         """
         end_ns = self._record[-1][0] if self._record else 0
         length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
             return Proposal(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         self._note_fallback(flown)
+        lost = flown != self._proposed
+        if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
+            ended, self._has_ended = self._has_ended, True
+            return Proposal(None, "" if ended else "each part flies the law of the start from now on: no part is left to learn")
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
         found = [change for change in changes if change.found]
-        lost = flown != self._proposed
         due = self._is_due(end_ns) or lost
         if not (due or found or self._changed):
-            if not changes:
-                return Proposal(None, "no identification is due, and no part is tested for a change")
-            gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes)
-            return Proposal(None, f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}")
+            return Proposal(None, unchanged(changes))
         if found:
             self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
             self._prior = self._model
@@ -189,22 +193,30 @@ class Learner:
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
     def _note_fallback(self, flown: int) -> None:
-        """Give up a part that the controller flies by the law of the start, unlike the model that was proposed or flew.
+        """Give up the outputs that fly the law of the start to the end of the engagement, by the digest of what flies.
 
-        Where all parts fly it, their proposal was refused, the law diverged, or the last part oscillated: none is given up.
+        The rest of it is the last proposal, the one before, which flew, or the start.
         """
         if flown == self._proposed:
             self._flew = self._last
-        if flown in {self._proposed, self._controller.digest()}:
+        if flown in {self._proposed, self._start.digest()}:
             return
-        for model, part in product((self._last, self._flew), tuple(self._known)):
-            fallen = fallen_back(self._controller, model, [output in part for output in self._controller.outputs])
+        names = self._controller.outputs
+        subsets = [outputs for count in range(1, len(names) + 1) for outputs in combinations(names, count)]
+        for model, outputs in product((self._last, self._flew, self._start), subsets):
+            fallen = given_up(self._controller, model, outputs)
             if fallen.digest() == flown:
-                self._dead[part] = ""
-                del self._known[part]
-                if model is self._last:  # else the controller refused that, too
+                self._give_up(fallen)
+                if model is self._last:  # else it does not fly: the controller refused it
                     self._last, self._proposed = fallen, flown
                 return
+
+    def _give_up(self, flown: RiseDiConfig) -> None:
+        """Leave the outputs of `learn.without` to the law of the start."""
+        self._start = given_up(self._controller, self._controller, outputs_without(flown))
+        if without := outputs_without(flown):
+            self._dead[without] = ""
+            self._known = {part: known for part, known in self._known.items() if not is_within(part, without)}
 
     def _is_due(self, end_ns: int) -> bool:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""
@@ -246,7 +258,15 @@ class Learner:
         if learned:
             designed = self._design(designed, model)
         proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
-        return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": start.model_dump()["learn"]}, "proposal")
+        return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal")
+
+
+def unchanged(changes: Iterable[Change]) -> str:
+    """The sentence of tests without a change."""
+    gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes)
+    if not gains:
+        return "no identification is due, and no part is tested for a change"
+    return f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}"
 
 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
