@@ -12,6 +12,7 @@ import pytest
 
 from flight_bringup.graph import LEARNER, parameter_overrides, second_stage
 from flight_bringup.scenarios import find_scenario
+from flight_core.channels import UNKNOWN
 from flight_core.modes import Mode
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -24,12 +25,15 @@ from rise_di_controller.learning import (
     Proposal,
     Updates,
     acting_inputs,
+    authority,
+    authority_names,
     changes,
     coupled,
     designed,
     fallen_back,
     given_up,
     outputs_without,
+    with_channels_of,
 )
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
@@ -102,6 +106,25 @@ def test_part_that_is_learned_later_gets_its_feedforward() -> None:
         assert flown is not None
         acting.append(flown.inputs)
     assert acting == [("aileron", "rudder"), None]
+
+
+def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
+    def of(flown: RiseDiConfig) -> dict[str, float]:
+        return dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
+
+    assert set(of(START).values()) == {UNKNOWN}  # no model flies yet
+    flight = Flight()
+    flight.receive(CHANGE | {"feedforward.deviation": [0.05 * abs(value) for value in CHANGE["feedforward.B"]]})
+    flight.step()
+    flown = flight.controller.parameters
+    assert isinstance(flown, RiseDiConfig)
+    # of the file: 0.98 / s^2 per deg and 30 deg, 0.06 m/s^2 per % and 50 %. Twice 5 % less are 10 % to first order
+    assert of(flown)["up.q"] == pytest.approx(0.9 * 0.98 * 30.0, rel=0.01)
+    assert of(flown)["down.V"] == pytest.approx(0.9 * 0.06 * 50.0, rel=0.01)
+    np.testing.assert_array_equal(flight.learning.authority(flight.controller), authority(flown, START))
+    without = with_channels_of(START, flown, [False, True, True, False], [False, True, False, False])  # of aileron, rudder
+    assert [of(without)[name] for name in ("down.p", "up.p", "up.r")] == [0.0, 0.0, UNKNOWN]
+    assert of(without)["up.q"] == of(flown)["up.q"]
 
 
 def scaled(name: str, factor: float) -> dict[str, Any]:

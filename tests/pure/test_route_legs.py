@@ -22,9 +22,10 @@ from flight_guidance import guidance, path
 from flight_guidance.guidance import Guidance
 from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
 from flight_guidance.modes import Lateral, Mode, bits
-from flight_guidance.notices import Notices
+from flight_guidance.notices import LEARNED, Notices
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
+from flight_guidance.reach import Authority
 from flight_guidance.route_file import Waypoint
 from flight_guidance.wind import WIND_TIME, wind_estimate, wind_of
 
@@ -331,12 +332,16 @@ def test_yaw_rate_beside_bank() -> None:
 def log_of(count: int, **channels: ArrayLike) -> Tape:
     """A log of guidance on a route to the north, a sample a second; `_` stands for a dot."""
     names = guidance.names(CONFIG.outputs)
-    level: dict[str, Any] = dict.fromkeys(names, 0.0) | {
-        "mode": Mode.ENGAGED,
-        "mode.lateral": Lateral.ROUTE,
-        "V_c": SPEED,
-        "pose.v_north": SPEED,
-    }
+    level: dict[str, Any] = (
+        dict.fromkeys(names, 0.0)
+        | dict(zip(LEARNED, Authority(), strict=True))
+        | {
+            "mode": Mode.ENGAGED,
+            "mode.lateral": Lateral.ROUTE,
+            "V_c": SPEED,
+            "pose.v_north": SPEED,
+        }
+    )
     level |= {name.replace("__", "."): value for name, value in channels.items()}
     values = np.column_stack([np.broadcast_to(np.asarray(level[name], dtype=float), count) for name in names])
     return Tape({"guidance": Signal(np.arange(count) * nanoseconds(1.0), names, values)}, 0)

@@ -14,11 +14,13 @@ from rcl_interfaces.srv import GetParameters
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer
 
+from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario, written
+from flight_core.channels import UNKNOWN
 from flight_core.modes import Mode
 from flight_core.rates import nanoseconds
 from flight_log.tape_reader import read_run
@@ -48,7 +50,12 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(tmp_path: Path) -> None:
     # the flight ends at the tick that waits for the second proposal
-    chosen, events, lines = scenario(tmp_path, updates=[10.0, 10.5]), list[Event](), list[str]()
+    guided = scenario(tmp_path, updates=[10.0, 10.5]).vary(
+        aircraft={"kinematics": "euler"},
+        reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
+        guidance={"program": {"heading": {"start": [1.0], "value": [0.5]}, "altitude": {"start": [1.0], "value": [20.0]}}},
+    )
+    chosen, events, lines = written(guided, tmp_path / "learn.yaml"), list[Event](), list[str]()
     run = tmp_path / "run"
     flown = fly_over_topics(chosen, run, lambda t, text: None, lockstep=True, announce=lines.append)
     assert flown == "completed"
@@ -63,6 +70,10 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
     result = replay(run)
     assert result.equal()
     assert result.whole.all()
+    steps = replay_guidance(recorded, chosen.guidance)
+    assert steps.equal()
+    assert steps.checked == steps.steps
+    assert recorded["guidance"]["authority.p"].min() < UNKNOWN  # guidance knows what was learned
 
 
 class Proposer:

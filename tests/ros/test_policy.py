@@ -103,7 +103,9 @@ def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, t
     overrides.append(f"recorder:directory:={tmp_path / 'run'}")
     start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
     lockstep = discovered(peer_node, ROLES)
-    beside_learner = {"controller": Access(frozenset({"/learning"}), frozenset({"/proposal"}), frozenset(), frozenset())}
+    beside_learner = {
+        "controller": Access(frozenset({"/learning", "/authority"}), frozenset({"/proposal"}), frozenset(), frozenset())
+    }
     for role in ROLES:
         further = beside_learner.get(role, real_time[role])
         assert real_time[role].merged(lockstep[role]).merged(further) == policy[role], role
@@ -119,7 +121,7 @@ def test_policy_allows_exactly_those_of_learner(start: Start, tmp_path: Path, pe
     scenario = find_scenario("osprey_learn")
     start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario.path)).wait_for("ready")
     controller = discovered(peer_node, ("controller",))["controller"]
-    assert {"/learning"} <= controller.publish
+    assert {"/learning", "/authority"} <= controller.publish
     assert {"/proposal"} <= controller.subscribe
     assert optional_node(LEARNER, "osprey_learn", start, tmp_path, peer_node) == allowed()["learner"]
 

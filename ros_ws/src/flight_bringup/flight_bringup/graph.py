@@ -13,6 +13,7 @@ from autopilot_bridge.params import ChannelMap, find_map, load_map
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_guidable
 from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import require
+from rise_di_controller.learning import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):
@@ -47,7 +48,7 @@ SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
 
 GUIDANCE_VIEWS = ("odometry", "path", "markers", "guidance/imu", "guidance/fix", "guidance/wind")
-OF_LEARNING = ("proposal", "learned", "learning")  # what a learner proposes and has found, and what became of it
+OF_LEARNING = ("proposal", "learned", "learning", "authority")  # of a learner, and of a controller that takes its models
 
 # The bridge also publishes the messages of its channel map.
 PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
@@ -55,7 +56,7 @@ PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
         AIRCRAFT: ("y", POSE, "truth"),
         REFERENCE_MODEL: ("y_m",),
         GUIDANCE: ("u_m", "guidance", *GUIDANCE_VIEWS),
-        CONTROLLER: ("u", "internals", "learning"),
+        CONTROLLER: ("u", "internals", "learning", "authority"),
         LEARNER: ("proposal", "learned"),
         BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
         RECORDER: ("recorded",),
@@ -189,6 +190,7 @@ def parameter_overrides(
         overrides[CONTROLLER]["y_rate"] = scenario.aircraft.rate
         if guidance is not None:
             overrides[GUIDANCE]["y_rate"] = scenario.aircraft.rate
+            overrides[GUIDANCE]["authority_rate"] = scenario.learns() * scenario.controller.rate / AUTHORITY_TICKS
             overrides[REFERENCE_MODEL]["u_m_rate"] = guidance.rate
     if spec in (RECORDER, ONE_PROCESS):
         if autopilot is not None:

@@ -2,12 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Attitude: body rates to hold or reach a bank and a pitch, in a coordinated turn."""
 
+import math
 from typing import NamedTuple
 
 from flight_core.kinematics import body_rates as inverse
 from flight_core.kinematics import clip, tilt, turn_rate
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
+
+YAW_TO_BANK = 1.5
+"""1/s. A yaw rate of 0.1 rad/s rolls the osprey by 0.02 rad/s, and 0.004 where A and B are 30 % off for the worse."""
+
+LARGEST_YAW = math.radians(20.0)
+"""Bank whose turn rate the yaw rate has at most: the rudder of the osprey is at half of its stop."""
 
 
 class AttitudeParams(NamedTuple):
@@ -55,3 +62,14 @@ def body_rates(
     lead = phi_dot * array_namespace(phi).tan(tilt(phi)) / params.n_alpha
     p, q = inverse(phi, theta, phi_dot, theta_dot + lead, r)
     return BodyRates(p, q, turn_rate(phi, theta, theta_dot, speed) + params.k_beta * beta)
+
+
+def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
+    """Yaw rate for a bank without an aileron, rad/s: of the turn, and more to roll there, within +-g tan(LARGEST_YAW) / V.
+
+        r_m = g tan(phi_c) / V + k (phi_c - phi),  k = YAW_TO_BANK
+
+    A yaw rolls an aircraft to the same side: the outer wing is faster, and the dihedral rolls away from the sideslip.
+    """
+    xp, turn = array_namespace(phi), GRAVITY / speed
+    return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * (phi_c - phi), turn * math.tan(LARGEST_YAW))

@@ -28,17 +28,19 @@ from flight_guidance.modes import (
     Target,
     Vertical,
 )
-from flight_guidance.notices import LINK_AGE, STALE_TIME
+from flight_guidance.notices import LEARNED, LINK_AGE, STALE_TIME
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
+from flight_guidance.reach import Authority, authority_of
 
 LIMITED = ("bank", "theta", "climb", "V", "slew")
 STATE = ("phi", "theta", "alpha", "alpha_trim", "slip", "psi")
 WIND = ("north", "east")
 FENCE = ("action", "clearance", "predicted")
 HEADING = "state.psi"
-ADDED = (LINK_AGE, HEADING)
-"""Channels of the log that logs of earlier versions lack, and that no step takes; `Lateral.HEADING` alone takes HEADING."""
+ADDED = (LINK_AGE, HEADING, *LEARNED)
+"""Channels that logs of earlier versions lack, or flights without a learner: LINK_AGE is taken by no step, HEADING by
+`Lateral.HEADING` alone, and LEARNED is then UNKNOWN."""
 
 
 class GuidanceOutput(NamedTuple):
@@ -57,7 +59,7 @@ def names(outputs: Sequence[str]) -> tuple[str, ...]:
         *(f"fence.{name}" for name in FENCE),
         *("phi_c", "theta_c", "climb_c", "V_c"),
         *(f"limited.{name}" for name in LIMITED),
-        *("age.pose", LINK_AGE, "begin", "given"),
+        *("age.pose", LINK_AGE, "begin", "given", *LEARNED),
         *(f"target.{name}" for name in TARGETS),
         *(f"state.{name}" for name in STATE),
         *(f"wind.{name}" for name in WIND),
@@ -85,7 +87,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
             *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.given)),
+            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.given), *inputs.authority),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
@@ -100,7 +102,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
 
 def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> tuple[Inputs, GuidanceState]:
     """The inputs of a step and the state after the step, from a sample of the log. Without HEADING it is that of the pose."""
-    logged = {HEADING: logged["pose.psi"]} | dict(logged)
+    logged = {HEADING: logged["pose.psi"]} | dict(zip(LEARNED, Authority(), strict=True)) | dict(logged)
 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)
@@ -108,7 +110,9 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
     target, mask = Target(*group("target", TARGETS)), int(logged["given"])
     given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
     begin, age_ns = Begin(int(logged["begin"])), nanoseconds(logged["age.pose"])
-    inputs = Inputs(t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given)
+    inputs = Inputs(
+        t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given, Authority(*(logged[name] for name in LEARNED))
+    )
     phi, theta, alpha, alpha_trim, slip, psi = group("state", STATE)
     state = GuidanceState(
         t_ns,
@@ -159,6 +163,7 @@ class Guidance:
         self._waits_from_ns: int | None = None  # for a pose that is young enough
         self._operated_ns: int | None = None  # the instant of the operator's last message, or of the first step
         self._link_lost = False
+        self._authority = Authority()
 
     @property
     def mode(self) -> Mode:
@@ -184,6 +189,10 @@ class Guidance:
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """Take a y in the order of the parameters' outputs. Raises ChannelError as `take_pose` does, but for equal values."""
         self._y = self._newest(self._y, sample, now_ns)
+
+    def take_authority(self, channels: Mapping[str, float]) -> None:
+        """Limit the steps from now on by what the inputs can do, from the channels of the topic `authority`."""
+        self._authority = authority_of(channels)
 
     def _newest(self, last: StampedVector | None, sample: StampedVector, now_ns: int) -> StampedVector:
         require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
@@ -229,7 +238,7 @@ class Guidance:
         """Fly home and orbit there; False while guidance does not fly."""
         if self.mode is not Mode.ENGAGED or self._pose is None:
             return False
-        self.take_target(modes.home(self.pose(), self._params))
+        self.take_target(modes.home(self.pose(), modes.within_reach(self._params, self._authority)))
         return True
 
     def skip(self) -> bool:
@@ -325,7 +334,7 @@ class Guidance:
         self._waits_from_ns = None
         link_age_ns = self._watch_link(now_ns)
         y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
-        inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given)
+        inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority)
         told = self.route.notes if self.route is not None and self._route_waits else ()
         self._begin, self._given, self._route_waits = Begin.NO, {}, False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from flight_core.kinematics import clip
 from flight_core.units import GRAVITY
 from flight_core.vectors import Scalar, array_namespace
+from flight_guidance import reach
 
 # Largest share of a turn lost to a sideslip; the f16 of JSBSim in an orbit, with the rudder at the stop: 0.09.
 LARGEST_SLIP = 0.2
@@ -105,10 +106,9 @@ def bank_for(acceleration: Scalar, path_angle: Scalar, limit: float) -> Scalar:
 def least_period(speed: float, bank: float, roll_rate: float) -> float:
     """Least period of path following, s: max(14, 1.5 V / (g tan(phi_max)), 11 phi_max / p_max).
 
-    A bank reversal takes 2 phi_max / p_max. With a period of 3.5 reversal times the osprey cycled in turbulence; 5.5 are asked
-    for.
+    The last term is `reach.least_period`.
     """
-    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), 11.0 * bank / roll_rate)
+    return max(14.0, 1.5 * speed / (GRAVITY * math.tan(bank)), reach.least_period(bank, roll_rate))
 
 
 def largest_wind(speed: float, wind: float, bank: float) -> float:

@@ -19,8 +19,8 @@ from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, Scalar, array_namespace
-from flight_guidance import path, protection
-from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates
+from flight_guidance import path, protection, reach
+from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates, yaw_for_bank
 from flight_guidance.fence import HOME, RIGHT, Escape, Fence, Motion, last_safe_turn
 from flight_guidance.lateral import (
     PathError,
@@ -32,7 +32,16 @@ from flight_guidance.lateral import (
     slip_estimate,
 )
 from flight_guidance.path import Arc, Leg, Loiter, Point, Route
-from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_angle, pitch_for, slewed
+from flight_guidance.reach import Authority
+from flight_guidance.vertical import (
+    VerticalParams,
+    alpha_estimate,
+    climb_for,
+    climb_speed,
+    path_angle,
+    pitch_for,
+    slewed,
+)
 from flight_guidance.wind import Wind, wind_estimate, wind_of
 
 LARGEST = 1e9
@@ -149,6 +158,56 @@ class GuidanceParams(NamedTuple):
     fence: Fence | None = None
     home: Home = Home()
     link_timeout_ns: int = 0  # of the operator's link; 0: no limit
+    dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
+
+
+def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
+    """The parameters with limits by a model learned in flight, where less than their own.
+
+    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters. Reversals of the bank fit into
+    the period of path following, and orbits have the radius for the bank. Without an aileron the largest bank is YAWED_BANK.
+    Without a throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
+    """
+    if authority == Authority():
+        return params
+    dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
+    limits, attitude, vertical = params.limits, params.attitude, params.vertical
+    climb, sink = reach.climb_rates(authority.down, authority.up, params.speed)
+    vertical = vertical._replace(climb=min(vertical.climb, climb))
+    if authority.down >= reach.LEAST:
+        vertical = vertical._replace(sink=min(vertical.sink, sink))
+    rate, bank = attitude.roll_rate, min(limits.bank, reach.YAWED_BANK)
+    if "p" not in dead:
+        rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
+        bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
+    radius = limits.radius * (math.tan(0.8 * limits.bank) / math.tan(0.8 * bank))
+    return params._replace(
+        dead=dead,
+        vertical=vertical,
+        limits=limits._replace(bank=bank, radius=radius),
+        attitude=attitude._replace(roll_rate=rate),
+    )
+
+
+def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
+    """The limits by a model learned in flight, as a sentence; empty where the own limits are less."""
+    now = within_reach(params, authority)
+    parts = [f"no {command}: {name} has no input with an effect" for name, command in DEAD.items() if name in now.dead]
+    if min(authority.down, authority.up) < reach.LEAST:
+        parts.append("no climb: V has no input with an effect")
+    for name, own, limit, unit in (
+        ("bank", math.degrees(params.limits.bank), math.degrees(now.limits.bank), "deg"),
+        ("roll rate", math.degrees(params.attitude.roll_rate), math.degrees(now.attitude.roll_rate), "deg/s"),
+        ("climb", params.vertical.climb, now.vertical.climb, "m/s"),
+        ("sink", params.vertical.sink, now.vertical.sink, "m/s"),
+    ):
+        if 0.0 < limit < own:
+            parts.append(f"{name} at most {limit:.2g} {unit}")
+    return ", ".join(parts)
+
+
+DEAD = {"p": "roll rate", "q": "pitch rate"}
+"""Commands that end where an output has no input with an effect."""
 
 
 class Begin(IntEnum):
@@ -168,6 +227,7 @@ class Inputs(NamedTuple):
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
     given: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
+    authority: Authority = Authority()  # of the inputs, as learned in flight
 
 
 class GuidanceState(NamedTuple):
@@ -364,6 +424,7 @@ def step(
     4. Protection in this order: bank, airspeed, climb, pitch; roll rate and load in `attitude.body_rates`; slew of u_m.
     5. u_m: p, q, r by `attitude.body_rates`, V_m = V_c - V0. In POSE_LOST p, q, r are 0.
     """
+    params = within_reach(params, inputs.authority)
     state = begin(state, inputs, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
@@ -402,9 +463,6 @@ def command(
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
-    V_wanted = _permitted_speed(state.target.V, params)
-    V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
-
     phi_c = clip(phi_wanted, bank)
     climb_c, climb_limited = _climb(state, pose, speed, dt, params) if flies else (0.0, False)
     theta_wanted = pitch_for(climb_c, speed, state.alpha)
@@ -416,6 +474,12 @@ def command(
         theta_wanted = theta_bounded
     theta_c = xp.minimum(xp.maximum(theta_wanted, limits.least_pitch), limits.largest_pitch)
 
+    V_asked = state.target.V
+    if flies and "q" in params.dead:
+        V_asked = V_asked + climb_speed(climb_c - pose["climb"], speed)
+    V_wanted = _permitted_speed(V_asked, params)
+    V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
+
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
     beta = pose["beta"] if flies else 0.0
     flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
@@ -424,6 +488,9 @@ def command(
         rates = rates._replace(r=rates.r + state.target.r)
     if state.mode is Mode.POSE_LOST:
         rates = BodyRates(0.0, 0.0, 0.0)
+    rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
+    if "p" in params.dead:
+        rates = rates._replace(r=yaw_for_bank(phi_c, state.phi, speed))
     wanted = {"V": V_c - params.speed, **rates._asdict()}
     u_m = tuple(
         wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)

@@ -30,6 +30,7 @@ from flight_guidance.guidance import Guidance, GuidanceOutput
 from flight_guidance.modes import Mode
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.reach import AUTHORITY as AUTHORITY_CHANNELS
 from flight_guidance.route_file import Origin, Waypoint, geographic
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
@@ -39,10 +40,12 @@ from flight_ros.receiver import Receiver
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
+    AUTHORITY,
     FIX,
     GUIDANCE,
     IMU,
     INTERNALS,
+    LOCKSTEP,
     MARKERS,
     NEWEST_SAMPLES,
     ODOMETRY,
@@ -99,9 +102,19 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
         self._allowed, self._mode, self._waits = True, Mode.OFF, ""
+        self._authority = self.receive(
+            AUTHORITY,
+            Decoder(AUTHORITY_CHANNELS).decode,
+            self._take_authority,
+            max_age_ns=None if self.parameters.lockstep else self._max_age_ns,
+            lock=None if self.parameters.lockstep else PublisherLock(self._timeouts_ns),
+            qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
+        )
+        self._authorities, self._authority_ns, self._has_authority = deque[StampedVector](), -1, True
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
-            self._inputs = LockstepInputs(y_period_ns, self.period_ns(), self._y.receive, self._pose.receive)
+            inputs = y_period_ns, self.period_ns(), self._y.receive, self._pose.receive
+            self._inputs = LockstepInputs(*inputs, self._receives_authority)
             self._empty_encoder = self.encoder(())
         else:
             self._controller_mode = ControllerMode.WAITING
@@ -131,7 +144,7 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return self._y.subscription, self._pose.subscription
 
     def tick(self, tick: Tick, now_ns: int) -> None:
-        for receiver in (self._internals, self._y, self._pose):
+        for receiver in (self._internals, self._authority, self._y, self._pose):
             receiver.poll(now_ns)
         if (output := self._step(now_ns, tick.number * self.period_ns())) is not None:
             self._publish(output, now_ns)
@@ -152,9 +165,25 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         return advanced
 
     def awaited_topic(self) -> str:
+        if not self._has_authority:
+            return self._authority.name
         return (self._pose if self._inputs.has_y else self._y).name
 
+    def _receives_authority(self, now_ns: int) -> bool:
+        """Lockstep: whether the last `authority` from before a step has arrived, of a controller that learns."""
+        if not (rate := self.parameters.authority_rate) or not now_ns:
+            return True
+        self._authority.poll(now_ns)
+        period = period_ns(rate, "authority_rate")
+        last_ns = (now_ns - 1) // period * period
+        self._has_authority = self._authority_ns >= last_ns
+        return self._has_authority
+
     def _step(self, now_ns: int, t_ns: int) -> GuidanceOutput | None:
+        # One of the instant of the step itself comes before or after it: in lockstep it acts from the next step on.
+        while self._authorities and (self._authorities[0].stamp_ns < now_ns or not self.parameters.lockstep):
+            value = self._authorities.popleft().value.tolist()
+            self._guidance.take_authority(dict(zip(AUTHORITY_CHANNELS, value, strict=True)))
         self._target.poll(now_ns, MAX_TARGETS)
         self._take_routes()
         output = self._guidance.step(now_ns, t_ns)
@@ -231,6 +260,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
                 self.get_logger().info(f"route of {len(points)} waypoints")
                 self._guidance.take_route(route)
                 self._guidance.keep_link()
+
+    def _take_authority(self, sample: StampedVector, now_ns: int) -> None:
+        if np.any(sample.value < 0.0):
+            raise ChannelError("bounds", "authority: found a value below 0, expected what an input can do either way")
+        self._authorities.append(sample)
+        self._authority_ns = sample.stamp_ns
 
     def _take_mode(self, sample: StampedVector, now_ns: int) -> None:
         """Fly while the controller is ENGAGED. After INACTIVE, hold what is measured; after a failsafe, go on."""

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a strong wind, a lost link.
+"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a strong wind, a lost link, new limits.
 
 The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
 """
@@ -9,12 +9,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+from flight_core.channels import UNKNOWN
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
 from flight_guidance.modes import Lateral
+from flight_guidance.reach import Authority
 
 DWELL = 10.0
 """Time for which a condition lasts before the notice, and ends before a second notice, s."""
+
+LEARNED = tuple(f"authority.{name}" for name in Authority._fields)
+"""Channels of `guidance`: what the inputs can do, as learned in flight."""
 
 LINK_AGE = "age.link"
 """Channel of `guidance`: time since the last message of an operator, s, 0 without a limit. Earlier versions had none."""
@@ -65,7 +70,7 @@ class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
     `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed command, m/s, the wind up to
-    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s.
+    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s; `reach`: `modes.reach_sentence`.
     """
 
     CHANNELS = (
@@ -74,8 +79,14 @@ class Notices:
     )
 
     def __init__(
-        self, wind: float, max_age: float, largest_wind: Callable[[float], float], link_timeout: float = math.inf
+        self,
+        wind: float,
+        max_age: float,
+        largest_wind: Callable[[float], float],
+        link_timeout: float = math.inf,
+        reach: Callable[[Authority], str] = lambda authority: "",
     ) -> None:
+        self._reach, self._authority, self._reached = reach, Authority(), ""
         self._wind, self._max_age, self._largest_wind, self._link_timeout = wind, max_age, largest_wind, link_timeout
         self._link = _Lasting(0.0)
         self._stale = _Lasting(STALE_TIME)
@@ -91,6 +102,10 @@ class Notices:
             side = "right" if self._action == RIGHT else "left"
             texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
         wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
+        if (authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))) != self._authority:
+            self._authority, reached, self._reached = authority, self._reached, self._reach(authority)
+            if reached != self._reached:
+                texts.append(f"by the learned model {self._reached}" if self._reached else "own limits again")
         if self._link.due(t, holds=log.get(LINK_AGE, 0.0) > self._link_timeout):
             texts.append(f"no message of an operator for {self._link_timeout:g} s: home")
         if self._stale.due(t, holds=log["age.pose"] > self._max_age):
@@ -106,7 +121,7 @@ class Notices:
         """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""
         if not has_channels([*log]):
             return []
-        names = [*self.CHANNELS, *({LINK_AGE} & set(log))]
+        names = [*self.CHANNELS, *(name for name in (LINK_AGE, *LEARNED) if name in log)]
         columns = [log[name].tolist() for name in names]
         samples = (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
         return [notice for at, sample in zip(t.tolist(), samples, strict=True) for notice in self.take(at, sample)]

@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -24,12 +25,12 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
-from flight_guidance import protection
+from flight_guidance import protection, reach
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
 from flight_guidance.fence import MARGIN, Fence, Zone, clearance, described
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
-from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, read_target
+from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, reach_sentence, read_target
 from flight_guidance.notices import Notices
 from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
@@ -134,6 +135,9 @@ class GuidanceConfig(NodeConfig):
         default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
+    authority_rate: float = Field(
+        default=0.0, ge=0, le=1000, description="in lockstep: the rate of `authority`, Hz, of a controller that learns; 0: none"
+    )
     outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")
     natural_frequency: Positives = Field(
         description="those of the reference model, one per output, rad/s; `parameters.yaml` of a run has them"
@@ -266,7 +270,7 @@ class GuidanceConfig(NodeConfig):
         """p_max, rad/s: 0.35, or less where 0.4 w p_max, the largest p_m_dot after a step, is a third of the authority."""
         frequency = self.natural_frequency[self.outputs.index("p")]
         authority = math.inf if self.roll_authority is None else self.roll_authority
-        return self.roll_rate or min(FASTEST_ROLL, authority / (3.0 * 0.4 * frequency))
+        return self.roll_rate or min(FASTEST_ROLL, reach.roll_rate(authority, frequency))
 
     def k_beta(self) -> float:
         """k_beta = min(0.5, k_chi V0 d / s), 1/s: a lateral gust of s = 1.5 m/s turns a held heading by d = 1 deg."""
@@ -286,16 +290,18 @@ class GuidanceConfig(NodeConfig):
     def notices(self) -> Notices:
         """What the notices of a flight depend on."""
         link_timeout = self.home.link_timeout or math.inf
-        return Notices(self.wind, self.max_age, lambda speed: largest_wind(speed, self.wind, self.bank), link_timeout)
+        reach_of, wind_of = partial(reach_sentence, self.params()), partial(largest_wind, wind=self.wind, bank=self.bank)
+        return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of)
 
     def climb_limits(self) -> tuple[float, float]:
         """Largest climb and sink rate, m/s: 0.7 and 0.5 of what full throttle gives, a V0 / g, and at most a tenth of V0.
 
         The rest of the throttle holds the airspeed. `protection.climb_range` takes the climb back where the rest is too little.
         """
+        steepest = STEEPEST * self.speed
         down, up = self.throttle_authority or (math.inf, math.inf)
-        steepest, lift = STEEPEST * self.speed, self.speed / GRAVITY
-        return self.climb or min(0.7 * up * lift, steepest), self.sink or min(0.5 * down * lift, steepest)
+        climb, sink = reach.climb_rates(down, up, self.speed)
+        return self.climb or min(climb, steepest), self.sink or min(sink, steepest)
 
     def params(self) -> GuidanceParams:
         """The numbers of the equations."""

@@ -13,6 +13,10 @@ STALL_ANGLE = 0.3
 """rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by lifting-line theory."""
 
 
+CLIMB_BANDWIDTH = 0.25
+"""1/s, of the climb rate by the airspeed: a fifth of the reference model's bandwidth of V, which adds 24 deg of lag there."""
+
+
 class VerticalParams(NamedTuple):
     """Gains and limits of the vertical loop."""
 
@@ -55,6 +59,14 @@ def alpha_estimate(alpha: Scalar, theta: Scalar, climb: Scalar, speed: Scalar, d
 def pitch_for(climb: Scalar, speed: Scalar, alpha: Scalar) -> Scalar:
     """Pitch for a climb rate, rad: theta_c = asin(climb / V) + alpha."""
     return path_angle(climb, speed) + alpha
+
+
+def climb_speed(error: Scalar, speed: Scalar) -> Scalar:
+    """Command of the airspeed, m/s, over the target, for an error of the climb rate without an elevator: K V / (2 g) error.
+
+    At a constant angle of attack the lift goes with V^2, so h_ddot = 2 g dV / V, and the error decays at K = CLIMB_BANDWIDTH.
+    """
+    return CLIMB_BANDWIDTH * speed / (2.0 * GRAVITY) * error
 
 
 def path_lag(stall_speed: float, speed: float) -> float:

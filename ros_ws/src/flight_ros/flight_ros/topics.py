@@ -105,6 +105,7 @@ ENGAGEMENT = Topic("bridge/engagement", KeyValue)  # key: the phase of the bridg
 PROPOSAL = Topic("proposal", DiagnosticArray)  # of a learner: flight_ros.reports
 LEARNED = Topic("learned", JointState)  # the entries of A and B that a learner identified
 LEARNING = Topic("learning", DiagnosticArray)  # what became of a proposal, and fallbacks
+AUTHORITY = Topic("authority", JointState)  # what the inputs can do at least, as learned in flight: for guidance
 START = Topic("start", Time)  # t = 0 of a flight in real time, once its nodes are matched
 NODE_STATE = Topic("node_state", KeyValue)  # key: the process, "/controller#4711"; value: a NodeState
 

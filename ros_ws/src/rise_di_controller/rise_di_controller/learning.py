@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from flight_core.channels import SIDES, UNKNOWN
 from flight_core.modes import Mode
 from flight_core.parameters import SMALLEST, ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
 from rise_di_controller.controller import Controller, Prepared, prepared
 from rise_di_controller.law import MIN_GAIN
 from rise_di_controller.params import ControllerConfig
@@ -22,7 +24,7 @@ from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 DESIGNED = frozenset({"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer"})
 """Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs."""
 
-OPTIONAL = ("feedforward.inputs", "feedforward.gravity")
+OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
 """Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
 
 
@@ -46,6 +48,10 @@ class Event(NamedTuple):
     stamp_ns: int
     change: Mapping[str, Any]
     sentence: str
+
+
+AUTHORITY_TICKS = 10
+"""Ticks of the controller from one sample of `authority` to the next."""
 
 
 class Updates:
@@ -85,6 +91,12 @@ class Learning:
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
         self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
+
+    def authority(self, controller: Controller) -> FloatArray:
+        """`authority` of what flies."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
+        return authority(flown, self._start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
         """Note a tick; whether an identification begins with it. None begins while the law is deactivated."""
@@ -309,6 +321,37 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
     fed = () if feedforward is None else feedforward.inputs or inputs
     F = np.zeros(len(inputs)) if observer is None else np.array(observer.F)
     return tuple(name for name, row in zip(inputs, F.reshape(len(inputs), -1), strict=True) if name in fed or row.any())
+
+
+def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Channels of the topic `authority`."""
+    return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
+
+
+def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
+    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit, (2m,), units/s:
+
+        y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),  Omega = C B of the model learned in flight
+
+    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i, and above 0 for any.
+    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the start.
+    """  # noqa: D400, D415 - what follows is an equation
+    m, model, acting = len(flown.outputs), flown.feedforward, acting_inputs(flown)
+    dead = np.array(flown.input_scale) <= SMALLEST
+    found = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
+    if model is None or (model, flown.observer) == (start.feedforward, start.observer):
+        return found.ravel()
+    rows = [model.states.index(name) for name in flown.outputs]
+    both = (model.B, model.deviation or (0.0,) * len(model.B))
+    B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
+    least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
+    for k, limits in enumerate((flown.lower, flown.upper)):
+        if limits is None:
+            continue
+        side = np.where(B > 0.0, k, 1 - k)
+        known = ~dead & [name in acting for name in flown.inputs]
+        found[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
+    return found.ravel()
 
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:

@@ -23,10 +23,10 @@ from flight_ros.rclpy_private import answer_invalid_transitions
 from flight_ros.reports import MAX_REPORT_SIZE, Report
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
+from flight_ros.topics import AUTHORITY, INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.learning import REFUSED, Event, Learning, Proposal
+from rise_di_controller.learning import AUTHORITY_TICKS, REFUSED, Event, Learning, Proposal, authority_names
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -120,6 +120,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._y_m.poll(now_ns)
         self._step(now_ns, tick.late_ns)
         self._learn(now_ns)
+        if tick.number % AUTHORITY_TICKS == 0:
+            self._publish_authority(now_ns)
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
@@ -174,6 +176,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
                 self._y_m.accept(sample, now_ns)
             if due:
                 self._learn(now_ns)
+                if now_ns % (AUTHORITY_TICKS * self.period_ns()) == 0:
+                    self._publish_authority(now_ns)
             if due and not self._step(now_ns, late_ns=0):
                 self._publish_u(self._empty_encoder.encode(now_ns, NO_CHANNELS))
             advanced = True
@@ -203,7 +207,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             qos=LOCKSTEP if parameters.lockstep else PROPOSALS,
             max_size=MAX_REPORT_SIZE,
         )
-        self._publish_learning = self.advertise(LEARNING)
+        self._publish_learning, self._send_authority = self.advertise(LEARNING), self.advertise(AUTHORITY)
+        self._authority_encoder = self.encoder(authority_names(parameters.outputs))
         return Learning(parameters, self._say, simulated=parameters.lockstep)
 
     def _learn(self, now_ns: int) -> None:
@@ -214,6 +219,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._proposals.poll(now_ns)
         if (taken := self._learning.step(self._controller, now_ns)) is not None:
             self.adopt(taken)
+
+    def _publish_authority(self, now_ns: int) -> None:
+        """Tell guidance what the inputs can do, by the model that flies. Without a learner nothing is told."""
+        if self._learning is not None:
+            self._send_authority(self._authority_encoder.encode(now_ns, self._learning.authority(self._controller)))
 
     def _has_proposal(self, now_ns: int) -> bool:
         """Lockstep: whether the proposal has arrived for which the step of an instant waits, if any."""

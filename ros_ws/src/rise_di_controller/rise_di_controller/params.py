@@ -68,13 +68,16 @@ class FeedforwardConfig(Config):
     gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
     lead: NonNegatives = Field(description="time from a tick until its input acts, s: half a period, delay and lag")
     inputs: Names | None = Field(default=None, description="the inputs with a feedforward; all where absent")
+    deviation: NonNegatives | None = Field(
+        default=None, description="standard deviations of B, as B, for the limits of guidance; 0 where absent"
+    )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
         """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for a C B whose D differs."""
         n, m = len(self.states), len(outputs)
         for name in outputs:
             require(self.states.count(name) == 1, "feedforward.states", ", ".join(self.states), f"the output {name} once")
-        for key, columns in (("A", n), ("B", m), ("gravity", n)):
+        for key, columns in (("A", n), ("B", m), ("gravity", n), ("deviation", m)):
             values = getattr(self, key)
             fits = values is None or len(values) == n * columns
             require(fits, f"feedforward.{key}", f"{len(values or ())} values", f"{n * columns}: {n} rows of {columns}")

@@ -118,6 +118,10 @@ class LearningLoop:
         """Let the proposals act that are due, and fall back where the law diverges."""
         self._learning.step(controller, now_ns)
 
+    def authority(self, controller: Controller) -> FloatArray:
+        """What the inputs can do at least, by the model that flies."""
+        return self._learning.authority(controller)
+
     def after_tick(self, controller: Controller, output: ControlOutput | None, now_ns: int) -> Learned | None:
         """Record a tick, and propose where an identification is due. Returns what it found."""
         if output is None or not controller.has_internals:

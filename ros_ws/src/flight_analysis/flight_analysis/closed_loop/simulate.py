@@ -21,7 +21,7 @@ from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import Event
+from rise_di_controller.learning import AUTHORITY_TICKS, Event, authority_names
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -116,6 +116,8 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
             "u_m": _SignalBuilder((*scenario.reference_model.outputs, *ATTITUDE)),
             "guidance": _SignalBuilder(guidance.names),
         }
+    if learning is not None:
+        signals["authority"] = _SignalBuilder(authority_names(scenario.controller.outputs))
     outcome, t_ns = COMPLETED, 0
     try:
         aircraft = Simulator(scenario.aircraft)
@@ -152,6 +154,10 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
             if t_ns % controller.period_ns == 0:
                 if learning is not None:
                     learning.before_tick(controller, t_ns)
+                    if t_ns % (AUTHORITY_TICKS * controller.period_ns) == 0:
+                        signals["authority"].add(t_ns, able := learning.authority(controller))
+                        if guidance is not None:  # acts from its next step on
+                            guidance.take_authority(dict(zip(signals["authority"].names, able.tolist(), strict=True)))
                 if (output := controller.tick(t_ns)) is not None:
                     u = select(aircraft.inputs, inputs, output.u)
                     signals["u"].add(output.stamp_ns, output.u)

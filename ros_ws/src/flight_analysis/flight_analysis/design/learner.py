@@ -257,6 +257,7 @@ class Learner:
         designed = start.model_copy(update={"learn": None})
         if learned:
             designed = self._design(designed, model)
+            designed = _with_deviations(designed, {k: v for part in known.values() for k, v in part.deviation.items()})
         proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
         return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal")
 
@@ -267,6 +268,15 @@ def unchanged(changes: Iterable[Change]) -> str:
     if not gains:
         return "no identification is due, and no part is tested for a change"
     return f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}"
+
+
+def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
+    """A controller whose model of the feedforward has the standard deviations of B, given by entry and relative to it."""
+    model = designed.feedforward
+    assert model is not None  # noqa: S101 - a design has one
+    names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
+    values = tuple(abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True))
+    return designed.model_copy(update={"feedforward": model.model_copy(update={"deviation": values})})
 
 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:

@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of commands by what the inputs can do: by rule at the start, and by a model that is learned in flight."""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from flight_core.channels import SIDES, UNKNOWN
+from flight_core.units import GRAVITY
+
+CLIMB, SINK = 0.7, 0.5
+"""Parts of the throttle's authority for a climb and a sink; the rest holds the airspeed."""
+
+REVERSALS = 11.0
+"""Least period of path following over bank / roll rate. A bank reversal takes 2 bank / roll rate. With a period of 3.5
+reversals the osprey cycled in turbulence; 5.5 are asked for."""
+
+
+LEAST = 1e-3
+"""units/s; an input with less authority has no effect."""
+
+
+YAWED_BANK = math.radians(10.0)
+"""Largest bank without an aileron: the rudder flies its turn with level wings too, in a sideslip of 6 deg of the osprey."""
+
+
+class Authority(NamedTuple):
+    """Least change of an output by the input from trim, units/s: 0 without an effect, UNKNOWN without a learned model."""
+
+    q: float = UNKNOWN  # rad/s^2
+    p: float = UNKNOWN  # rad/s^2
+    down: float = UNKNOWN  # of V, m/s^2
+    up: float = UNKNOWN
+
+
+AUTHORITY = tuple(f"{side}.{name}" for side in SIDES for name in ("q", "p", "V"))
+"""Channels of the topic `authority` that guidance takes."""
+
+
+def authority_of(channels: Mapping[str, float]) -> Authority:
+    """From the channels of the topic: the lesser way of q and p."""
+    q, p = (min(channels[f"{side}.{name}"] for side in SIDES) for name in ("q", "p"))
+    return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))
+
+
+def climb_rates(down: float, up: float, speed: float) -> tuple[float, float]:
+    """Climb and sink rate, m/s, that full throttle up and down gives, a V0 / g, by the parts CLIMB and SINK."""
+    return CLIMB * up * speed / GRAVITY, SINK * down * speed / GRAVITY
+
+
+def roll_rate(authority: float, frequency: float) -> float:
+    """Roll rate p_max, rad/s: 0.4 w p_max, the largest p_m_dot of the reference after a step, is a third of the authority."""
+    return authority / (3.0 * 0.4 * frequency)
+
+
+def least_period(bank: float, rate: float) -> float:
+    """Least period of path following for reversals of a bank at a roll rate, s."""
+    return REVERSALS * bank / rate
