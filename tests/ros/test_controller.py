@@ -208,6 +208,24 @@ def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, p
     assert {channel(message, "y.q") for message in peer_node.received["internals"]} == {0.01}
 
 
+def test_another_publisher_takes_over_once_u_is_at_trim(start_node: Start, peer_node: Peer) -> None:
+    hold, ramp = 0.2, 0.3
+    start_node("rise_di_controller", "-p", f"hold:={hold}", "-p", f"ramp:={ramp}")
+    engage(peer_node)
+    last_ns = time.time_ns()
+    peer_node.send()
+
+    def send() -> None:
+        for topic in ("y_m", "y"):
+            peer_node.publish(topic, to_message(time.time_ns(), OUTPUTS, np.full(4, 0.5), "/another"))
+
+    def taken() -> list[int]:
+        return [stamp_ns(message) for message in peer_node.received["internals"] if channel(message, "y.q") == 0.5]
+
+    peer_node.until(taken, each=send)
+    assert taken()[0] - last_ns > MAX_AGE_NS + nanoseconds(hold + ramp) - PERIOD_NS  # y may be a period old
+
+
 @pytest.mark.parametrize(
     ("name", "message", "reason"),
     [

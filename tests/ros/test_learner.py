@@ -12,7 +12,7 @@ import psutil
 import pytest
 from rcl_interfaces.srv import GetParameters
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer, peer
+from tests.ros.peer import Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.replay import replay
@@ -82,12 +82,12 @@ class Proposer:
     def __init__(self, peer_node: Peer, start: RiseDiConfig) -> None:
         self.peer, self.start = peer_node, start
         self.change = designed(self.start, find_scenario("osprey_observer").rise_di())
-        self.told: list[str] = []
+        self.told: list[Report] = []
         self._publish = peer_node.node.create_publisher(PROPOSAL.type, PROPOSAL.name, PUBLISH).publish
         peer_node.node.create_subscription(LEARNING.type, LEARNING.name, self._take, PUBLISH, raw=True)
 
     def _take(self, raw: bytes) -> None:
-        self.told.append(reports.decode(raw).sentence)
+        self.told.append(reports.decode(raw))
 
     def propose(self, sender: str = "learner#1", change: Mapping[str, object] = MappingProxyType({})) -> None:
         """Publish a proposal whose window ended a tick or more ago."""
@@ -99,7 +99,7 @@ class Proposer:
         count = len(self.told)
         propose()
         self.peer.until(lambda: len(self.told) > count, each=self.peer.send)
-        return self.told[count]
+        return self.told[count].sentence
 
 
 def test_controller_refuses_lies_and_storms_and_flies_a_certified_model(start: Start, tmp_path: Path) -> None:
@@ -116,18 +116,35 @@ def test_controller_refuses_lies_and_storms_and_flies_a_certified_model(start: S
         assert "after that of the last proposal" in proposer.answer(proposer.propose)
         peer_node.until(lambda: time.monotonic() > time_of_refusal + 2.5, each=peer_node.send)  # half of the least spacing
         assert proposer.answer(proposer.propose) == "flies model"
+        flies_ns = proposer.told[-1].stamp_ns
         peer_node.until(lambda: get(peer_node) == 0.6, each=peer_node.send)
+        assert flown_at(peer_node)[flies_ns] == proposer.start.digest()  # u of a tick does not wait for its certificate
         assert "sender" not in controller.output
+
+        def burst() -> None:
+            proposer.propose(change={"flown": None})
+            for _ in range(20):
+                proposer.propose(change={"start": 1})
 
         def storm() -> None:
             for _ in range(200):
                 proposer.propose("second#2")
             proposer.propose(change={"start": 1})
 
-        assert "found a proposal for the parameters 1" in proposer.answer(storm)
+        for several in (burst, storm):
+            assert "found a proposal for the parameters 1" in proposer.answer(several)
         peer_node.until(lambda: peer_node.counted("refused proposal: sender", 100), each=peer_node.send)
+        assert peer_node.counted("refused proposal: malformed")
+        assert peer_node.counted("refused proposal: rate")  # a second one in a tick
         missed = [message for message in peer_node.received["/diagnostics"] if "overrun" in str(message)]
         assert not missed
+
+
+def flown_at(peer_node: Peer) -> dict[int, int]:
+    """The digest of the parameters of each tick, by its instant, ns."""
+    ticks = [dict(zip(message.name, message.position, strict=True)) for message in peer_node.received["internals"]]
+    stamps = map(stamp_ns, peer_node.received["internals"])
+    return {stamp + nanoseconds(tick["age"]): int(tick["parameters"]) for stamp, tick in zip(stamps, ticks, strict=True)}
 
 
 def get(peer_node: Peer) -> float:

@@ -25,7 +25,7 @@ from tests.small_disk import small_disk
 from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
-from flight_ros.topics import PUBLISH, publisher_qos
+from flight_ros.topics import PUBLISH, RECORDED, publisher_qos
 
 pytestmark = pytest.mark.package("flight_recorder")
 
@@ -121,6 +121,19 @@ def test_flight_of_which_part_recorded_is_no_silent_failure(recorder: Recorder, 
 
     peer_node.until(lambda: all(f"waiting for /{topic}: no publisher" in process.output for topic in ("y_m", "u")), each=send)
     assert "waiting for /y:" not in process.output
+
+
+def test_log_reaches_as_far_as_oldest_of_y_y_m_and_u(recorder: Recorder, peer_node: Peer) -> None:
+    spans: list[Time] = []
+    peer_node.node.create_subscription(RECORDED.type, RECORDED.name, spans.append, PUBLISH)
+    recorder("run").wait_for("ready")
+
+    def send() -> None:
+        peer_node.send()
+        peer_node.command(0.0, 0.0, 0.0, 0.0, age=5.0)
+
+    peer_node.until(lambda: spans, each=send)
+    assert time.time() - spans[0].sec - spans[0].nanosec / 1e9 > 5.0
 
 
 def test_flight_that_falls_silent_named_each_time(recorder: Recorder, peer_node: Peer) -> None:
