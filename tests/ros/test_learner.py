@@ -49,8 +49,8 @@ def scenario(folder: Path, **learn: object) -> Scenario:
 
 
 def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays_to_the_bit(tmp_path: Path) -> None:
-    # the flight ends at the tick that waits for the second proposal
-    guided = scenario(tmp_path, updates=[10.0, 10.5]).vary(
+    # the flight ends at the tick that waits for the second proposal, and that begins the third search
+    guided = scenario(tmp_path, updates=[10.0, 10.5, 11.0]).vary(
         aircraft={"kinematics": "euler"},
         reference_model={"pulses": {}, "coordinated_turn": None, "live": {"speed": 25.0}},
         guidance={"program": {"heading": {"start": [1.0], "value": [0.5]}, "altitude": {"start": [1.0], "value": [20.0]}}},

@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
-from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
+from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, SEARCH_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
 from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
@@ -44,7 +44,6 @@ STAMP_ERROR = 1e-5  # s, of a time of day as a float
 STALL_TIMEOUT = 40.0
 """s. A lockstep flight without progress for so long ends; lost contact with a node ends it within three seconds."""
 
-SEARCH_TIMEOUT = 300.0  # s, the same of a flight that waits for a learner: a search takes 5 s of a core
 
 Progress = Callable[[float, str], None]  # flight time in s, and the text beside it
 

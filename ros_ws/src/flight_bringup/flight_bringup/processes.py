@@ -35,7 +35,7 @@ from flight_bringup.graph import (
     start_lead,
 )
 from flight_core.files import dump_yaml, write_file
-from flight_core.outcome import INTERRUPTED, LOST_CONTACT, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, LOST_CONTACT, NEVER_FLEW
 from flight_core.parameters import ParameterError, nest
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 STOP_TIMEOUT = 2.5  # s, for all processes but the recorder together; a node needs 0.2 s
 CLOSE_TIMEOUT = 30.0  # s, for the recorder, which needs 0.2 s: on a busy host or disk it still closes its log
+SEARCH_TIMEOUT = 300.0  # s, for a learner in lockstep: a search takes 5 s of a core
 READY_TIMEOUT = 20.0  # s
 DISCOVERY_TIME = 0.5  # s, until the publishers of another flight on this host are known, twice the measured 0.25 s
 FIRST_Y = 20.0  # s, that a bridge waits for the first y of its autopilot
@@ -292,13 +293,20 @@ class FlightProcesses:
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 
     def stop(self) -> None:
-        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT."""
+        """Stop all processes, the recorder last; SIGKILL after STOP_TIMEOUT, and for the recorder CLOSE_TIMEOUT.
+
+        At the end of a lockstep flight a learner completes its search first.
+        """
         with handle_signals(signal.SIG_IGN):  # a second Ctrl-C must not interrupt this: it would truncate the log
             if self.processes:
                 leave_outcome(self._run, self.outcome)
-            for recorder, timeout in ((False, STOP_TIMEOUT), (True, CLOSE_TIMEOUT)):
-                deadline = time.monotonic() + timeout
-                group = [process for process in self.processes if (process.node in {RECORDER, ONE_PROCESS}) is recorder]
+            searches = self._lockstep and self.outcome == COMPLETED and self._scenario.learns()
+            last = {RECORDER: CLOSE_TIMEOUT, ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT}
+            first = {LEARNER: SEARCH_TIMEOUT} if searches else {}
+            rest = {process.node: STOP_TIMEOUT for process in self.processes if process.node not in last | first}
+            for timeouts in (first, rest, last):
+                deadline = time.monotonic() + max(timeouts.values(), default=0.0)
+                group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
                     if process.popen.poll() is None:
                         process.popen.terminate()  # not SIGINT, which gives a traceback while Python still imports

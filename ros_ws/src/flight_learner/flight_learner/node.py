@@ -144,5 +144,13 @@ class LearnerNode(FlightNode[LearnerConfig]):
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
             self._proposal = Proposal(None, f"the identification failed: {' '.join(str(error).split())}")
 
+    def close(self) -> None:
+        """In lockstep complete the searches that are due: the log has their entries, as that of one process."""
+        if self.parameters.lockstep:
+            self._advance(0)
+            while self._search is not None:
+                self._search.join()
+                self._advance(0)
+
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         return DiagnosticStatus.OK, "identifies" if self._search is not None else self._said, {}
