@@ -10,12 +10,12 @@ import pytest
 
 import rise_di
 from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airspeed import at_speed
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.speed import at_speed
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError

@@ -43,6 +43,7 @@ class Aircraft(NamedTuple):
     bias: Bias | None = None
     sines: Sines | None = None
     kinematics: EulerKinematics | None = None
+    trim: Array | None = None  # (n,) of x_dot, where the matrices are those of another airspeed than the trim's
 
 
 def f(t: Any, x: Array, params: Aircraft, turbulence: Array | None = None) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from aircraft_sim import uncertainty
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe, Unit, load_airframe
+from aircraft_sim.airspeed import over_airspeed
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
@@ -277,6 +278,11 @@ class AircraftConfig(NodeConfig):
         default=UncertaintyConfig(), description="how far the aircraft differs from its airframe"
     )
     drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
+    over_airspeed: str | None = Field(
+        default=None,
+        description="of an airframe: its input that is a thrust. A, B and the trim then follow the airspeed in flight; where"
+        " absent they are those of the trim speed",
+    )
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
     vanes: VaneSensorsConfig = Field(default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out")
@@ -349,6 +355,10 @@ class AircraftConfig(NodeConfig):
         known = self.kinematics == "linear" or not missing
         require(known, "kinematics", f"{self.kinematics!r}", f"linear: {has_none} state {', '.join(missing)}")
         require(bool(airframe.gusts) or self.turbulence is None, "turbulence", "a section", f"none: {has_none} gusts")
+        if self.over_airspeed is not None:
+            over_airspeed(airframe, self.over_airspeed)
+            require(self.kinematics == "linear", "over_airspeed", "kinematics euler beside it", "linear kinematics")
+            require(self.drift is None, "over_airspeed", "a drift beside it", "none: a drift is that of the trim speed")
         for name in self.vanes.channels:
             require(name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}")
             require(name not in airframe.outputs, "vanes.channels", name, f"none: {name} is an output of {airframe.name}")
@@ -368,6 +378,7 @@ class AircraftConfig(NodeConfig):
             ("kinematics", self.kinematics != "linear"),
             ("uncertainty", uncertain),
             ("drift", self.drift),
+            ("over_airspeed", self.over_airspeed),
         ):
             require(not value, key, "a value", f"none: {self.airframe} has no matrices to change")
 
@@ -441,7 +452,8 @@ class AircraftConfig(NodeConfig):
         """The plant as arrays: equation (1), the actuators, the turbulence and the drift."""
         airframe, aircraft = self.load()
         turbulence = self._turbulence(airframe.speed, list(airframe.gusts))
-        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors())
+        over = None if self.over_airspeed is None else over_airspeed(airframe, self.over_airspeed)
+        return PlantParams(aircraft, self.actuator_model(), self.step_ns, turbulence, self.drift_factors(), over)
 
     def actuator_model(self) -> Actuators:
         """The actuators as arrays."""

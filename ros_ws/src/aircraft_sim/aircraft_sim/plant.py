@@ -36,24 +36,59 @@ def share(t: Array, start: Any, duration: Any) -> Array:
     return xp.where(t >= start, xp.where(duration > 0.0, part, 1.0), 0.0)
 
 
+class OverAirspeed(NamedTuple):
+    """How A, B and the trim follow the airspeed V0 + V: exponents of the ratio to V0, and trims at K ratios."""
+
+    speed: float  # V0, m/s
+    place: int  # of V in x
+    A: Array  # (n, n) exponents of the entries
+    B: Array  # (n, m)
+    gravity: Array  # (n, n)
+    wind: Array  # (n, G)
+    ratio: Array  # (K,) rising
+    x: Array  # (K, n) of the trims, deviations from that at V0
+    u: Array  # (K, m)
+
+
 class PlantParams(NamedTuple):
-    """Parameters of the plant: aircraft, actuators, integration step, turbulence and drift."""
+    """Parameters of the plant: aircraft, actuators, integration step, turbulence, drift, and what follows the airspeed."""
 
     aircraft: Aircraft
     actuators: Actuators
     step_ns: int  # of the integration
     turbulence: Turbulence | None = None  # of one step; None without turbulence
     drift: Drift | None = None
+    over_airspeed: OverAirspeed | None = None  # None: A and B are those of the trim speed
 
 
-def aircraft_at(t_ns: int, plant: PlantParams) -> Aircraft:
-    """The aircraft at t: its A, B and effect of wind times 1 + share (factor - 1)."""
+def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircraft:
+    """The aircraft at t in the state x, (n,), at the trim without x: its A, B and effect of wind times 1 + share (factor - 1).
+
+    Over the airspeed the entries are times powers of r = 1 + V / V0, and about the trim of r, (x_r, u_r):
+
+        x_dot = A x + gravity sin(x) + B u + trim,  trim = -(A x_r + gravity sin(x_r) + B u_r)
+    """
+    if plant.over_airspeed is not None and x is not None:
+        return _at_airspeed(x, plant.aircraft, plant.over_airspeed)
     aircraft, drift = plant.aircraft, plant.drift
     if drift is None:
         return aircraft
     part = share(np.array(seconds(t_ns)), drift.start, drift.duration)
     A, B, wind = (1.0 + part * (factor - 1.0) for factor in (drift.A, drift.B, drift.wind))
     return aircraft._replace(A=aircraft.A * A, B=aircraft.B * B, gust_direction=aircraft.gust_direction * wind)
+
+
+def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
+    """The aircraft at the airspeed of a state, within the ratios of the trims."""
+    least, most = over.ratio[[0, -1]].tolist()
+    r = min(max(1.0 + x[over.place].item() / over.speed, least), most)
+    A, B, gravity = (
+        matrix * r**powers for matrix, powers in ((aircraft.A, over.A), (aircraft.B, over.B), (aircraft.gravity, over.gravity))
+    )
+    x_r, u_r = (np.array([np.interp(r, over.ratio, column) for column in of.T]) for of in (over.x, over.u))
+    trim = -(A @ x_r + gravity @ np.sin(x_r) + B @ u_r)
+    wind = aircraft.gust_direction * r**over.wind
+    return aircraft._replace(A=A, B=B, gravity=gravity, gust_direction=wind, trim=trim)
 
 
 class AircraftState(NamedTuple):
@@ -71,10 +106,10 @@ def initial_state(plant: PlantParams) -> AircraftState:
     return AircraftState(xp.zeros_like(plant.aircraft.A[0, :]), xp.zeros_like(plant.aircraft.B[0, :]), z)
 
 
-def forcing(t_ns: int, steps: int, plant: PlantParams) -> Forcing:
-    """Forcing at the beginnings, middles and ends of a number of steps from t on: 2 steps + 1 instants; the aircraft of t."""
+def forcing(t_ns: int, steps: int, plant: PlantParams, x: Array | None = None) -> Forcing:
+    """Forcing at the beginnings, middles and ends of some steps from t and x on: 2 steps + 1 instants; the aircraft of then."""
     halves = array_namespace(plant.aircraft.A).arange(2 * steps + 1, dtype=plant.aircraft.A.dtype)
-    return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, aircraft_at(t_ns, plant))
+    return dynamics.at_times(seconds(t_ns) + seconds(plant.step_ns) / 2.0 * halves, aircraft_at(t_ns, plant, x))
 
 
 def advance(
@@ -102,17 +137,17 @@ def advance(
     caller that has computed it. Raises ParameterError where the step does not divide the duration.
     """
     x, position, z = state
-    aircraft, filters = aircraft_at(t_ns, plant), plant.turbulence
+    aircraft, filters = aircraft_at(t_ns, plant, x), plant.turbulence
     steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
     normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
 
     def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:
         return dynamics.x_dot_forced(x, forced[round(2.0 * since / dt)], params)
 
-    rate = (forcing(t_ns, steps, plant) if forced is None else forced).rate
+    rate = (forcing(t_ns, steps, plant, x) if forced is None else forced).rate
     for k in range(steps):
         position, mean = actuators.move(seconds(t_ns + k * plant.step_ns), position, u, dt, plant.actuators)
-        held = aircraft.B.dot(mean)
+        held = aircraft.B.dot(mean) if aircraft.trim is None else aircraft.B.dot(mean) + aircraft.trim
         if filters is not None:
             held = held + aircraft.gust_direction @ turbulence.wind(z, filters)
             z = turbulence.step(z, normals[k], filters)

@@ -92,7 +92,7 @@ class StateSpaceModel:
         begin = (t_ns - self._block_ns) // self._plant.step_ns
         if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
             self._block_ns, begin = t_ns, 0
-            self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant)
+            self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
         half, psi_dot, velocity = seconds(duration_ns) / 2.0, self._psi_dot, self._velocity
@@ -146,7 +146,7 @@ class StateSpaceModel:
     def truth(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel."""
         index = 2 * ((t_ns - self._block_ns) // self._plant.step_ns)
-        flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant))
+        flown = self._plant._replace(aircraft=plant.aircraft_at(t_ns, self._plant, self._state.x))
         return truth.values(self._state, self._block.wind[index], self._block.rate[index], flown)
 
     def diverged(self) -> bool:
@@ -159,7 +159,7 @@ class StateSpaceModel:
         self._plant = self._plant._replace(
             aircraft=aircraft, actuators=parameters.actuator_model(), drift=parameters.drift_factors()
         )
-        self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant)
+        self._block_ns, self._block = t_ns, plant.forcing(t_ns, BLOCK, self._plant, self._state.x)
 
 
 class Simulator:

@@ -26,6 +26,8 @@ def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: Plan
     `wind` (G,) and `rate` (n,) are the `dynamics.Forcing` of this instant.
     """
     f = dynamics.f_state(state.x, plant.aircraft) + rate
+    if plant.aircraft.trim is not None:
+        f = f + plant.aircraft.trim
     if plant.turbulence is not None:
         turbulent = turbulence.wind(state.turbulence, plant.turbulence)
         wind, f = wind + turbulent, f + plant.aircraft.gust_direction @ turbulent

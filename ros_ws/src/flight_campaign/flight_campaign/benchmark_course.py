@@ -74,6 +74,8 @@ def build_course(scenario: Scenario) -> Course:
     require(
         at_trim, "controller.schedule", "models at other speeds", "none: the aircraft of a campaign fly at their trim speed"
     )
+    fixed = aircraft.over_airspeed is None
+    require(fixed, "aircraft.over_airspeed", aircraft.over_airspeed, "none: the aircraft of a campaign keep their trim speed")
     airframe, plant = aircraft.load()[0], aircraft.plant()
     tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
     ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")

@@ -60,7 +60,13 @@ def _is_newest_last(scenario: Scenario) -> bool:
     """Whether the last sample of a tick is the newest y in every tick, so that earlier samples need no measurement."""
     aircraft = scenario.aircraft
     plain = aircraft.sensors.delay == 0.0 and aircraft.sensors.dropout == 0.0
-    return plain and not scenario.controller.vanes and aircraft.drift is None and not aircraft.is_jsbsim
+    return (
+        plain
+        and not scenario.controller.vanes
+        and aircraft.drift is None
+        and aircraft.over_airspeed is None
+        and not aircraft.is_jsbsim
+    )
 
 
 def _actions(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:

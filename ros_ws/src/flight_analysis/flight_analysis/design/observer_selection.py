@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.airspeed import at_speed
 from aircraft_sim.disturbance import AIR_STATE
 from aircraft_sim.turbulence import MODERATE, dryden
 from aircraft_sim.uncertainty import nominal_and_sampled
@@ -43,7 +44,6 @@ from flight_analysis.design.requirement import (
     least_fraction,
     nominal_conditions,
 )
-from flight_analysis.design.speed import at_speed
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import TunedLaw
