@@ -336,7 +336,9 @@ def test_filter_of_a_constant_record_begins_as_after_a_long_one() -> None:
     z = np.zeros(len(params.Phi))
     for _ in range(60_000):  # six times as long as the slowest decay, of 100 s
         z = params.Phi @ (z + params.L @ (e - params.H @ z)) + params.Gamma @ (u - 0.01)
-    assert estimates_after(record, np.full(4, 0.01), params) == pytest.approx(z, rel=0.01, abs=1e-6)  # exp(-6) is 0.0025
+    assert estimates_after(record, np.full(4, 0.01), [params] * len(record)) == pytest.approx(
+        z, rel=0.01, abs=1e-6
+    )  # exp(-6) is 0.0025
 
 
 def test_changes_in_log_are_those_that_the_controller_took(flown: Flown) -> None:

@@ -85,14 +85,25 @@ def test_filter_over_the_record_equals_the_ticks_of_the_law() -> None:
     for e in np.sin(np.arange(60.0)):
         state, u = law.step(state, measured(e), DT, observer)
         record.append(PastTick(vector(e), u - TRIM, vector(7.0), DT))
-    assert estimates_after(tuple(record), vector(0.0), observer) == pytest.approx(state.z, abs=1e-14)
+    assert estimates_after(tuple(record), vector(0.0), [observer] * len(record)) == pytest.approx(state.z, abs=1e-14)
+
+
+def test_filter_over_the_record_is_that_of_each_tick() -> None:
+    law, slow = with_observer(TRIM_LAW), params()
+    fast = slow._replace(Phi=0.6 * slow.Phi, Gamma=2.0 * slow.Gamma)
+    filters, record = [slow] * 40 + [fast] * 3 + [slow, fast] * 2, []
+    state = law.engage(measured(1.0), slow)
+    for e, of_tick in zip(np.sin(np.arange(47.0)), filters, strict=True):
+        state, u = law.step(state, measured(e), DT, of_tick)
+        record.append(PastTick(vector(e), u - TRIM, vector(7.0), DT))
+    assert estimates_after(tuple(record), vector(0.0), filters) == pytest.approx(state.z, abs=1e-14)
 
 
 def test_filter_starts_in_its_steady_state_and_predicts_where_no_y_came() -> None:
     # change 0.1, means e = 2 and u = 0.15: z = (0.5 0.25 2 + 2 0.15) / (1 - 0.375) = 0.88
     # without y: z+ = 0.5 0.88 + 2 0.1 = 0.64. e = 2: z = 0.64 + 0.25 1.36 = 0.98, z+ = 0.49 + 2 (0.3 - 0.1) = 0.89
     record = (PastTick(None, vector(0.2), vector(7.0), DT), PastTick(vector(2.0), vector(0.3), vector(7.0), DT))
-    assert estimates_after(record, vector(0.1), params()) == pytest.approx([0.89], abs=1e-14)
+    assert estimates_after(record, vector(0.1), [params()] * len(record)) == pytest.approx([0.89], abs=1e-14)
 
 
 def test_new_observer_without_record_starts_from_error_and_trim_keeps_contribution() -> None:

@@ -87,7 +87,7 @@ class Flight:
 def test_proposal_flies_after_certificate_in_parts() -> None:
     flight = Flight()
     flight.receive()
-    assert flight.step() == 9  # fields, relations, zeros, filter and feedback, three delays, arrays, the switch
+    assert flight.step() == 11  # fields, relations, zeros, filter and feedback, three delays, law, limits, names, the switch
     assert flight.sentences == ["flies model"]
     expected = RiseDiConfig.validate_mapping(START.changed(CHANGE), "expected")
     assert flight.controller.digest == expected.digest()

@@ -10,18 +10,26 @@ import pytest
 
 import rise_di
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.airspeed import at_speed
+from aircraft_sim.airspeed import at_speed, level_flight
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.margins import law_order
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.design.innovation_filters import Recording
+from flight_analysis.design.learner import Learner, about, steady_end
+from flight_analysis.design.model_identification import best_known
 from flight_bringup.scenarios import find_scenario
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import StampedVector
 from rise_di.gain_design import observed
 from rise_di_controller.control_law import Measurements
+from rise_di_controller.controller import Controller
+from rise_di_controller.learning import Event, Learning, Proposal, acting_inputs, authority, designed, fallen_back
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
+from rise_di_controller.observer import estimates_after
 from rise_di_controller.rise_di import RiseDiConfig
 
 pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
@@ -158,3 +166,146 @@ def test_campaign_and_export_refuse_models_at_other_speeds(scheduled: RiseDiConf
         build_course(SHIPPED.vary(controller=scheduled))
     with pytest.raises(ParameterError, match=r"^controller\.schedule: found models at other speeds"):
         exportable(scheduled)
+
+
+LEARNS = find_scenario("osprey_learn_speeds").rise_di()
+
+
+class Learns:
+    """A controller that learns beside a schedule, at 1.2 of the trim speed for 6 s, and the proposals of its flight."""
+
+    def __init__(self, scheduled: RiseDiConfig) -> None:
+        self.change = designed(LEARNS, scheduled)
+        self.model = RiseDiConfig.validate_mapping(LEARNS.changed(self.change), "controller")
+        self.controller, self.events = Controller(LEARNS), list[Event]()
+        self.learning = Learning(LEARNS, self.events.append, simulated=False)
+        self.now_ns, self.u = 0, list[Any]()
+        for _ in range(600):
+            self.tick()
+
+    def tick(self) -> None:
+        """A tick, with small errors along a motion of q."""
+        self.now_ns += NANOSECONDS // 100
+        t = self.now_ns / NANOSECONDS
+        y_m = np.array([0.02 * np.sin(2.0 * t), 0.0, 0.0, 5.0])
+        e = 0.005 * np.sin(3.0 * t + np.arange(4))
+        self.controller.take_y(StampedVector(self.now_ns, y_m + e), self.now_ns)
+        self.controller.take_y_m(StampedVector(self.now_ns, y_m), self.now_ns)
+        self.controller.tick(self.now_ns)
+        self.u.append(self.controller.state.u)
+        self.learning.step(self.controller, self.now_ns)
+
+    def propose(self, change: dict[str, Any]) -> str:
+        """What becomes of a proposal."""
+        proposal = Proposal(self.now_ns, LEARNS.digest(), self.controller.digest, change, "model")
+        self.learning.receive(proposal, self.controller, self.now_ns)
+        said = len(self.events)
+        while len(self.events) == said:
+            self.tick()
+        return self.events[-1].sentence
+
+
+def test_learned_models_of_all_speeds_fly_and_go_back_at_once(scheduled: RiseDiConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Learns(scheduled)
+    assert flight.propose(flight.change) == "flies model"
+    assert flight.controller.digest == flight.model.digest()
+    assert {"schedule.slow.Phi", "schedule.fast.F"} <= set(flight.change)
+    state, (law, params) = flight.controller.state, flight.model.tuned_law()
+    assert state.y is not None
+    at_once = Measurements(state.y.value, state.y_m, np.zeros(4), state.u_trim + state.u_ff, state.u)
+    _, u = law.step(state.law, at_once, np.float64(1e-9), params)
+    assert u == pytest.approx(state.u, abs=1e-6)
+    monkeypatch.setattr(flight.controller, "diverges", lambda: True)
+    flight.tick()
+    assert flight.controller.parameters == LEARNS
+
+
+def test_new_filter_runs_over_the_record_with_the_model_of_its_speed(scheduled: RiseDiConfig) -> None:
+    flight = Learns(scheduled)
+    flight.propose(flight.change)
+    state = flight.controller.state
+    filters = [flight.model.at_speed(1.2).tuned_law().params] * len(state.history)
+    expected = estimates_after(state.history, state.u_ff, filters)  # there was no feedforward before
+    assert state.law.law.z == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor", "sentence"),
+    [
+        (
+            "schedule.fast.F",
+            -1.0,
+            "refused: controller.schedule, at 1.4 of the trim speed: observer.F: found a spectral radius",
+        ),
+        ("schedule.slow.ratio", 0.9, "refused: controller.schedule: found 25.0 m/s, 1.0 s, models at 0.63 and 1.4 times it"),
+        ("schedule.speed", 2.0, "refused: controller.schedule: found 50.0 m/s, 1.0 s, models at 0.7 and 1.4 times it"),
+        ("schedule.fast.B", -1.0, "refused: controller.schedule.fast.B: found a C B with D = [-1, -1, -1, -1]"),
+    ],
+)
+def test_lie_about_another_speed_is_refused(scheduled: RiseDiConfig, name: str, factor: float, sentence: str) -> None:
+    flight = Learns(scheduled)
+    change = dict(flight.change)
+    value = change[name]
+    change[name] = factor * value if isinstance(value, float) else [factor * each for each in value]
+    assert flight.propose(change).startswith(sentence)
+    assert flight.controller.parameters == LEARNS
+
+
+def test_part_without_a_model_has_none_at_any_speed(scheduled: RiseDiConfig) -> None:
+    mixed = fallen_back(LEARNS, Learns(scheduled).model, [name in {"q", "V"} for name in LEARNS.outputs])
+    assert acting_inputs(mixed) == ("aileron", "rudder")
+    assert mixed.schedule is not None
+    for model in mixed.schedule.models:
+        assert not np.reshape(model.F, (4, -1))[[0, 3]].any()
+
+
+def test_guidance_counts_on_the_least_effect_over_the_speeds(scheduled: RiseDiConfig) -> None:
+    lower = authority(Learns(scheduled).model, LEARNS)[:4]
+    assert LEARNS.lower is not None
+    # elevator and thrust at 0.7 V0: 0.49 of a moment, and all of a thrust
+    assert lower[[0, 3]] == pytest.approx([56.15 * 0.49 * -LEARNS.lower[0], 6.0 * -LEARNS.lower[3]], rel=1e-3)
+
+
+def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
+    """A record at 1.24 of the trim speed, where effects of surfaces are 54 % larger."""
+    faster = {"start": [0.0, 2.0], "stop": [100.0, 100.0], "value": [3.0, 3.0]}
+    scenario = find_scenario("osprey_learn_speeds").vary(
+        flight={"duration": 20.0},
+        aircraft={"rate": 100.0, "step": 0.01, "turbulence": None},
+        reference_model={
+            "rate": 100.0,
+            "pulses": {
+                "V": faster,
+                "q": {"start": [9.0, 12.0, 15.0, 18.0], "stop": [10.0, 13.0, 16.0, 19.0], "value": [-0.1, 0.1, 0.1, -0.1]},
+                "p": {"start": [10.0, 13.0, 16.0, 19.0], "stop": [11.0, 14.0, 17.0, 20.0], "value": [0.4, -0.4, -0.5, 0.5]},
+                "r": {"start": [11.0, 14.0], "stop": [12.0, 15.0], "value": [0.03, -0.03]},
+            },
+        },
+    )
+    ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
+    made = Learner(scenario.rise_di(), OSPREY, lambda start, model: start)
+    for stamp_ns, y, u in zip(ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True):
+        made.take(stamp_ns, y, u)
+    made.propose(0)
+    found, true, file = made.identification, scenario.aircraft.sampled_airframe(), OSPREY.matrix_b()
+    assert found is not None
+    assert 12.0 < len(found.recorded.t) * 0.01 < 18.5  # the seconds of the climb in speed are left out
+    for entry in best_known(found.entries, true.outputs):
+        place = true.index(entry.row), list(true.inputs).index(entry.column)
+        assert entry.nominal == pytest.approx(file[place])
+        error = true.matrix_b()[place] / file[place] - 1.0
+        assert abs(entry.error - error) < max(3.0 * entry.deviation, 0.1), entry.name
+
+
+def test_record_with_two_speeds_has_the_end_of_one() -> None:
+    V = np.concatenate([np.zeros(1000), np.linspace(0.0, 8.0, 100), np.full(1200, 8.0)])
+    V[1500] = np.nan
+    y = np.stack([0.0 * V, V, 0.0 * V, 0.0 * V], axis=1)  # q, V, p, r
+    t = np.arange(len(V), dtype=np.float64) * 0.01
+    end, ratio = steady_end(Recording(0.01, t, y, y), OSPREY)
+    assert ratio == pytest.approx(1.32, rel=0.01)
+    assert 1200 <= len(end.t) < 1300
+    assert end.t[-1] == pytest.approx(22.99)
+    turned = about(end, OSPREY, *level_flight(OSPREY, ratio, "thrust"))
+    assert np.nanmean(turned.y[:, 1]) == pytest.approx(0.0, abs=0.02)
+    assert turned.u[0, 0] == pytest.approx(0.0 - level_flight(OSPREY, ratio, "thrust")[1][0])

@@ -42,8 +42,15 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     if controller.learn.prior is not None:
         airframe = _prior(controller.learn.prior, airframe)
 
+    speeds = None
+    if controller.schedule is not None:
+        slow, fast = (there.ratio for there in controller.schedule.models)
+        speeds, V0 = (slow, fast), controller.schedule.speed
+        require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", f"{airframe.speed:g} m/s, that of the model")
+
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        return observed(start, scenario, model, margin, uncertain=False, sketched=aircraft.is_jsbsim)[0]
+        designed = observed(start, scenario, model, margin, uncertain=False, sketched=aircraft.is_jsbsim, speeds=speeds)
+        return designed[0]
 
     return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
 

@@ -3,7 +3,7 @@
 """The controller without ROS: buffers y and y_m, steps the guarded law, returns u and a log. For node and simulation."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import partial
 from typing import NamedTuple
 
@@ -43,10 +43,24 @@ class Prepared(NamedTuple):
     names: tuple[str, ...]  # of the channels of `internals`
 
 
+def preparing(parameters: ControllerConfig) -> Generator[None, None, Prepared]:
+    """`prepared` in parts of at most about 1 ms."""
+    law = parameters.tuned_law()
+    yield
+    limits = parameters.guard()
+    yield
+    return Prepared(parameters, law, limits, parameters.digest(), internals.names(parameters.logged_groups(law.control_law)))
+
+
 def prepared(parameters: ControllerConfig) -> Prepared:
     """The parameters with what a controller makes of them."""
-    names = internals.names(parameters.logged_groups())
-    return Prepared(parameters, parameters.tuned_law(), parameters.guard(), parameters.digest(), names)
+    parts = preparing(parameters)
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            ready: Prepared = end.value
+            return ready
 
 
 class Controller:
@@ -151,7 +165,7 @@ class Controller:
         return {name: period for name, period in periods if period}
 
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
-        return (parameters.observer, parameters.feedforward) == (self._first.observer, self._first.feedforward)
+        return parameters.models() == self._first.models()
 
     def take_y(self, sample: StampedVector, now_ns: int) -> None:
         """Buffer a sample of y, shape (m,), in the law's order.

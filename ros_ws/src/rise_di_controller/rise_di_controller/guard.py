@@ -25,7 +25,7 @@ from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
 from rise_di_controller.saturation import Limits, saturate
-from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at
+from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at, observers_of
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of the difference more than 20 times.
@@ -210,8 +210,9 @@ def tick(
     measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
     after, u_free, u, effectors = law_within_limits(law_state, measured, dt, law, guard, state.effectors)
     if guard.history:
-        lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal)),) * missed
-        last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt))
+        scale = getattr(after, "scale", None)
+        lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal), scale),) * missed
+        last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt), scale)
         state = state._replace(history=(*state.history, *lost, last)[-guard.history :])
     state = state._replace(
         law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
@@ -273,7 +274,8 @@ def retune(
     An observer with the same matrices continues. With a history of the last ticks a new observer and a new feedforward go on in
     the same motion: z comes from the new filter over these ticks, and u_o goes on where an observer acts. Without a history the
     observer starts again from the present error, and u_o and u_ff become part of u_trim. A schedule has the models of the
-    present speed. Arguments: `guards`, old and new, with the models of the feedforward.
+    present speed, and over the record those of every tick. Arguments: `guards`, old and new, with the models of the
+    feedforward.
     """
     y, y_m = state.y, state.y_m
     if state.law is None or y is None or y_m is None:
@@ -285,20 +287,22 @@ def retune(
     if isinstance(law, ScheduleState):
         observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
     other_model = isinstance(observing, (ObserverState, VaneObserverState)) and _is_replaced(*observers)
-    if len(state.history) > 1 and isinstance(law, ObserverState) and isinstance(law.law, LawState):
+    if len(state.history) > 1 and isinstance(observing, ObserverState) and isinstance(observing.law, LawState):
         change: Array = np.zeros_like(state.u)  # of u_ff
         if other_nominal:
             state, change = _with_nominal(state, y_m, after)
         if other_model or other_nominal:
             # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part of the law: what
             # the law has integrated beside an observer stays there, which would take it long to integrate again.
-            rest, limits = state.u - state.u_trim - state.u_ff, new.params.limits
-            acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in (old.params, new.params))
-            goes_on = np.where(acted, law.u_o - change, rest)
+            rest, limits = state.u - state.u_trim - state.u_ff, observers[1].limits
+            acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
+            goes_on = np.where(acted, observing.u_o - change, rest)
             u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-            inner = shifted(law.law, rest - u_o - (rest + change - law.u_o), new.params.law)
-            z = observer.estimates_after(state.history, change, new.params)
-            law = ObserverState(inner, z, u_o, np.ones_like(law.sigma))
+            inner = shifted(observing.law, rest - u_o - (rest + change - observing.u_o), observers[1].law)
+            filters = observers_of(new.params, [tick.scale for tick in state.history])
+            z = observer.estimates_after(state.history, change, filters)
+            started = ObserverState(inner, z, u_o, np.ones_like(observing.sigma))
+            law = law._replace(law=started) if isinstance(law, ScheduleState) else started
         return state._replace(law=law)
     if other_model and not _same_model(*observers):
         z = observer.initial_estimates(y.value - y_m, observers[1])

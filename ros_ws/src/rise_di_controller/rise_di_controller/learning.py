@@ -16,13 +16,15 @@ from flight_core.modes import Mode
 from flight_core.parameters import SMALLEST, ParameterError, flatten, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from rise_di_controller.controller import Controller, Prepared, prepared
+from rise_di_controller.controller import Controller, Prepared, prepared, preparing
 from rise_di_controller.law import MIN_GAIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
 
-DESIGNED = frozenset({"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer"})
-"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs."""
+DESIGNED = frozenset(
+    {"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer", "schedule"}
+)
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs, at every speed."""
 
 OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
 """Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
@@ -249,6 +251,13 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
         ", ".join(proposed.observer.states),
         f"those of the start: {', '.join(start.observer.states)}",
     )
+    speeds = _speeds(start)
+    require(
+        _speeds(proposed) == speeds,
+        "controller.schedule",
+        _speeds(proposed) or "none",
+        f"that of the start: {speeds or 'none'}",
+    )
     least = start.observer.margin
     found = proposed.observer.margin
     require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
@@ -263,9 +272,18 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
         yield from proposed.checks()
     except ParameterError as error:
         raise ParameterError(f"controller.{error}") from None
-    ready = prepared(proposed)
+    ready = yield from preparing(proposed)
     yield
     return ready
+
+
+def _speeds(parameters: RiseDiConfig) -> str:
+    """The speeds of the models, and how the schedule follows; empty without a schedule."""
+    schedule = parameters.schedule
+    if schedule is None:
+        return ""
+    ratios = " and ".join(f"{model.ratio!r}" for model in schedule.models)
+    return f"{schedule.speed!r} m/s, {schedule.time!r} s, models at {ratios or 'no'} times it"
 
 
 def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
@@ -305,12 +323,18 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
         "softening": tuple(softening.tolist()),
         "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
     }
-    observer, feedforward = designed.observer, designed.feedforward
+    observer, feedforward, schedule = designed.observer, designed.feedforward, designed.schedule
     if channels.any() and observer is not None and feedforward is not None:
-        F = np.reshape(observer.F, (len(bare), -1)) * ~channels[:, None]
+
+        def without(F: Sequence[float]) -> dict[str, Any]:
+            return {"F": tuple((np.reshape(F, (len(bare), -1)) * ~channels[:, None]).ravel().tolist())}
+
         acting = feedforward.inputs or start.inputs
-        flown = tuple(name for name, without in zip(start.inputs, bare, strict=True) if name in acting and not without)
-        changed["observer"] = observer.model_copy(update={"F": tuple(F.ravel().tolist())})
+        flown = tuple(name for name, is_bare in zip(start.inputs, bare, strict=True) if name in acting and not is_bare)
+        changed["observer"] = observer.model_copy(update=without(observer.F))
+        if schedule is not None and schedule.slow is not None and schedule.fast is not None:
+            slow, fast = (model.model_copy(update=without(model.F)) for model in schedule.models)
+            changed["schedule"] = schedule.model_copy(update={"slow": slow, "fast": fast})
         changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
     return designed.model_copy(update=changed)
 
@@ -319,8 +343,9 @@ def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
     """The inputs with a feedforward or an observer: those of the parts with a model."""
     feedforward, observer, inputs = parameters.feedforward, parameters.observer, parameters.inputs
     fed = () if feedforward is None else feedforward.inputs or inputs
-    F = np.zeros(len(inputs)) if observer is None else np.array(observer.F)
-    return tuple(name for name, row in zip(inputs, F.reshape(len(inputs), -1), strict=True) if name in fed or row.any())
+    models = () if parameters.schedule is None else parameters.schedule.models
+    F = np.hstack([np.reshape(model.F, (len(inputs), -1)) for model in (observer, *models) if model is not None])
+    return tuple(name for name, row in zip(inputs, F, strict=True) if name in fed or row.any())
 
 
 def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
@@ -333,18 +358,21 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 
         y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),  Omega = C B of the model learned in flight
 
-    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i, and above 0 for any.
+    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i, and above 0 for any. Beside
+    models at further speeds it is the least over the speeds.
     For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the start.
     """  # noqa: D400, D415 - what follows is an equation
     m, model, acting = len(flown.outputs), flown.feedforward, acting_inputs(flown)
     dead = np.array(flown.input_scale) <= SMALLEST
     found = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
-    if model is None or (model, flown.observer) == (start.feedforward, start.observer):
+    if model is None or flown.models() == start.models():
         return found.ravel()
     rows = [model.states.index(name) for name in flown.outputs]
     both = (model.B, model.deviation or (0.0,) * len(model.B))
     B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
     least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
+    for there in () if flown.schedule is None else flown.schedule.models:
+        least = least * np.minimum(np.abs(np.reshape(there.B, (-1, m))[rows].diagonal() / B), 1.0)
     for k, limits in enumerate((flown.lower, flown.upper)):
         if limits is None:
             continue
@@ -356,7 +384,7 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
     """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
-    acting, is_first = acting_inputs(flown), (flown.observer, flown.feedforward) == (start.observer, start.feedforward)
+    acting, is_first = acting_inputs(flown), flown.models() == start.models()
     if is_first or all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
         return start
     mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])

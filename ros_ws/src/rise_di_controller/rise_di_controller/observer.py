@@ -51,6 +51,7 @@ class PastTick(NamedTuple):
     u: Array  # (m,) u less the trim and the feedforward of the tick
     y_m: Array  # (m,)
     dt: Array  # () length of the tick, s
+    scale: Array | None = None  # (m,) factor of input_scale, beside a schedule
 
 
 class ObserverState(NamedTuple):
@@ -84,26 +85,32 @@ def initial_estimates(e: Array, params: ObserverParams) -> Array:
     return product(params.H.swapaxes(0, 1), e)
 
 
-def estimates_after(history: tuple[PastTick, ...], change: Array, params: ObserverParams) -> Array:
+def estimates_after(history: tuple[PastTick, ...], change: Array, filters: Sequence[ObserverParams]) -> Array:
     """Estimates of the filter over the last ticks, predicted for the next tick.
 
-        z = (I - Phi (I - L H))^-1 (Phi L mean(e) + Gamma mean(u - change))        its steady state at the means
+        z = (I - Phi (I - L H))^-1 (mean(Phi L e) + mean(Gamma (u - change)))      the steady state at the means
         z = z + L (e - H z),  z = Phi z + Gamma (u - change)                       over the ticks,
         that is z = (Phi - Phi L H) z + Phi L e + Gamma (u - change)
 
     So the filter knows what the law held: to estimate it takes longer than the record. A tick without a y has no
-    correction. The products with e and u are taken of the whole record at once, in a third of the time. Arguments: `history`
-    with a y at least; `change` of the feedforward since then, (m,).
+    correction. The products with e and u are taken of all ticks of a filter at once, in a third of the time. Arguments:
+    `history` with a y at least; `change` of the feedforward since then, (m,); the `filters` of the ticks.
     """
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
     u = np.array([tick.u - change for tick in history]).T
-    gain = product(params.Phi, params.L)
-    by_e, by_u = product(gain, e), product(params.Gamma, u)
-    corrected = params.Phi - product(gain, params.H)
+    of_tick = np.array([id(params) for params in filters])
+    by_e, by_u = np.zeros((2, len(filters[0].Phi), len(history)))
+    steps: dict[int, tuple[Array, Array]] = {}
+    for params in {id(params): params for params in filters}.values():
+        own, gain = of_tick == id(params), product(params.Phi, params.L)
+        by_e[:, own], by_u[:, own] = product(gain, e[:, own]), product(params.Gamma, u[:, own])
+        steps[id(params)] = params.Phi, params.Phi - product(gain, params.H)
+    _, corrected = steps[id(filters[0])]
     z = product(inverse(np.eye(len(corrected)) - corrected), np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1))
-    for has_y, addend in zip(known, (by_e + by_u).T, strict=True):
-        z = product(corrected if has_y else params.Phi, z) + addend
+    for place, has_y, addend in zip(of_tick.tolist(), known, (by_e + by_u).T, strict=True):
+        predicted, corrected = steps[place]
+        z = product(corrected if has_y else predicted, z) + addend
     return z
 
 

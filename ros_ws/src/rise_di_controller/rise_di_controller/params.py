@@ -393,7 +393,7 @@ class ControllerConfig(NodeConfig):
         law, params, nominal = self.control_law(), self.law_params(), self.nominal()
         if self.observer is None or nominal is None:
             return TunedLaw(law, params)
-        bound, part = self.guard().limits, self.observer.part
+        bound, part = self._limits(), self.observer.part
         rate = part / self.observer.within * (bound.upper - bound.lower) / 2.0
         limits = Limits(part * bound.lower, part * bound.upper, rate)
         fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
@@ -404,11 +404,17 @@ class ControllerConfig(NodeConfig):
         observed = ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate), vanes)
         return TunedLaw(with_observer(law) if section is None else with_observer(law, vanes=True), observed)
 
-    def logged_groups(self) -> dict[str, tuple[str, ...]]:
-        """Groups of channels of `internals` and the names in each."""
+    def models(self) -> tuple[Any, ...]:
+        """The sections with a model of the aircraft, for a learner to replace."""
+        return self.feedforward, self.observer
+
+    def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
+        """Groups of channels of `internals` and the names in each; `law` is the result of `tuned_law`, if known."""
         estimates = () if self.observer is None else self.observer.states
         effectors = () if self.allocation is None else self.allocation.effectors
-        return internals.groups(self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors, self.vanes)
+        return internals.groups(
+            law or self.tuned_law().control_law, self.outputs, self.inputs, estimates, effectors, self.vanes
+        )
 
     @property
     def effectors(self) -> tuple[str, ...]:
@@ -445,20 +451,24 @@ class ControllerConfig(NodeConfig):
             del content["law"]
         return int.from_bytes(blake2b(json.dumps(sorted(flatten(content))).encode(), digest_size=6).digest(), "big")
 
+    def _limits(self) -> Limits:
+        """The limits of u, infinite where there is none."""
+        unlimited = (np.inf,) * len(self.inputs)
+        return Limits(
+            -np.array(unlimited) if self.lower is None else np.array(self.lower),
+            np.array(self.upper or unlimited),
+            np.array(self.slew or unlimited),
+        )
+
     def guard(self) -> GuardParams:
         """Times, limits and nominal model of the guard."""
-        unlimited = (np.inf,) * len(self.inputs)
         return GuardParams(
             period_ns=period_ns(self.rate, "rate"),
             max_age_ns=nanoseconds(self.max_age),
             hold_ns=nanoseconds(self.hold),
             ramp_ns=nanoseconds(self.ramp),
             deactivation_holds=self.on_deactivate == "hold",
-            limits=Limits(
-                -np.array(unlimited) if self.lower is None else np.array(self.lower),
-                np.array(self.upper or unlimited),
-                np.array(self.slew or unlimited),
-            ),
+            limits=self._limits(),
             history=self.history_ticks(),
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=self._flown_nominal(),

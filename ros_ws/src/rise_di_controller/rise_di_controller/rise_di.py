@@ -157,13 +157,6 @@ class RiseDiConfig(ControllerConfig):
         require(both, "schedule", "a feedforward or an observer that holds at the trim speed alone", expected)
         slow, fast = (model.ratio for model in schedule.models)
         require(slow < 1.0 < fast, "schedule", f"ratios of {slow:g} and {fast:g}", "one below 1 and one above")
-        for name, model in zip(("slow", "fast"), schedule.models, strict=True):
-            there = self._with_models(model)
-            try:
-                there.tuned_law()
-            except ParameterError as error:  # of feedforward.KEY or observer.KEY
-                raise ParameterError(f"schedule.{name}.{str(error).partition('.')[2]}") from None
-        require(self.learn is None, "learn", "a schedule beside it", "none: a model is learned at one speed")
         require(not self.vanes, "observer.vanes", "a schedule beside them", "none: they read the model of the trim speed")
 
     def checks(self) -> Iterator[None]:
@@ -173,22 +166,35 @@ class RiseDiConfig(ControllerConfig):
             return
         yield from self.model_copy(update={"schedule": None}).checks()
         self.check_law()
+        for name, model in zip(("slow", "fast"), self.schedule.models, strict=True):
+            yield
+            try:
+                self._with_models(model).tuned_law()
+            except ParameterError as error:  # of feedforward.KEY or observer.KEY
+                raise ParameterError(f"schedule.{name}.{str(error).partition('.')[2]}") from None
+        yield
+        observer = self.tuned_law().params.observer
+        yield
+        feedforward = self._nominal_over_speed(self.known_nominal())
         slow, fast = (model.ratio for model in self.schedule.models)
         for ratio in (slow, (1.0 + slow) / 2.0, (1.0 + fast) / 2.0, fast):
+            yield
             try:
-                yield from self.at_speed(ratio).checks()
+                yield from self._at_speed(ratio, feedforward, observer).checks()
             except ParameterError as error:
                 raise ParameterError(f"schedule, at {ratio:.3g} of the trim speed: {error}") from None
 
     def at_speed(self, ratio: float) -> Self:
         """The parameters that fly at a part of the trim speed in steady flight, with the models of there and no schedule."""
-        params, over = self.tuned_law().params, self.guard().over_speed
-        assert over is not None  # noqa: S101 - the schedule has models
-        scale = params.airspeed + (1.0 - params.airspeed) / ratio**2
+        return self._at_speed(ratio, self._nominal_over_speed(self.known_nominal()), self.tuned_law().params.observer)
+
+    def _at_speed(self, ratio: float, feedforward: OverSpeed, observer: OverSpeed) -> Self:
+        airspeed = self._airspeed()
+        scale = airspeed + (1.0 - airspeed) / ratio**2
         sections: dict[str, Any] = {}
         for key, matrices, names in (
-            ("feedforward", over.of(scale), ("A", "B", "gravity")),
-            ("observer", params.observer.of(scale), ("Phi", "Gamma", "L", "F")),
+            ("feedforward", feedforward.of(scale), ("A", "B", "gravity")),
+            ("observer", observer.of(scale), ("Phi", "Gamma", "L", "F")),
         ):
             values = {name: tuple(getattr(matrices, name).ravel().tolist()) for name in names}
             sections[key] = getattr(self, key).model_copy(update=values)
@@ -209,10 +215,9 @@ class RiseDiConfig(ControllerConfig):
         self,
         matrices: Callable[["RiseDiConfig", FloatArray], FloatArray],
         model: Callable[[FloatArray, FloatArray], Any],
-    ) -> OverSpeed | None:
-        """A model of the matrices at the trim speed and at the speeds of the schedule."""
-        if self.schedule is None or not self.schedule.models:
-            return None
+    ) -> OverSpeed:
+        """A model of the matrices at the trim speed and at the speeds of a schedule with models."""
+        assert self.schedule is not None  # noqa: S101 - for the type checker
         airspeed, (slow, fast) = self._airspeed(), self.schedule.models
         at_trim = matrices(self.model_copy(update={"schedule": None}), np.ones(len(self.outputs)))
         at_slow, at_fast = (
@@ -220,16 +225,24 @@ class RiseDiConfig(ControllerConfig):
         )
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
+    def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:
+        """The model of the feedforward over the airspeed, with leads and inputs of the model at the trim speed."""
+
+        def matrices(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
+            return nominal_side_by_side(config.known_nominal(), scale)
+
+        return self._over_speed(matrices, partial(nominal_of, at_trim))
+
+    def models(self) -> tuple[Any, ...]:
+        """Also the models at further speeds."""
+        return (*super().models(), () if self.schedule is None else self.schedule.models)
+
     def guard(self) -> GuardParams:
         """Also the models of the feedforward over the airspeed."""
         guard = super().guard()
-        if self.schedule is None or not self.schedule.models:
+        if guard.nominal is None or self.schedule is None or not self.schedule.models:
             return guard
-
-        def of_feedforward(config: RiseDiConfig, scale: FloatArray) -> FloatArray:
-            return nominal_side_by_side(config.known_nominal(), scale)
-
-        return guard._replace(over_speed=self._over_speed(of_feedforward, partial(nominal_of, self.known_nominal())))
+        return guard._replace(over_speed=self._nominal_over_speed(guard.nominal))
 
     def known_nominal(self) -> Nominal:
         """The arrays of the feedforward, where there is one."""
@@ -242,8 +255,11 @@ class RiseDiConfig(ControllerConfig):
         law = super().tuned_law()
         if self.schedule is None:
             return law
-        model = partial(observer_of, law.params)
-        over = self._over_speed(lambda config, scale: side_by_side(config.tuned_law().params, scale), model)
+        over = None
+        if self.schedule.models:
+            over = self._over_speed(
+                lambda config, scale: side_by_side(config.tuned_law().params, scale), partial(observer_of, law.params)
+            )
         speed, time = np.float64(self.schedule.speed), np.float64(self.schedule.time)
         return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
 

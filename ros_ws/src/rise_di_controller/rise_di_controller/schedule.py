@@ -8,7 +8,7 @@ law's own equations do not change. The models of a feedforward and of an observe
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -40,6 +40,11 @@ class OverSpeed(NamedTuple):
         """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
         return self.at(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
+
+    def of_each(self, scales: FloatArray) -> list[Any]:
+        """The models of T factors, (T, m), as from `of`, at once."""
+        d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
+        return [self.at(place) for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()]
 
 
 def over_speed(
@@ -130,8 +135,22 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
-    """Parameters of the extended law with the observer of the airspeed, if there is one; input_scale as at the trim."""
-    return params.law if params.observer is None else params.observer.of(scale)
+    """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer the models there."""
+    return _scaled(params.law if params.observer is None else params.observer.of(scale), scale)
+
+
+def _scaled(params: Any, scale: Array) -> Any:
+    """Parameters of the extended law with input_scale times `scale`."""
+    if isinstance(params, ObserverParams):
+        return params._replace(law=_scaled(params.law, scale))
+    return params._replace(input_scale=params.input_scale * scale)
+
+
+def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverParams]:
+    """The observers of some ticks, with the factors of input_scale there beside a schedule."""
+    if not isinstance(params, ScheduleParams):
+        return [params] * len(scales)
+    return [params.law] * len(scales) if params.observer is None else params.observer.of_each(np.array(scales))
 
 
 @lru_cache(maxsize=64)
@@ -145,41 +164,32 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
     estimates, of the same meaning at every speed, and u_o goes on to -F z at its own rate.
     """  # noqa: D400, D415 - what follows is an equation
 
-    def scaled(params: ScheduleParams, scale: Array) -> Any:
-        if isinstance(params.law, ObserverParams):
-            of_law = params.law.law
-            return params.law._replace(law=of_law._replace(input_scale=of_law.input_scale * scale))
-        return params.law._replace(input_scale=params.law.input_scale * scale)
-
-    def at(params: ScheduleParams, scale: Array) -> Any:
-        return scaled(params._replace(law=law_at(params, scale)), scale)
-
     def followed(state: ScheduleState, y: Array, dt: Array, params: ScheduleParams) -> ScheduleState:
         xp = array_namespace(y)
         part = xp.minimum(dt / params.time, 1.0 + 0.0 * dt)
         scale = state.scale + part * (target_scale(y, params) - state.scale)
-        return ScheduleState(law.retune(state.law, scaled(params, state.scale), scaled(params, scale)), scale)
+        return ScheduleState(law.retune(state.law, _scaled(params.law, state.scale), _scaled(params.law, scale)), scale)
 
     def engage(measured: Measurements, params: ScheduleParams) -> ScheduleState:
         scale = target_scale(measured.y, params)
-        return ScheduleState(law.engage(measured, at(params, scale)), scale)
+        return ScheduleState(law.engage(measured, law_at(params, scale)), scale)
 
     def step(state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams) -> tuple[ScheduleState, Array]:
         state = followed(state, measured.y, dt, params)
-        of_law, u = law.step(state.law, measured, dt, at(params, state.scale))
+        of_law, u = law.step(state.law, measured, dt, law_at(params, state.scale))
         return state._replace(law=of_law), u
 
     def limited(
         state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams, limits: Limits
     ) -> tuple[ScheduleState, Array, Array]:
         state = followed(state, measured.y, dt, params)
-        of_law, u_free, u = law.limited(state.law, measured, dt, at(params, state.scale), limits)
+        of_law, u_free, u = law.limited(state.law, measured, dt, law_at(params, state.scale), limits)
         return state._replace(law=of_law), u_free, u
 
     def retune(state: ScheduleState, old: ScheduleParams, new: ScheduleParams) -> ScheduleState:
-        return state._replace(law=law.retune(state.law, scaled(old, state.scale), scaled(new, state.scale)))
+        return state._replace(law=law.retune(state.law, _scaled(old.law, state.scale), _scaled(new.law, state.scale)))
 
     def missed(state: ScheduleState, measured: Measurements, params: ScheduleParams) -> ScheduleState:
-        return state._replace(law=law.missed(state.law, measured, at(params, state.scale)))
+        return state._replace(law=law.missed(state.law, measured, law_at(params, state.scale)))
 
     return ControlLaw(ScheduleState, engage, step, limited, retune, missed, inner=law)

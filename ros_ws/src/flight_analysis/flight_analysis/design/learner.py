@@ -8,12 +8,14 @@ refused with a sentence. The controller refuses parameters that fail its own che
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from itertools import chain, combinations, product
 from typing import NamedTuple
 
 import numpy as np
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_analysis.design.gain_selection import ChannelPairing
@@ -23,6 +25,7 @@ from flight_analysis.design.model_identification import (
     MAX_DEVIATION,
     MAX_WHITENESS,
     PRIOR,
+    Entry,
     Identification,
     Part,
     Unknown,
@@ -39,6 +42,8 @@ from rise_di_controller.rise_di import RiseDiConfig
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
 SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
+
+SPREAD = 0.02  # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4 %
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
 """The controller with the feedforward and the observer of a model. Raises ParameterError."""
@@ -72,6 +77,8 @@ class Learner:
         assert settings is not None  # noqa: S101 - for the type checker
         self._controller, self._rough, self._design = controller, airframe, design
         self._period, self._believed = 1.0 / controller.rate, rough
+        self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
+        self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
         self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
         self._record: deque[tuple[int, FloatArray, FloatArray]] = deque()
@@ -132,6 +139,13 @@ class Learner:
         controller fell back. Outputs that the controller took back, because they oscillated, are not proposed again. Where no
         part is left, nothing is identified, and the sentence says so once.
         """
+        try:
+            return self._proposal(flown)
+        except ParameterError as error:  # no steady airspeed, or no design
+            return Proposal(None, str(error))
+
+    def _proposal(self, flown: int) -> Proposal:
+        """The proposal of `propose`. Raises ParameterError where there is none."""
         end_ns = self._record[-1][0] if self._record else 0
         length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
@@ -182,10 +196,7 @@ class Learner:
             )
         if not sentences:
             return Proposal(None, "; ".join(refusals) or "each part flies the law of the start from before on")
-        try:
-            proposed = self._designed(model, known, gone)
-        except ParameterError as error:
-            return Proposal(None, str(error))
+        proposed = self._designed(model, known, gone)
         new = [*gone, *(part for part, value in known.items() if value.end_ns == end_ns)]
         self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
         self._known, self._model, self._dead = known, model, gone
@@ -229,22 +240,59 @@ class Learner:
         return due
 
     def _identified(self) -> Identification:
-        """A and B from the record, about the prior; the search begins at the model that flies too."""
+        """A and B from the record, about the prior; the search begins at the model that flies too.
+
+        Beside models at several speeds the record is of a steady speed, and so is the prior. The entries are reduced to the
+        trim speed. Raises ParameterError where the speed is not steady over SHORTEST.
+        """
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
-        found, flown = self.recording(), self.model
-        return identify(found, self._prior, self._actuation, channels, at_bound=AT_BOUND, unknown=unknown, flown=flown)
+        identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
+        if not self._has_speeds:
+            return identified(self.recording(), self._prior, flown=self.model)
+        found, ratio = self._steady(self.recording())
+        length = self._period * len(found.t)
+        expected = f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
+        require(length > SHORTEST - self._period, "airspeed", f"it steady over the last {length:.3g} s", expected)
+        flown = None if self.model is None else self._at_speed(self.model, ratio)
+        there = identified(found, self._at_speed(self._prior, ratio), flown=flown)
+        parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in there.parts)
+        return there._replace(parts=tuple(parts))
+
+    def _steady(self, recorded: Recording) -> tuple[Recording, float]:
+        """Beside models at several speeds: the steady end of a record, about the trim there, and the speed over V0."""
+        if not self._has_speeds:
+            return recorded, 1.0
+        found, ratio = steady_end(recorded, self._rough)
+        return about(found, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
+
+    def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
+        """A model at a speed of `_steady`."""
+        return at_speed(model, ratio, self._thrust) if self._has_speeds else model
+
+    def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
+        """Entries reduced to the trim speed: relative errors and deviations stay."""
+        powers, states = exponents(self._rough, self._thrust), list(self._rough.states)
+        columns, of = {"A": states, "B": list(self._rough.inputs)}, {"A": powers.A, "B": powers.B}
+        each = [ratio ** of[e.matrix][states.index(e.row), columns[e.matrix].index(e.column)].item() for e in entries]
+        return tuple(
+            entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)
+            for entry, factor in zip(entries, each, strict=True)
+        )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Tests of the parts whose window ended RECORD ago or earlier."""
+        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not steady over the test."""
         tested = {part: known for part, known in self._known.items() if part not in self._changed}
         old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
         if not old or self._believed.drift > DRIFT:
             return []
         deviation = {name: value for known in old.values() for name, value in known.deviation.items()}
-        recent = self.recording(end_ns - nanoseconds(RECORD))
+        whole = self.recording(end_ns - nanoseconds(RECORD))
+        recent, ratio = self._steady(whole)
+        if len(recent.t) < len(whole.t):
+            return []
         delays = {part: known.delay for part, known in old.items()}
-        changes = change_test(recent, self._model, self._actuation, deviation, delays)
+        changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, deviation, delays)
         return [change for change in changes if change.outputs in old]
 
     def _designed(
@@ -327,3 +375,24 @@ def sentence(found: Part) -> str:
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
     text = ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
     return text if all(entry.nominal for entry in found.entries) else f"{text}, with coupling"
+
+
+def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
+    """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
+
+    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then vary twice as much.
+    """
+    V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
+    known = np.isfinite(V)[::-1]
+    ratio = np.where(known, 1.0 + V[::-1], 0.0)
+    count = np.maximum(np.cumsum(known), 1)
+    mean = np.cumsum(ratio) / count
+    square = np.cumsum(ratio**2) / count - mean**2
+    length = int(np.flatnonzero(square <= (SPREAD * mean) ** 2)[-1]) + 1
+    first = len(V) - length
+    return recorded._replace(t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]), float(mean[length - 1])
+
+
+def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:
+    """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
+    return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

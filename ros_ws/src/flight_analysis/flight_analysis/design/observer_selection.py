@@ -213,6 +213,8 @@ def with_aircraft_observer(
         return selected
     slow, fast = (there.model(selected.relaxation).model_dump() for there in others[selected.place])
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
+    if controller.schedule is not None:
+        schedule["time"] = controller.schedule.time
     scheduled = RiseDiConfig.validate_mapping(selected.controller.model_dump() | {"schedule": schedule}, "controller")
     return selected._replace(controller=scheduled)
 
