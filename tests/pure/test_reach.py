@@ -88,9 +88,10 @@ def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
     # At a constant angle of attack the lift goes with V^2, so that 1 m/s more of V accelerates upwards with 2 g / V.
     sinks, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=-1.0)
     assert sinks.u_m[OWN.outputs.index("q")] == 0.0
-    assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == pytest.approx(0.25 * 1.0)
+    assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == pytest.approx(0.4 * 1.0)
     climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
     assert climbs.V_c - SPEED == pytest.approx(SPEED - sinks.V_c)
+    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == pytest.approx(1.2)  # m/s^2, of 1.2 rad/s
 
 
 def test_limits_are_said_once_and_end_with_the_model() -> None:

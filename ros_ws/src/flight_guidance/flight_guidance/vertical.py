@@ -13,8 +13,8 @@ STALL_ANGLE = 0.3
 """rad from zero lift, C_Lmax / C_Lalpha: 1.45 and 4.9 1/rad, of a clean wing of aspect ratio 7 by lifting-line theory."""
 
 
-CLIMB_BANDWIDTH = 0.25
-"""1/s, of the climb rate by the airspeed: a fifth of the reference model's bandwidth of V, which adds 24 deg of lag there."""
+CLIMB_BANDWIDTH = 0.4
+"""1/s, of the climb rate by the airspeed: a third of the osprey's bandwidth of V, which adds 37 deg of lag there."""
 
 
 class VerticalParams(NamedTuple):
