@@ -17,7 +17,7 @@ import numpy as np
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning import Proposal
-from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
+from flight_analysis.design.change_test import ANGLE, RECORD, Change, change_test
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import (
@@ -131,9 +131,10 @@ class Learner:
     def propose(self, flown: int) -> Proposal:
         """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
 
-        The last RECORD seconds are tested for a change of what flies. After one the older record is left out, and the model
-        that flew is the prior. A part with an input without effect flies the law of the start, without this input. Before the
-        first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken itself.
+        The last RECORD seconds are tested for a loss of effect of inputs. After a loss the older record is left out, and the
+        flown model is the prior. A part with an input without effect flies the law of the start, without this input.
+        Before the first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken
+        itself.
 
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
         controller fell back. Outputs that the controller took back, because they oscillated, are not proposed again. Where no
@@ -171,9 +172,7 @@ class Learner:
             for part, name in (gone if lost else dead).items()
             if name
         ]
-        sentences += [
-            f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}" for change in found if not change.dead
-        ]
+        sentences += [changed(change) for change in found if not change.dead]
         identified = self.identification = self._identified()
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
@@ -286,13 +285,12 @@ class Learner:
         old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
         if not old or self._believed.drift > DRIFT:
             return []
-        deviation = {name: value for known in old.values() for name, value in known.deviation.items()}
         whole = self.recording(end_ns - nanoseconds(RECORD))
         recent, ratio = self._steady(whole)
         if len(recent.t) < len(whole.t):
             return []
         delays = {part: known.delay for part, known in old.items()}
-        changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, deviation, delays)
+        changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         return [change for change in changes if change.outputs in old]
 
     def _designed(
@@ -312,10 +310,10 @@ class Learner:
 
 def unchanged(changes: Iterable[Change]) -> str:
     """The sentence of tests without a change."""
-    gains = ", ".join(f"{' and '.join(change.outputs)} {change.gain:.2g}" for change in changes)
-    if not gains:
+    effects = ", ".join(f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items())
+    if not effects:
         return "no identification is due, and no part is tested for a change"
-    return f"the aircraft has not changed: log-likelihood by a change {gains}, expected {MAX_GAIN:g}"
+    return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"
 
 
 def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
@@ -330,6 +328,13 @@ def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
     """Whether the outputs of a part are among those of another."""
     return set(part) <= set(whole)
+
+
+def changed(found: Change) -> str:
+    """The part that has changed, and its weakest input."""
+    name, left = min(found.left.items(), key=lambda effect: effect[1])
+    weakest = f"{name} has {100 * left:.0f} % of its effect"
+    return f"{' and '.join(found.outputs)} changed, log-likelihood {found.gain:.3g}: {weakest}"
 
 
 def explains(found: Part) -> bool:

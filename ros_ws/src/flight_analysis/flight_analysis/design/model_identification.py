@@ -221,7 +221,7 @@ class Search:
         self._units = units(self._model, coupled=coupled)
         of_A, of_B = map(np.count_nonzero, self._units)
         self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None  # theta, levels and innovations of `levels`
-        self.count = of_A + of_B  # of the entries that are identified
+        self.count = int(of_A + of_B)  # of the entries that are identified
         self.believe(np.repeat([PRIOR, unknown.effect], [of_A, of_B]))
 
     def believe(self, deviation: FloatArray) -> None:
