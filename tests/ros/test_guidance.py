@@ -33,6 +33,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
 from flight_guidance.modes import Lateral, Vertical
+from flight_guidance.reach import AUTHORITY
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
@@ -201,6 +202,17 @@ def test_target_without_channels_keeps_link(start: Start, peer_node: Peer, calm:
     made.until(lambda: made.last("age.link") < 0.1, made.target)
     made.until(lambda: made.last("mode.lateral") == Lateral.ORBIT)
     made.until(lambda: "no message of an operator for 1 s: home" in made.process.output)
+
+
+def test_learned_authority_limits_commands_and_a_bad_one_is_refused(flight: Flight) -> None:
+    def able(value: float) -> None:
+        channels = np.full(len(AUTHORITY), value)
+        flight.peer.publish("authority", to_message(time.time_ns(), AUTHORITY, channels, "/controller#1"))
+
+    flight.until(lambda: flight.last("authority.p") == 0.0, lambda: able(0.0))
+    assert "by the learned model no roll rate: p has no input with an effect" in flight.process.output
+    flight.until(partial(flight.peer.counted, "refused authority: bounds"), lambda: able(-1.0))
+    assert flight.last("authority.p") == 0.0
 
 
 def test_modes_of_second_controller_refused(flight: Flight) -> None:
