@@ -210,6 +210,14 @@ def test_short_record_is_refused() -> None:
     assert made.propose(0) == Proposal(None, "record: found 5.01 s, expected 10 s")
 
 
+def test_record_without_motion_and_noise_is_refused() -> None:
+    made = made_learner(scenario(learn={"updates": [10.0]}))
+    for k in range(1001):
+        made.take(k * 10_000_000, np.array([0.0, 0.01 * (k % 3), 0.0, 0.0]), np.zeros(4))
+    expected = "record: found a constant q, V, r, expected outputs that move, or the noise of their sensors"
+    assert made.propose(0) == Proposal(None, expected)
+
+
 def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pytest.MonkeyPatch) -> None:
     made, identified = made_learner(scenario(learn={"updates": [15.0]})), Mock(return_value=SimpleNamespace(parts=()))
     monkeypatch.setattr(design_learner, "identify", identified)

@@ -142,7 +142,7 @@ class Learner:
         """
         try:
             return self._proposal(flown)
-        except ParameterError as error:  # no steady airspeed, or no design
+        except ParameterError as error:  # no steady airspeed, no motion, or no design
             return Proposal(None, str(error))
 
     def _proposal(self, flown: int) -> Proposal:

@@ -36,6 +36,7 @@ from flight_analysis.design.innovation_filters import (
     filter_model,
     whole,
 )
+from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
@@ -591,10 +592,12 @@ def identify(
     Arguments: `airframe` the nominal one; `channels` in the law's order, whose D the model has to keep, by default the
     airframe's order; `at_bound` how many entries of a part may lie at their bound; `unknown` what else is identified; `flown`
     the model in flight, a further start of the search; `progress` is called with the steps `completed` of
-    the search, and their largest number `total`.
+    the search, and their largest number `total`. Raises ParameterError for an output that does not move.
     """
     model = filter_model(airframe, actuation, recorded)
     known = np.isfinite(recorded.y).all(axis=1) & (recorded.t >= recorded.t[0] + TRANSIENT)
+    still = [name for name, y in zip(airframe.outputs, recorded.y[known].T, strict=True) if not np.diff(y).any()]
+    require(not still, "record", f"a constant {', '.join(still)}", "outputs that move, or the noise of their sensors")
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every, done = blocks(model), count(1)
     starts = len(STARTS) + (flown is not None)
