@@ -377,8 +377,9 @@ def storm(topic: str, reason: str = "conflicting publisher") -> Injection:
 
 
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u": INPUTS}
-PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller", "u_m": "guidance"}
+PUBLISHERS = {"y": "aircraft", "y_m": "reference_model", "u": "controller", "u_m": "guidance", "proposal": "learner"}
 CONSUMERS = {"y": "controller", "y_m": "controller", "u": "aircraft", "u_m": "reference_model", "target": "guidance"}
+CONSUMERS["proposal"] = "controller"
 
 Names = tuple[str, ...]
 BadSample = tuple[float, Names, FloatArray]  # the offset of its stamp from the present, s; names; values
@@ -465,6 +466,30 @@ def relay(topic: str) -> Iterator[Callable[[JointState], None]]:
         stdin.close()
         process.popen.kill()
         process.end()
+
+
+def learner_killed(flight: Flight, random: Generator) -> None:
+    """The learner killed, and started again a second later."""
+    at_random(flight, random)
+    flight.begin_fault()
+    flight.kill("learner")
+    pause(flight, 1.0)
+    flight.start("learner")
+    flight.processes["learner"].wait_for("ready")
+    flight.end_fault()
+
+
+def second_learner(flight: Flight, random: Generator) -> None:
+    """A second learner, from its first proposal on, for two seconds."""
+    flight.processes["learner"].wait_for("no model")  # the publisher that is locked
+    until_refusal_logged_again(flight, "proposal", "conflicting publisher")
+    process = flight.node("learner")
+    process.wait_for("no model")
+    flight.begin_fault()
+    pause(flight, 2.0)
+    process.popen.terminate()
+    assert process.end() == 0, process.output
+    flight.end_fault()
 
 
 def second(role: str, topic: str) -> Injection:
@@ -648,6 +673,7 @@ CONTROLLER: dict[str, Any] = {"victim": "controller", "needs": ("aircraft",)}
 GUIDANCE: dict[str, Any] = {"victim": "guidance", "needs": ("reference_model", "aircraft")}
 RECORDER: dict[str, Any] = {"victim": "recorder"}
 GUIDED: dict[str, Any] = {"kind": Kind.GUIDED, "in_suite": False}
+LEARNING: dict[str, Any] = {"kind": Kind.LEARNING, "in_suite": False}
 POSE_GATE: dict[str, Any] = {"victim": "gate", "needs": ("guidance",)}
 POSE_BENCHMARK = GUIDED | POSE_GATE
 
@@ -722,5 +748,9 @@ CASES = (
     Case("pose frozen, new stamps", pose_fault("freeze", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
     Case("pose stale", pose_fault("hold", POSE_IS_BACK), *STALE_POSE, **POSE_BENCHMARK),
     Case("pose jumping", pose_fault("jump"), None, response=Response.WITHIN_LIMITS, **POSE_BENCHMARK),
+    Case("learner killed", learner_killed, None, **LEARNING, victim="learner"),
+    Case("learner stopped", stop("learner"), None, **LEARNING, victim="learner"),
+    Case("second learner", second_learner, conflicting("proposal", "learner"), 0.02, **LEARNING, needs=ends_of("proposal")),
+    Case("storm on proposal", storm("proposal"), conflicting("proposal", "foreign"), **LEARNING, needs=ends_of("proposal")),
     Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED, in_suite=False),
 )

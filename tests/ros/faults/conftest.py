@@ -13,7 +13,7 @@ from tests.ros.faults.draws import Draw, draw, found
 from tests.ros.faults.flight import Flight, Kind
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario
+from flight_bringup.scenarios import find_scenario, written
 
 Row = dict[str, str | int | float | bool | None]
 LINES = 12  # of an error in a row: what failed, and the first output of a process that did not answer
@@ -134,7 +134,10 @@ def flights(tmp_path_factory: pytest.TempPathFactory, pytestconfig: pytest.Confi
     plain = find_scenario(str(pytestconfig.getoption("--faults-scenario", "osprey_gust")))
     guided = find_scenario(str(pytestconfig.getoption("--faults-guided", "osprey_route")))
     bridged = find_scenario("osprey_observer")
-    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided, Kind.BRIDGED: bridged}
+    # a proposal a second, from 3 s on
+    learning = find_scenario("osprey_learn").vary(controller={"learn": {"updates": [3.0], "check": 1.0, "latency": 1.0}})
+    learning = written(learning, tmp_path_factory.mktemp("learning") / "learn.yaml")
+    scenarios = {Kind.PLAIN: plain, Kind.OWN_CLOCK: plain, Kind.GUIDED: guided, Kind.BRIDGED: bridged, Kind.LEARNING: learning}
     made = Flights(tmp_path_factory.mktemp("faults"), scenarios)
     yield made
     made.close()

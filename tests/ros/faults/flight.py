@@ -33,7 +33,7 @@ from tests.ros.conftest import Process, logged
 from tests.ros.peer import peer
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_bringup.graph import AIRCRAFT, BRIDGE, CONTROLLER, GUIDANCE, RECORDER, REFERENCE_MODEL
+from flight_bringup.graph import AIRCRAFT, BRIDGE, CONTROLLER, GUIDANCE, LEARNER, RECORDER, REFERENCE_MODEL
 from flight_core.modes import Mode
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.vectors import FloatArray, StampedVector
@@ -50,15 +50,19 @@ class Kind(Enum):
     PLAIN = "four nodes and a profile of commands"
     OWN_CLOCK = "the same, with a clock that can be set"
     GUIDED = "guidance beside them"
+    LEARNING = "a learner beside the four; without noise of sensors it refuses each record"
     BRIDGED = "the bridge and a simulated autopilot in place of the aircraft"
 
 
-MODULES = {node.executable: node.module for node in (RECORDER, CONTROLLER, AIRCRAFT, REFERENCE_MODEL, GUIDANCE, BRIDGE)}
+MODULES = {
+    node.executable: node.module for node in (RECORDER, CONTROLLER, AIRCRAFT, REFERENCE_MODEL, GUIDANCE, LEARNER, BRIDGE)
+}
 FOUR: tuple[str, ...] = ("recorder", "controller", "aircraft", "reference_model")
 ROLES = {
     Kind.PLAIN: FOUR,
     Kind.OWN_CLOCK: FOUR,
     Kind.GUIDED: (*FOUR, "guidance"),
+    Kind.LEARNING: (*FOUR, "learner"),
     Kind.BRIDGED: ("recorder", "controller", "reference_model", "autopilot", "bridge"),
 }
 OUTPUTS, INPUTS = ("q", "p", "r", "V"), ("elevator", "aileron", "rudder", "thrust")
@@ -330,6 +334,8 @@ class Flight:
             return self._run("tests.ros.autopilot", str(self.scenario), str(RELEASE_AFTER), cwd=REPOSITORY)
         if role == "bridge":
             parameters = (f"map:={fast_map(self.folder)}", "dry_run:=false")
+        if role == "learner":
+            parameters = (f"scenario_file:={self.scenario}",)
         words = [word for parameter in parameters for word in ("-p", parameter)]
         if role == "aircraft" and self.gate is not None:
             words += ["-r", f"{POSE.name}:={TRUE_POSE.name}"]

@@ -28,11 +28,13 @@ from flight_ros.messages import Encoder, NamedDecoder
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Ticker
-from flight_ros.topics import PUBLISH, TARGET, U_M, Y_M, Topic, U, Y
+from flight_ros.topics import PROPOSAL, PUBLISH, TARGET, U_M, Y_M, Topic, U, Y
 
 OUTPUTS = ("q", "V", "p", "r")  # of `target` V alone is a channel: its storm is refused
 NAMES = {"y": OUTPUTS, "y_m": OUTPUTS, "u_m": OUTPUTS, "target": OUTPUTS, "u": ("elevator", "aileron", "rudder", "thrust")}
-SUBSCRIBERS = 3  # the node that uses the topic, the recorder, the probe
+NAMES["proposal"] = OUTPUTS  # no proposal but for its header, by which it is refused
+SUBSCRIBERS = dict.fromkeys(NAMES, 3) | {"target": 2, "proposal": 1}
+"""The node that uses the topic, the recorder, the probe. The probe publishes `target`; only the controller takes `proposal`."""
 BURST_NS = 1_000_000  # a thousand bursts a second: the sleep of Python cannot time single messages at 10 kHz
 REPORT_PERIOD = 10.0  # s, of the lines that report missing subscribers
 
@@ -44,8 +46,8 @@ def matched_publisher(topic: str) -> Iterator[Publisher]:
     context = Context()
     rclpy.init(context=context)
     node = Node("foreign", context=context)
-    kind = {endpoint.name: endpoint for endpoint in (Y, Y_M, U, U_M, TARGET)}[topic]
-    subscribers = SUBSCRIBERS - (kind is TARGET)  # the probe publishes it
+    kind = {endpoint.name: endpoint for endpoint in (Y, Y_M, U, U_M, TARGET, PROPOSAL)}[topic]
+    subscribers = SUBSCRIBERS[topic]
     publisher = node.create_publisher(kind.type, kind.name, PUBLISH)
     report = time.monotonic() + REPORT_PERIOD
     while publisher.get_subscription_count() < subscribers:
