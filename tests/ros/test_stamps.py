@@ -21,6 +21,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_guidance.node import GuidanceNode
+from flight_guidance.reach import AUTHORITY
 from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Encoder
@@ -45,10 +46,10 @@ LIMITS = {
     "controller": {"y": CONTROLLER_AGE, "y_m": CONTROLLER_AGE},
     "aircraft": {"u": U_AGE},
     "reference_model": {"u_m": U_M_AGE},
-    "guidance": {"y": GUIDANCE_AGE, "pose": GUIDANCE_AGE, "target": GUIDANCE_AGE, "internals": GUIDANCE_AGE},
+    "guidance": dict.fromkeys(("y", "pose", "target", "internals", "authority"), GUIDANCE_AGE),
 }
 """Age limits, s, by node and topic."""
-LOCKSTEP_UNBOUNDED = {"target"}  # an operator has the system clock, not the flight time
+LOCKSTEP_UNBOUNDED = {"target", "authority"}  # an operator has the system clock; the last `authority` before a step is awaited
 WITHOUT_STAMP = {"clock", "recorded", "route"}  # the flight time, the end of the log, a plan
 NAMES = {
     "y": SCENARIO.controller.outputs,
@@ -58,6 +59,7 @@ NAMES = {
     "pose": POSE,
     "target": ("heading",),
     "internals": ("mode",),
+    "authority": AUTHORITY,
 }
 
 
