@@ -17,6 +17,7 @@ the other flights that learn are flown again over topics, recorded, and compared
 
 import csv
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -76,6 +77,7 @@ ALARM_FLIGHT = 600.0  # s
 COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
 LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
 PALETTE = 32  # colours of the picture
+DOMAINS = 100  # domains 1 to 100: below the ephemeral ports on every system
 RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "lqg", "rise_observer"), "gust_turbulence"
 """Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file in the loop of osprey_servo.
 MRAC measures the full state, and INDI the actuators too."""
@@ -270,6 +272,7 @@ def fly(name: str, number: int, chosen: Scenario, *, lockstep: bool) -> Learned:
 
 def equals_in_lockstep(tape: Tape, chosen: Scenario) -> bool:
     """Whether a flight over topics in lockstep records the same samples to the byte, and replays to the bit."""
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % DOMAINS)  # the processes of the benchmark fly side by side
     with TemporaryDirectory() as folder:
         run = Path(folder, "run")
         outcome = fly_over_topics(written(chosen, Path(folder, "flown.yaml")), run, lambda *_: None, lockstep=True)
