@@ -296,6 +296,13 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
 
 
+@pytest.mark.parametrize(("error", "acts"), [(-0.18, True), (-0.6, False)])
+def test_input_is_dead_only_without_effect_with_a_free_too(error: float, acts: bool) -> None:
+    """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test, and 82 % with A free."""
+    vague = Entry("B", "p", "rudder", -9.7, -error - 0.7, 0.11, -9.7)
+    assert design_learner.has_effect([vague, Entry("B", "r", "rudder", -9.7, error, 0.01, -9.7)], "rudder") is acts
+
+
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     white, flown = Prediction(np.ones(2), np.ones(2), 1.0), load_airframe("osprey")
     effects = Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)

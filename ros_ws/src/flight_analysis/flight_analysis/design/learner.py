@@ -166,14 +166,15 @@ class Learner:
             self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
             self._prior = self._model
             self._changed |= {change.outputs for change in found}
+        identified = self.identification = self._identified()
+        dead = {part: name for part, name in dead.items() if not has_effect(identified.entries, name)}
         gone = self._dead | dead
         sentences = [
             f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
             for part, name in (gone if lost else dead).items()
             if name
         ]
-        sentences += [changed(change) for change in found if not change.dead]
-        identified = self.identification = self._identified()
+        sentences += [changed(change) for change in found if change.outputs not in dead]
         known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
         refusals = []
         for part in identified.parts:
@@ -323,6 +324,15 @@ def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> 
     names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
     values = tuple(abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True))
     return designed.model_copy(update={"feedforward": model.model_copy(update={"deviation": values})})
+
+
+def has_effect(entries: Iterable[Entry], name: str) -> bool:
+    """Whether the identified entries keep half of the best known effect of an input.
+
+    The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not.
+    """
+    effects = [entry for entry in entries if entry.matrix == "B" and entry.column == name and entry.nominal]
+    return min(effects, key=lambda entry: entry.deviation).error > -0.5
 
 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
