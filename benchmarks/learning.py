@@ -568,9 +568,9 @@ def plot(rows: Sequence[Row]) -> Figure:
             axis.plot([place - 0.35, place + 0.35], [np.nanmean(values)] * 2, color=colour, linewidth=2.2)
         axis.set_xticks(range(len(columns)), list(columns), fontsize=7)
         axis.set_title(f"A and B +-{100 * uncertainty:g} %: score", fontsize=10, loc="left")
-        axis.set_ylim(bottom=0.0)
         axis.grid(axis="y", color="#dddddd", linewidth=0.6)
         axis.spines[["top", "right"]].set_visible(False)
+    axis.set_ylim(bottom=0.0)  # of both panels, once all points are drawn: it ends the automatic limits
     return figure
 
 
