@@ -357,6 +357,7 @@ def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSe
     request = {"topic": "/ap/request", "type": "std_msgs/msg/UInt8", "rate": 5.0, "stamped": False}
     requests = {"enter": request | {"when": "engaging"}, "leave": request | {"when": "release"}}  # as with the map of PX4
     qos = {"reliability": "reliable", "durability": "volatile", "depth": 1}
+    setup.change_age_limits(1e3)  # a delay of the host does not end the request before
     setup.change_map(conditions={"guided": condition}, engage_timeout=1e3)
     setup.change_map("messages", **requests)
     setup.change_map("topics", **{"/ap/mode": qos, "/ap/request": qos})
@@ -370,10 +371,10 @@ def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSe
 
     client = start("flight_cli.cli", "engage")
     waiting = "waiting: the mode is not guided (data is 10)"
-    setup.peer.until(lambda: any(waiting in line for line in client.lines), each=command)
+    setup.peer.until(lambda: waiting in client.output or client.popen.poll() is not None, each=command)
     client.interrupt()
     setup.peer.until(lambda: client.popen.poll() is not None, each=command)
-    assert client.end() == 130
+    assert client.end() == 130, client.output
     assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in bridge.lines)
 
 

@@ -59,7 +59,8 @@ def osprey(tmp_path: Path) -> Path:
 
 
 def test_second_publisher_and_command_beyond_bound_refused(osprey: Path, start: Start, peer_node: Peer) -> None:
-    process = start("reference_model.main", "--ros-args", "--params-file", str(osprey))
+    patient = ("-p", "live.max_age:=1000.0")  # a delay of the host does not level the wings, which rolls to the left
+    process = start("reference_model.main", "--ros-args", "--params-file", str(osprey), *patient)
     place = OUTPUTS.index("p")
 
     def rolls() -> list[float]:
