@@ -186,6 +186,29 @@ def test_proposal_that_loses_the_race_during_its_certificate_is_refused() -> Non
     assert flight.sentences[0].endswith("they changed meanwhile")
 
 
+def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step()
+    beside = flight.controller.parameters
+    assert isinstance(beside, RiseDiConfig)
+    flight.now_ns += 10 * NANOSECONDS
+    monkeypatch.setattr(flight.controller, "diverges", lambda: True)
+    flight.step(1)
+    monkeypatch.undo()
+    assert flight.controller.digest == START.digest()
+    of_q = [name in {"elevator", "thrust"} for name in START.inputs]
+    held = designed(START, with_channels_of(START, beside, of_q, [name == "elevator" for name in START.inputs]))
+    flight.receive(flown=beside.digest())  # a model alone: the law fell back because of one
+    flight.receive(held, flown=beside.digest() + 1)
+    assert [sentence.endswith("they changed meanwhile") for sentence in flight.sentences[-2:]] == [True, True]
+    flight.receive(held, flown=beside.digest())
+    flight.step()
+    assert flight.sentences[-1] == "flies model"
+    assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
+    assert flight.controller.parameters.input_scale[START.inputs.index("elevator")] < 1e-6  # the law moves it no more
+
+
 def test_second_and_late_proposals_are_refused() -> None:
     flight = Flight()
     flight.receive()

@@ -56,6 +56,21 @@ AUTHORITY_TICKS = 10
 """Ticks of the controller from one sample of `authority` to the next."""
 
 
+class Fallback(NamedTuple):
+    """A fallback to the law of the start in all parts."""
+
+    flown: int  # digest of the parameters before
+    input_scale: tuple[float, ...]  # of these
+    fallen: int  # digest of the parameters after
+
+    def outlived_by(self, proposal: Proposal, flown: int) -> bool:
+        """Whether a proposal beside the parameters before holds an input more, one without effect, and nothing else changed."""
+        scale = proposal.change.get("input_scale")
+        if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
+            return False
+        return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
+
+
 class Updates:
     """When identifications and tests begin: at the first tick at or after each of the times, counted from the first tick."""
 
@@ -93,6 +108,7 @@ class Learning:
         self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
         self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
+        self._fallback: Fallback | None = None  # the last one
 
     def authority(self, controller: Controller) -> FloatArray:
         """`authority` of what flies."""
@@ -140,6 +156,7 @@ class Learning:
         elif controller.diverges():
             taken = given_up(self._start, self._start, outputs_without(controller.parameters))
             what = "falls back to the law of the start: it diverges"
+            self._fallback = Fallback(controller.digest, controller.parameters.input_scale, taken.digest())
             self._take(controller, now_ns, prepared(taken), what)
         return taken
 
@@ -186,7 +203,7 @@ class Learning:
         if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
             later = f"one that ends at least {seconds(self._spacing_ns):g} s after that of the last proposal"
             return f"found {window}, expected {later}"
-        return _unfit(proposal, controller)
+        return self._unfit(proposal, controller)
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
@@ -205,7 +222,7 @@ class Learning:
                 next(certificate)
         except StopIteration as end:
             self._certificate = None
-            refusal = _unfit(proposal, controller)
+            refusal = self._unfit(proposal, controller)
             if not refusal:
                 without = outputs_without(end.value.parameters)
                 what = f"{FLIES} {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
@@ -221,19 +238,23 @@ class Learning:
         self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
         return None
 
+    def _unfit(self, proposal: Proposal, controller: Controller) -> str:
+        """The refusal of a proposal for a law that is not engaged, or that lost the race with another change; else empty.
+
+        An input that has lost its effect has none after a fallback either, which its loss may have caused.
+        """
+        if controller.mode is not Mode.ENGAGED:
+            return f"found the mode {controller.mode.name}, expected a model only while the law is engaged"
+        if proposal.flown == controller.digest:
+            return ""
+        if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
+            return ""
+        return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
+
     def _take(self, controller: Controller, now_ns: int, new: Prepared, sentence: str) -> None:
         change = changes(controller.parameters, new.parameters)
         controller.retune(new)
         self._announce(Event(now_ns, change, sentence))
-
-
-def _unfit(proposal: Proposal, controller: Controller) -> str:
-    """The refusal of a proposal for a law that is not engaged, or that lost the race with another change; else empty."""
-    if controller.mode is not Mode.ENGAGED:
-        return f"found the mode {controller.mode.name}, expected a model only while the law is engaged"
-    if proposal.flown == controller.digest:
-        return ""
-    return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
 
 
 def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
