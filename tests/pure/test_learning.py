@@ -315,6 +315,28 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     assert design_learner.weaker(part._replace(entries=near), flown) == ""
 
 
+def test_weaker_effect_replaces_that_of_the_file_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file has been measured by nobody: one with an elevator that was a third too strong refused each model in gusts."""
+    chosen = scenario(learn={"updates": [10.0, 11.0, 12.0], "latency": 0.0})
+    made, white = made_learner(chosen), Prediction(np.ones(2), np.ones(2), 1.0)
+    better, thrust = white._replace(log_likelihood=2.0), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)
+    found = []
+    for error, after in ((0.0, white), (-0.3, better), (-0.5, better)):
+        effects = Entry("B", "q", "elevator", 56.1499, error, 0.02, 56.1499), thrust
+        found.append(Part(("elevator", "thrust"), ("q", "V"), effects, white, after, "", 0.0, gusts=True))
+    identified = Mock(side_effect=[SimpleNamespace(parts=(part,)) for part in found])
+    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(made, "_design", lambda *_: chosen.rise_di())
+    sentences = []
+    for k in range(1201):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        if k in {1000, 1100, 1200}:
+            sentences.append(made.propose(made._proposed).sentence)
+    assert sentences[0] == "q and V of the airframe osprey as it is"
+    assert sentences[1].startswith("B[q, elevator] -30 +- 2 %")
+    assert sentences[2].startswith("B[q, elevator]: found 71 % of that of the model that flies")
+
+
 def test_flight_without_learner_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"^controller\.learn: found a flight without a learner"):
         simulate(scenario())

@@ -55,6 +55,7 @@ class Known(NamedTuple):
     end_ns: int  # of its window
     deviation: Mapping[str, float]  # of its entries by name, 1
     delay: float  # of its inputs, s
+    is_rough: bool  # that of the rough airframe as it is
 
 
 class Learner:
@@ -181,7 +182,8 @@ class Learner:
             if any(is_within(part.outputs, without) or is_within(without, part.outputs) for without in gone):
                 continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
-            before = model if part.outputs in known.keys() - self._changed and not lost else None
+            learned = {outputs for outputs, of_part in known.items() if not of_part.is_rough} - self._changed
+            before = model if part.outputs in learned and not lost else None
             of_flight = "" if rough else part.refusal or not_white(part) or weaker(part, before)
             if refusal := uncoupled(part, known) or of_flight:
                 refusals.append(refusal)
@@ -190,7 +192,7 @@ class Learner:
             model = with_entries(model, entries)
             deviation = {entry.name: abs(entry.deviation * entry.unit / entry.value) for entry in entries if entry.value}
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(end_ns, deviation, self._actuation.delay if rough else part.delay)
+            known[part.outputs] = Known(end_ns, deviation, self._actuation.delay if rough else part.delay, rough)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
             )
