@@ -316,7 +316,7 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
 
 
 def test_weaker_effect_replaces_that_of_the_file_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The file has been measured by nobody: one with an elevator that was a third too strong refused each model in gusts."""
+    """No flight has measured the file: one with an elevator that was a third too strong refused each model in gusts."""
     chosen = scenario(learn={"updates": [10.0, 11.0, 12.0], "latency": 0.0})
     made, white = made_learner(chosen), Prediction(np.ones(2), np.ones(2), 1.0)
     better, thrust = white._replace(log_likelihood=2.0), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)
