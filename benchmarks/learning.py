@@ -16,6 +16,7 @@ the other flights that learn are flown again over topics, recorded, and compared
 """
 
 import csv
+import json
 import math
 import os
 import sys
@@ -38,6 +39,7 @@ from PIL import Image
 from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.plant import Drift
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, sampled_matrices, wind_factors
 from control_laws.catalogue import LAWS
@@ -49,6 +51,7 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario, written
 from flight_campaign import fleet, tuning
+from flight_campaign.fleet import Fleet
 from flight_campaign.learning import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_campaign.tuned_gains import load, tuned_file
@@ -68,6 +71,8 @@ REPOSITORY = Path(__file__).parents[1]
 IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
 SEED = 11  # of the aircraft
 LEARNED, DAMAGED, SETTLED, END = 64.0, 60.0, 75.0, 100.0  # s: when the last model flies; the fault, and what counts after it
+WINDOWS = ((0.0, 14.0), (14.0, 30.0), (30.0, DAMAGED), (DAMAGED, SETTLED), (SETTLED, END))
+"""s, of a flight with damage: before the first model, with the first ones, learned, from the damage on, and learned again."""
 UPDATE = 1.0  # s, of a core, for the two parts of the osprey
 LATE, MARGIN, WITHIN = 0.02, 0.03, 1.1  # s, s; a score within 10 % of that of the true model
 REPEATED = 35.0  # s, after which the commands of osprey_learn come again
@@ -144,6 +149,7 @@ class Row(NamedTuple):
     longest: float = 0.0  # s of a core, the same
     replayed: int = 0
     lockstep: float = math.nan  # 1: equal to the byte in lockstep; NaN where not flown
+    windows: str = ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
     events: str = ""
     revision: str = ""  # of the code that flew
 
@@ -192,13 +198,13 @@ def evaluation(flown: Scenario) -> Scenario:
     return shipped.vary(aircraft=aircraft, reference_model={"rate": 100.0})
 
 
-def score(tape: Tape, first: float = 0.0, without: Sequence[str] = ()) -> float:
+def score(tape: Tape, first: float = 0.0, without: Sequence[str] = (), end: float = math.inf) -> float:
     """Sum over the outputs of the true rms error in units of a score; infinite for a flight that ended early."""
     if tape.outcome != COMPLETED:
         return math.inf
     y_m, truth, t = tape["y_m"], tape["truth"], tape.time("y_m")
     outputs = tuple(name for name in y_m.names if name not in without)
-    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[t >= first]
+    e = np.stack([truth[f"x.{name}"] - y_m[name] for name in outputs], axis=1)[(t >= first) & (t < end)]
     return float(np.sum(np.sqrt(np.mean(e**2, axis=0)) / score_units(outputs, load_airframe("osprey").units_of_outputs())))
 
 
@@ -389,7 +395,21 @@ def damage(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
     without = {"elevator": "q", "aileron": "p", "rudder": "r"}.get(dead, "")
     found: dict[str, Any] = {key: score(tape, SETTLED, (without,)) for key, tape in (tapes | {"learner": flown.tape}).items()}
     lost = int(found["learner"] > LOSS_OF_TRACK_SCORE >= found["alone"])
-    return flown.row._replace(**found, dead=dead, lost=lost)
+    windows = "" if dead else json.dumps(over_windows(tapes | {"learner": flown.tape}, chosen, aircraft))
+    return flown.row._replace(**found, dead=dead, lost=lost, windows=windows)
+
+
+def over_windows(tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe) -> dict[str, list[float]]:
+    """Scores over WINDOWS; those of the true model until the damage with the model of the aircraft as it was."""
+    found = {key: [score(tape, first, (), end) for first, end in WINDOWS] for key, tape in tapes.items()}
+    before = designed(start_of(chosen), chosen, aircraft)
+    if "true" in found and before is not None:
+        whole = simulate(chosen.vary(controller=before))
+        found["true"] = [
+            score(whole, first, (), end) if end <= DAMAGED else value
+            for (first, end), value in zip(WINDOWS, found["true"], strict=True)
+        ]
+    return found
 
 
 def alarms(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
@@ -500,11 +520,21 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
         ratio = np.mean([each.learner for each in chosen]) / np.mean([each.true for each in chosen])
         yield row(f"{name}: mean over that of the true model", float(ratio), at_most=1.05)
         yield row(f"{name}: share found to have changed", float(np.mean([each.alarms > 0 for each in chosen])))
+        flown = [json.loads(each.windows) for each in chosen]
+        for key, label in LABELS.items():
+            yield from window_figures(name, label, np.array([each[key] for each in flown if key in each]))
         return
     right = [each.found == each.dead and each.found_at <= SETTLED for each in chosen]
     yield row(f"{name}: share found within {SETTLED - DAMAGED:.0f} s", float(np.mean(right)), at_least=0.95)
     wrong = [each.found not in {"", each.dead} for each in chosen]
     yield row(f"{name}: another input found", float(sum(wrong)), at_most=0.0)
+
+
+def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence_data.Row]:
+    """Mean scores over WINDOWS of the flights to the end, of scores (N, W)."""
+    whole = values[np.isfinite(values).all(axis=1)]
+    for (first, end), mean in zip(WINDOWS, whole.mean(axis=0) if len(whole) else (), strict=bool(len(whole))):
+        yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
 
 
 def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
@@ -547,6 +577,41 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         yield row(f"{subject}: largest score, {law.title}", float(np.max(in_time)))
         lost = float(np.mean(delayed > LOSS_OF_TRACK_SCORE))
         yield row(f"{subject}: share lost with u {1e3 * LATE:.0f} ms late, {law.title}", lost)
+
+
+def damaged_rival_figures(name: str, numbers: Sequence[int]) -> Iterator[evidence_data.Row]:
+    """Scores over WINDOWS of the laws of RIVALS, with the aircraft, wind, noise and damage of the cell `name`."""
+    brief = learning(CELLS[name], 0, 0.1)
+    model = tuning.build_benchmark(brief.vary(controller=start_of(brief))).model  # of the airframe file: one for all aircraft
+    tuned = load(tuned_file(find_scenario("osprey_servo")))
+    rivals = {
+        law: (LAWS[law].control_law(model), LAWS[law].params(tuning.as_gains(tuned[law][OBJECTIVE]), model)) for law in RIVALS
+    }
+    found = {law: list[FloatArray]() for law in RIVALS}
+    for number in numbers:
+        flights, benchmark = damaged_flight(learning(CELLS[name], number, END))
+        ends = tuple(round(end / benchmark.model.period) for _, end in WINDOWS[:-1])
+        for law, (control_law, params) in rivals.items():
+            course = benchmark.courses[tuning.GUST][LAWS[law].feedforward]
+            flown = fleet.fly(flights, benchmark.vehicle, course, control_law, params, windows=ends)
+            scores_of_law = np.sum(np.asarray(flown.windows)[:, :, 0] / benchmark.unit, axis=1)
+            found[law].append(np.where(np.asarray(flown.diverged)[0], math.inf, scores_of_law))
+    for law, values in found.items():
+        yield from window_figures(f"rivals, {name}", LAWS[law].title, np.array(values))
+        lost = float(np.sum(np.array(values)[:, -1] > LOSS_OF_TRACK_SCORE))
+        yield row(f"rivals, {name}: lost, {LAWS[law].title}", lost)
+
+
+def damaged_flight(chosen: Scenario) -> tuple[Fleet, tuning.Benchmark]:
+    """The aircraft of a scenario whose elevator and aileron lose half of their effect, alone in a fleet, and its benchmark."""
+    benchmark = tuning.build_benchmark(chosen.vary(controller=start_of(chosen)))
+    aircraft = chosen.aircraft.sampled_airframe()
+    A, B = aircraft.matrix_a()[None], aircraft.matrix_b()[None]
+    left = np.array([WEAK if key in {"elevator", "aileron"} else 1.0 for key in aircraft.inputs])
+    wind = np.ones((len(aircraft.states), len(aircraft.gusts)))
+    fault = Drift(DAMAGED, 0.0, np.ones_like(A[0]), np.ones_like(B[0]) * left, wind)
+    benchmark = benchmark._replace(plant=benchmark.plant._replace(drift=fault))
+    return tuning.benchmark_fleet(A, B, 0, tuning.GUST, benchmark), benchmark
 
 
 def plot(rows: Sequence[Row]) -> Figure:
@@ -616,6 +681,8 @@ def main(
     found, airs = list(figures(rows)), [name for name in CELLS if CELLS[name].kind == "learn"]
     for uncertainty in sorted({CELLS[name].uncertainty for name in airs if name in whole}):
         found += rival_figures(uncertainty, range(aircraft))
+    if "weak" in whole:
+        found += damaged_rival_figures("weak", range(count("weak", aircraft)))
     for each in found:
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
     if found:
