@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from aircraft_sim.airframe import load_airframe
+from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.learning import Proposal
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import learner as design_learner
+from flight_analysis.design.change_test import Change
 from flight_analysis.design.learner import Learner
 from flight_analysis.design.model_identification import Entry, Part, Prediction
 from flight_analysis.metrics import errors_by_model
@@ -296,11 +297,29 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
 
 
-@pytest.mark.parametrize(("error", "acts"), [(-0.18, True), (-0.6, False)])
-def test_input_is_dead_only_without_effect_with_a_free_too(error: float, acts: bool) -> None:
+@pytest.mark.parametrize(
+    ("gain", "sentence"),
+    [
+        (1.0, "p and r changed, log-likelihood 10: rudder has 5 % of its effect"),
+        (-1.0, "rudder has no effect: p and r without it"),
+    ],
+)
+def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
+    gain: float, sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An aircraft whose A was wrong had a rudder with 13 % of its effect by the test, and 82 % with A free."""
-    vague = Entry("B", "p", "rudder", -9.7, -error - 0.7, 0.11, -9.7)
-    assert design_learner.has_effect([vague, Entry("B", "r", "rudder", -9.7, error, 0.01, -9.7)], "rudder") is acts
+    made, start = made_learner(scenario()), scenario().rise_di()
+
+    def identified(_: Any, prior: Airframe, **__: Any) -> SimpleNamespace:
+        with_rudder = abs(prior.matrix_b()[prior.index("r"), list(prior.inputs).index("rudder")]) > 0.1
+        return SimpleNamespace(parts=(), after=SimpleNamespace(log_likelihood=gain * with_rudder))
+
+    monkeypatch.setattr(design_learner, "identify", identified)
+    change = Change(("p", "r"), 10.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
+    monkeypatch.setattr(made, "_changes", lambda _: [change])
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+    assert made.propose(start.digest()).sentence.startswith(sentence)
 
 
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:

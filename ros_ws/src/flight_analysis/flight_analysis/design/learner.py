@@ -41,6 +41,7 @@ from rise_di_controller.rise_di import RiseDiConfig
 
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
+FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
 SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
 
 SPREAD = 0.02  # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4 %
@@ -168,7 +169,7 @@ class Learner:
             self._prior = self._model
             self._changed |= {change.outputs for change in found}
         identified = self.identification = self._identified()
-        dead = {part: name for part, name in dead.items() if not has_effect(identified.entries, name)}
+        dead = {part: name for part, name in dead.items() if not self._acts(name, identified)}
         gone = self._dead | dead
         sentences = [
             f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
@@ -241,8 +242,15 @@ class Learner:
                 self._planned.append(last + self._window_ns)
         return due
 
-    def _identified(self) -> Identification:
-        """A and B from the record, about the prior; the search begins at the model that flies too.
+    def _acts(self, name: str, identified: Identification) -> bool:
+        """Whether an identified model predicts the held-out samples better than one that is identified without an input.
+
+        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not.
+        """
+        return identified.after.log_likelihood > self._identified(without=name).after.log_likelihood
+
+    def _identified(self, without: str = "") -> Identification:
+        """A and B from the record, about the prior, `without` the effect of an input; also from the model that flies on.
 
         Beside models at several speeds the record is of a steady speed, and so is the prior. The entries are reduced to the
         trim speed. Raises ParameterError where the speed is not steady over SHORTEST.
@@ -250,14 +258,17 @@ class Learner:
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
         identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
+        prior, model = self._prior, self.model
+        if without:
+            prior, model = without_effect(prior, without), model and without_effect(model, without)
         if not self._has_speeds:
-            return identified(self.recording(), self._prior, flown=self.model)
+            return identified(self.recording(), prior, flown=model)
         found, ratio = self._steady(self.recording())
         length = self._period * len(found.t)
         expected = f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
         require(length > SHORTEST - self._period, "airspeed", f"it steady over the last {length:.3g} s", expected)
-        flown = None if self.model is None else self._at_speed(self.model, ratio)
-        there = identified(found, self._at_speed(self._prior, ratio), flown=flown)
+        flown = None if model is None else self._at_speed(model, ratio)
+        there = identified(found, self._at_speed(prior, ratio), flown=flown)
         parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in there.parts)
         return there._replace(parts=tuple(parts))
 
@@ -328,13 +339,11 @@ def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> 
     return designed.model_copy(update={"feedforward": model.model_copy(update={"deviation": values})})
 
 
-def has_effect(entries: Iterable[Entry], name: str) -> bool:
-    """Whether the identified entries keep half of the best known effect of an input.
-
-    The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not.
-    """
-    effects = [entry for entry in entries if entry.matrix == "B" and entry.column == name and entry.nominal]
-    return min(effects, key=lambda entry: entry.deviation).error > -0.5
+def without_effect(model: Airframe, name: str) -> Airframe:
+    """A model with almost no effect of an input."""
+    column = model.matrix_b()[:, list(model.inputs).index(name)].tolist()
+    effects = zip(model.states, column, strict=True)
+    return with_entries(model, [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value])
 
 
 def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
