@@ -119,6 +119,13 @@ MEASUREMENTS = (
     Measurement("campaign-missions", (*MISSIONS, "5000"), (*MISSIONS, "200"), evidence_rows.fleet, "3 min"),
     Measurement("cluster", CLUSTER, (*CLUSTER, "--aircraft", "1000"), evidence_rows.cluster, "1 min"),
     Measurement("compare", (*COMPARE, "200"), (*COMPARE, "20"), evidence_rows.compare, "5 min"),
+    Measurement(
+        "compare-self_tuner",
+        (*COMPARE, "200", "--laws", "self_tuner"),
+        (*COMPARE, "20", "--laws", "self_tuner"),
+        evidence_rows.compare,
+        "1 min",
+    ),
     Measurement("margins", (*MARGINS, "200"), (*MARGINS, "10"), evidence_rows.margins, "15 min"),
     Measurement("effectors", (*EFFECTORS, "50"), (*EFFECTORS, "1"), evidence_rows.effectors, "60 min", long=True),
     Measurement("view", VIEW, QUICK_VIEW, evidence_rows.view, "15 min", timed=True),

@@ -80,6 +80,7 @@ TOPICS = (
             "campaign-missions": "uncertain aircraft on a route",
             "cluster": "a campaign on a cluster of dask with faults",
             "compare": "other laws on the same aircraft and course",
+            "compare-self_tuner": "the indirect self-tuner on the same aircraft and course",
             "margins": "the cost of a phase margin under five laws",
             "effectors": "each effector lost at a random time",
         },

@@ -83,7 +83,7 @@ COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": 
 LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
 PALETTE = 32  # colours of the picture
 DOMAINS = 100  # domains 1 to 100: below the ephemeral ports on every system
-RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "lqg", "rise_observer"), "gust_turbulence"
+RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"), "gust_turbulence"
 """Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file in the loop of osprey_servo.
 MRAC measures the full state, and INDI the actuators too."""
 TRAIN = {  # m/s, m, s: a gust every 3 to 7 s

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import block_diag, solve_discrete_are
+from scipy.signal import lfilter
 
-from control_laws import l1, lqi, observed, observer_design, riccati
+from control_laws import l1, lqi, observed, observer_design, riccati, self_tuner
 from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
 from flight_bringup.scenarios import find_scenario
@@ -244,6 +245,75 @@ def test_lyapunov_function_of_mrac_decreases_as_in_theory() -> None:
         y += model.period * (2.0 * u.item() + d)
     # V + integral of K e^2 is constant in continuous time; Euler steps of 0.1 ms keep it within 1 in 1000
     np.testing.assert_allclose(values, values[0], rtol=1e-3)
+
+
+def self_tuner_gains(**changes: float) -> dict[str, float]:
+    return {
+        "K": 3.0,
+        "Lambda": 0.1,
+        "filter": 10.0,
+        "memory": 1e9,
+        "prior_A": 1e4,
+        "prior_Omega": 1e4,
+        "prior_bias": 1e4,
+    } | changes
+
+
+def test_self_tuner_converges_to_aircraft_under_commands_in_calm_air() -> None:
+    model, A, Omega, y = integrator(Omega=2.0), -1.5, 3.0, 0.0  # the nominal model has an A of 0
+    control_law, params = law_of("self_tuner", model, **self_tuner_gains())
+    state, u = control_law.engage(at(y), params), np.zeros(COLUMN)
+    for k in range(600):
+        state, u = control_law.step(state, at(y, 0.1 * (-1.0) ** (k // 100), u_before=u), np.array(DT), params)
+        y += DT * (A * y + Omega * u.item())
+    # input scale 1 / 2; the prior is 1e8 times weaker than the signals
+    np.testing.assert_allclose(state.theta[0, :, 0], [A, Omega / 2.0, 0.0], atol=1e-4)
+
+
+def test_self_tuner_estimates_as_least_squares_over_all_ticks() -> None:
+    model, a, ticks, memory, deviation = integrator(), 1.0 - np.exp(-10.0 * DT), 40, 0.5, np.array([2.0, 3.0, 5.0])
+    own = self_tuner_gains(memory=memory, prior_A=2.0, prior_Omega=3.0, prior_bias=5.0)
+    control_law, params = law_of("self_tuner", model, **own)
+    y, u = np.random.default_rng(1).normal(0.0, [[1.0], [3.0]], (2, ticks))
+    y[0] = u[0] = 0.0
+    state = control_law.engage(at(0.0), params)
+    for k in range(ticks):
+        state, _ = control_law.step(state, at(y[k], u_before=np.full(COLUMN, u[k])), np.array(DT), params)
+    y_f, u_f = (lfilter([a], [1.0, a - 1.0], signal) for signal in (y, u))
+    before = np.concatenate([[0.0], y_f[:-1]])
+    phi = np.stack([before, 2.0 * u_f, np.ones(ticks)], axis=1)
+    nominal = np.array([0.0, 1.0, 0.0])
+    # 3 unknowns a tick: theta is a Markov process around the nominal with this deviation, seen with noise of variance 1 / dt
+    kept = np.exp(-DT / memory)
+    step = np.eye(3 * ticks) - kept * np.eye(3 * ticks, k=-3)
+    of_step = np.tile(1.0 / (deviation * np.sqrt(1.0 - kept**2)), ticks)
+    of_step[:3] = 1.0 / deviation
+    seen = np.sqrt(DT) * block_diag(*phi[:, None, :])
+    residual = np.sqrt(DT) * ((y_f - before) / DT - phi @ nominal)
+    found, *_ = np.linalg.lstsq(np.vstack([seen, of_step[:, None] * step]), np.append(residual, np.zeros(3 * ticks)))
+    np.testing.assert_allclose(state.theta[0, :, 0], nominal + found[-3:], rtol=1e-8)
+
+
+def test_self_tuner_without_excitation_returns_to_nominal_model(osprey: NominalModel) -> None:
+    control_law, params = law_of("self_tuner", osprey)
+    state, calm = control_law.engage(at(np.zeros(4)), params), at(np.zeros(4))
+    before = state._replace(theta=state.theta + 1.0, P=0.5 * state.P)
+    for _ in range(5):
+        before, _ = control_law.step(before, calm, 5.0 * params.memory[0, 0], params)
+    # exp(-25) of theta and exp(-50) of P are left; the bias alone is seen in calm
+    np.testing.assert_allclose(before.theta[:, :-1], self_tuner.nominal_theta(osprey)[:, :-1, None], atol=1e-9)
+    np.testing.assert_allclose(before.P[:-1, :-1], state.P[:-1, :-1], atol=1e-12)
+
+
+def test_self_tuner_keeps_signs_and_least_size_of_effects(osprey: NominalModel) -> None:
+    nu = np.array([[1.0], [2.0], [-1.0], [0.5]])
+    Omega = self_tuner.nominal_theta(osprey)[:, 4:8, None]
+    expected = np.linalg.solve(Omega[..., 0], nu)
+    np.testing.assert_allclose(self_tuner.solve(Omega, nu, osprey.D), expected, rtol=1e-12)
+    for share in (-1.0, 0.0, 0.1):  # an estimate of the wrong sign, or too small
+        wrong = share * np.eye(4)[..., None]
+        np.testing.assert_allclose(self_tuner.solve(wrong, nu, osprey.D), nu / self_tuner.LEAST_EFFECT)
+    np.testing.assert_allclose(self_tuner.solve(wrong, nu, -osprey.D), -nu / self_tuner.LEAST_EFFECT)
 
 
 def test_indi_needs_no_model_except_input_gain() -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di, super_twisting
+from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di, self_tuner, super_twisting
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from rise_di_controller import law as rise
@@ -36,7 +36,18 @@ INITIAL_CHANNEL_GAINS = {
 }
 """Initial gains of a search in every channel, in scaled inputs and SI; K and Lambda start from the lag of the loop."""
 
-INITIAL_COMMON_GAINS = {"softening": 3.0, "omega": 1.5, "filter": 12.6, "leak": 0.05, "fade": 4.0, "loose": 0.01}
+INITIAL_COMMON_GAINS = {
+    "softening": 3.0,
+    "omega": 1.5,
+    "filter": 12.6,
+    "leak": 0.05,
+    "fade": 4.0,
+    "loose": 0.01,
+    "memory": 30.0,
+    "prior_A": 1.0,
+    "prior_Omega": 0.1,
+    "prior_bias": 1.0,
+}
 """Initial gains common to all channels."""
 
 INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
@@ -169,6 +180,15 @@ LAWS: dict[str, Law] = {
         "MacKunis RISE, filtered difference", "y", "Omega", _filtered, mackunis.mackunis_params, (*_rise_gains, "filter")
     ),
     "mackunis_ideal": Law("MacKunis RISE, perfect y_dot", "y, y_dot", "Omega", _ideal, mackunis.mackunis_params, _rise_gains),
+    "self_tuner": Law(
+        "indirect self-tuner",
+        "y",
+        "A, B, lags",
+        self_tuner.control_law,
+        self_tuner.self_tuner_params,
+        ("K", "Lambda", "filter", "memory", "prior_A", "prior_Omega", "prior_bias"),
+        linear=False,
+    ),
     "indi": Law("INDI", "y, actuators", "Omega", indi.control_law, indi.indi_params, ("K", "bandwidth", "share")),
 } | {
     f"{name}_vanes" if vanes else name: Law(
