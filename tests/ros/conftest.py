@@ -42,8 +42,8 @@ class Process:
     def __init__(self, *arguments: str, cwd: Path, within: Sequence[str] = (), stdin: int | None = None) -> None:
         command, pipe = [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
         self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
-        self.lines: list[str] = []
-        self._changed = threading.Condition()
+        self.arguments, self.lines = arguments, list[str]()
+        self._changed, self._closed = threading.Condition(), False
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
 
@@ -53,16 +53,26 @@ class Process:
             with self._changed:
                 self.lines.append(line.rstrip())
                 self._changed.notify_all()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
 
     @property
     def output(self) -> str:
         """The output so far."""
         return "\n".join(self.lines)
 
-    def wait_for(self, text: str, timeout: float = HANG) -> Self:
-        """Wait until a line contains the text."""
+    def has_logged(self, *parts: str) -> bool:
+        """Whether a line contains all parts. A process that has ended without one never will: its output is the error."""
         with self._changed:
-            logged = self._changed.wait_for(lambda: any(text in line for line in self.lines), timeout)
+            logged = any(all(part in line for part in parts) for line in self.lines)
+            assert logged or not self._closed, f"ended without {parts}; output:\n{self.output}"
+        return logged
+
+    def wait_for(self, text: str, timeout: float = HANG) -> Self:
+        """Wait until a line contains the text. The process must not end before."""
+        with self._changed:
+            logged = self._changed.wait_for(lambda: self.has_logged(text), timeout)
         assert logged, f"{text!r} not logged within {timeout} s; output:\n{self.output}"
         return self
 
@@ -119,6 +129,41 @@ class Process:
         return status
 
 
+class HostDelays(threading.Thread):
+    """Delays of the host, as a thread sees them that is due every 10 ms: all processes of a test have them."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self._delays: list[tuple[float, float]] = []
+        self._ended = threading.Event()
+        self.start()
+
+    def run(self) -> None:
+        """Measure until `end`."""
+        period, begin = 0.01, time.time()
+        while not self._ended.wait(period):
+            begin, before = time.time(), begin
+            if (delay := begin - before - period) > period:
+                self._delays.append((begin, delay))
+
+    def since(self, t: float) -> float:
+        """Sum of the delays that ended after an instant of the system clock, s."""
+        return sum(delay for end, delay in self._delays if end > t)
+
+    def end(self) -> None:
+        """End the thread."""
+        self._ended.set()
+        self.join()
+
+
+@pytest.fixture
+def host_delays() -> Iterator[HostDelays]:
+    """The delays of the host during a test, by which it extends its limits of time."""
+    delays = HostDelays()
+    yield delays
+    delays.end()
+
+
 def settable_clock(folder: Path) -> Path:
     """A library that gives the processes that load it a system clock that can be set: tests/ros/faults/clock.c."""
     compiler = shutil.which("cc")
@@ -172,7 +217,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
             for child in process.children():
                 child.kill()
             process.popen.kill()
-        process.end()
+        print(*process.arguments, "ended with status", process.end())  # pytest shows it where the test failed
+        print(*process.lines[-30:], sep="\n")
 
 
 @pytest.fixture

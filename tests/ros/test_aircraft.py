@@ -46,7 +46,7 @@ def test_u_older_than_age_limit_does_not_end_failsafe(start_node: Start, peer_no
     # As of a controller that was stopped while its middleware sent: longer than the age limit, newer than the last u.
     refused = "/u: sample refused: stamp 0.1"  # logged once in 2 s: a busy machine also delays a sample beyond the age limit
     peer_node.until(
-        lambda: peer_node.counted("refused u: old") and refused in process.output,
+        lambda: peer_node.counted("refused u: old") and process.has_logged(refused),
         each=lambda: peer_node.command(0.0, 0.0, 0.02, 0.0, age=0.15),
     )
     assert not any(aileron(peer_node))

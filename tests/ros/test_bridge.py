@@ -31,7 +31,7 @@ from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
-from tests.ros.conftest import Process, Start, settable_clock
+from tests.ros.conftest import HostDelays, Process, Start, settable_clock
 from tests.ros.peer import HANG, Peer, peer, stamp_ns
 from typer.testing import CliRunner
 
@@ -41,6 +41,7 @@ from autopilot_bridge.params import LIBRARY
 from flight_bringup import processes
 from flight_cli.cli import COMMANDS, application
 from flight_core.modes import Mode
+from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.rates import NANOSECONDS
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
@@ -52,12 +53,12 @@ app = application([*COMMANDS])
 
 SCENARIO = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
 BEST_EFFORT = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-RELEASE_AFTER = 1.0  # s, in place of the 3 s of RC_OVERRIDE_TIME
+RELEASE_AFTER = 2.0  # s, in place of the 3 s of RC_OVERRIDE_TIME, longer than MAX_AGE
 NEUTRAL = 0.4  # s, in tests with neutral values
 FULL = math.radians(30.0)  # full deflection of a surface in the map
 EARLY = 0.05  # s; the last u may be some periods older than the instant that the test takes for it
 PATIENT = 5.0  # s, of y and u, where a release by their age would hide another one
-MAX_AGE, RELEASE = 0.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s, for hosts under load
+MAX_AGE, RELEASE = 1.5, 0.5  # s; MAX_AGE replaces the map's 0.2 s: a host pauses for up to a second
 LATE = 0.2  # s, scheduling delay of a host under load; without load a tick of 5 ms and a message period of 20 ms
 
 
@@ -68,7 +69,7 @@ class BridgeSetup:
         self._start = start
         self.map = str(folder / "ardupilot.yaml")
         Path(self.map).write_bytes(MAP_FILES["ardupilot_2024"].read_bytes())
-        self.change_age_limits(MAX_AGE)
+        self.change_age_limits(MAX_AGE, MAX_AGE)
         self.peer = peer_node
         self.joys: list[Joy] = []
         peer_node.node.create_subscription(Joy, "/ap/joy", self.joys.append, BEST_EFFORT)
@@ -83,10 +84,11 @@ class BridgeSetup:
         row.update(values)
         Path(self.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
-    def change_age_limits(self, max_age: float) -> None:
+    def change_age_limits(self, y: float, u: float) -> None:
         """Change the age limits of y and u, s."""
-        for place in (("silence",), *(("outputs", name) for name in ("q", "V", "p", "r"))):
-            self.change_map(*place, max_age=max_age)
+        self.change_map("silence", max_age=u)
+        for name in ("q", "V", "p", "r"):
+            self.change_map("outputs", name, max_age=y)
 
     def autopilot(self) -> Process:
         """Start the simulated autopilot."""
@@ -108,9 +110,13 @@ class BridgeSetup:
 
     def engage_while(self, command: Callable[[], None]) -> None:
         """Engage and wait for six further messages to the autopilot, while u is published."""
-        self.peer.until(lambda: self.engage(each=command) == "", each=command)
+        self.until_engaged(command)
         self.joys.clear()
         self.peer.until(lambda: len(self.joys) > 5, each=command)
+
+    def until_engaged(self, command: Callable[[], None] | None = None) -> None:
+        """Call the service until it engages, while u is published."""
+        self.peer.until(lambda: self.engage(each=command) == "", each=command)
 
     def kill_engaged_bridge(self, autopilot: Process) -> tuple[float, int]:
         """Kill an engaged bridge; the instant of the system clock and the timeouts of the autopilot before.
@@ -129,14 +135,24 @@ class BridgeSetup:
 
     def until_released(self, bridge: Process, command: Callable[[], None], *reason: str) -> None:
         """Wait until the bridge releases the channels for this reason, while u is published."""
-        words = ("ENGAGED -> RELEASE: ", *reason)
-        self.peer.until(lambda: any(all(word in line for word in words) for line in bridge.lines), each=command)
+        self.peer.until(lambda: bridge.has_logged("ENGAGED -> RELEASE: ", *reason), each=command)
+
+    def first_release(self, bridge: Process, begin: int, command: Callable[[], None]) -> str:
+        """Wait until the bridge releases the channels in a line from `begin` on, while u is published; the line."""
+        lines: list[str] = []
+
+        def is_released() -> bool:
+            lines[:] = [line for line in bridge.lines[begin:] if "ENGAGED -> RELEASE: " in line]
+            return bool(lines)
+
+        self.peer.until(is_released, each=command)
+        return lines[0]
 
     def engage_from_trim(self) -> None:
         """Wait for trim and engage: the bridge deactivates the controller, and activates it when it engages."""
         self.peer.received["u"].clear()
         self.peer.until(lambda: self.peer.received["u"] and not any(self.peer.received["u"][-1].position))
-        self.peer.until(lambda: self.engage() == "")
+        self.until_engaged()
         self.wait_for_joys()
         self.peer.until(lambda: any(self.peer.received["u"][-1].position))
 
@@ -157,7 +173,7 @@ class BridgeSetup:
 
     def until_logged(self, process: Process, *parts: str, timeout: float = 30.0) -> None:
         """Spin until a line of a process contains the parts, so that few messages wait to be read."""
-        self.peer.until(lambda: any(all(part in line for part in parts) for line in process.lines), timeout)
+        self.peer.until(lambda: process.has_logged(*parts), timeout)
 
     def wait_for_joys(self) -> None:
         """Wait for six further messages to the autopilot."""
@@ -207,8 +223,9 @@ def true_error(autopilot: Process, setup: BridgeSetup) -> dict[str, float]:
 
 
 def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channels(
-    setup: BridgeSetup,
+    setup: BridgeSetup, host_delays: HostDelays
 ) -> None:
+    setup.change_age_limits(PATIENT, MAX_AGE)
     assert CliRunner().invoke(app, ["check-signs", setup.map, "--scenario", str(SCENARIO)]).exit_code == 0
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
@@ -233,15 +250,18 @@ def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channe
     setup.until_logged(bridge, "RELEASE -> DISENGAGED: u is")
     setup.peer.spin(0.3)
     finite, released = setup.after(killed)
-    assert max(finite) < MAX_AGE + LATE
-    assert last + MAX_AGE < min(released) < MAX_AGE + LATE
-    assert RELEASE - LATE < max(released) - min(released) < RELEASE + LATE
-    assert len(released) > 10  # 25 at 50 Hz
+    late = LATE + host_delays.since(killed)
+    assert max(finite) < MAX_AGE + late
+    assert last + MAX_AGE < min(released) < MAX_AGE + late
+    assert RELEASE - late < max(released) - min(released) < RELEASE + late
+    assert len(released) > (RELEASE - late) * 40.0  # sent at 50 Hz
     setup.until_logged(restarted, "-> INACTIVE", timeout=HANG)  # so that its integrals do not wind up
 
 
-def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channels(setup: BridgeSetup) -> None:
-    setup.change_map("silence", max_age=1e3)  # a delay of the host does not release them for the age of u
+def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channels(
+    setup: BridgeSetup, host_delays: HostDelays
+) -> None:
+    setup.change_age_limits(MAX_AGE, PATIENT)
     autopilot = setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
     setup.node("rise_di_controller.main").wait_for("ready")
@@ -254,18 +274,21 @@ def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channel
         gamepad.publish(Joy(buttons=[1]))
 
     setup.peer.until(lambda: gamepad.get_subscription_count() == 1)
-    setup.peer.until(lambda: setup.engage(each=press) == "pilot override active: gamepad")
-    gamepad.publish(Joy(buttons=[0]))
+
+    def until_refused() -> None:
+        setup.peer.until(lambda: setup.engage(each=press) == "pilot override active: gamepad")
+        gamepad.publish(Joy(buttons=[0]))
+
+    until_refused()
     setup.engage_from_trim()
     pressed = time.time()
     press()
     setup.until_logged(bridge, "ENGAGED -> RELEASE: pilot override by gamepad")
     setup.peer.spin(RELEASE + LATE)
     finite, released = setup.after(pressed)
-    assert max(finite, default=0.0) < LATE  # at once
-    assert min(released) < LATE
-    assert setup.engage(each=press) == "pilot override active: gamepad"
-    gamepad.publish(Joy(buttons=[0]))
+    assert max(finite, default=0.0) < LATE + host_delays.since(pressed)  # at once
+    assert min(released) < LATE + host_delays.since(pressed)
+    until_refused()
 
     setup.engage_from_trim()
     with autopilot.stopped():
@@ -273,8 +296,9 @@ def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channel
         setup.until_logged(bridge, "RELEASE -> DISENGAGED: ", " s old (/ap/")  # q, p, r, or V where its last sample was lost
     setup.peer.spin(0.5)
     finite, released = setup.after(stopped)
-    assert max(finite) < MAX_AGE + LATE  # y is fresh again; the bridge does not re-engage by itself
-    assert max(released) < MAX_AGE + RELEASE + LATE
+    late = LATE + host_delays.since(stopped)
+    assert max(finite) < MAX_AGE + late  # y is fresh again; the bridge does not re-engage by itself
+    assert max(released) < MAX_AGE + RELEASE + late
 
     setup.engage_and_disengage_by_the_page()
     bridge.wait_for("ENGAGED -> RELEASE: disengaged by request")
@@ -286,7 +310,7 @@ def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channel
     killed, before = setup.kill_engaged_bridge(autopilot)
     setup.peer.until(lambda: autopilot.lines.count("timeout") > before)  # the autopilot's own timeout
     finite, released = setup.after(killed)
-    assert max(finite, default=0.0) < LATE
+    assert max(finite, default=0.0) < LATE + host_delays.since(killed)
     assert not released
 
 
@@ -295,7 +319,7 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
 ) -> None:
     step, command = tmp_path / "step", partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
     step.write_bytes(bytes(8))
-    setup.change_age_limits(PATIENT)  # a delay of the host does not release them
+    setup.change_age_limits(PATIENT, PATIENT)
     setup.autopilot()
     with monkeypatch.context() as environment:
         environment.setenv("LD_PRELOAD", str(settable_clock(tmp_path)))
@@ -303,12 +327,12 @@ def test_step_of_system_clock_leaves_engagement_and_release_as_they_are(
         bridge = setup.bridge("-p", "dry_run:=false")
     received = setup.peer.received
     setup.peer.until(lambda: received["y"] and received["bridge/would_send"], each=command)
-    assert setup.engage(each=command) == ""
+    setup.until_engaged(command)
     for seconds in (4 * PATIENT, -4 * PATIENT):  # beyond the limits either way
         with step.open("r+b") as stream:
             stream.write(struct.pack("=q", round(seconds * NANOSECONDS)))
         received["y"].clear()
-        setup.peer.until(lambda: len(received["y"]) > 40, timeout=30.0, each=command)
+        setup.peer.until(lambda: len(received["y"]) > 40, each=command)
     assert "ENGAGED -> " not in bridge.output.replace("DISENGAGED -> ", "")
     setup.joys.clear()
     bridge.interrupt().succeed()
@@ -321,14 +345,14 @@ def test_stopped_bridge_releases_channels_and_can_be_engaged_again(setup: Bridge
     bridge = setup.bridge("-p", "dry_run:=false")
     setup.engage_while(command)
     with bridge.stopped():  # until the autopilot flies on its own law
-        setup.peer.until(lambda: "timeout" in autopilot.lines, each=command)
+        setup.peer.until(lambda: autopilot.has_logged("timeout"), each=command)
     setup.until_released(bridge, command, "the bridge did not run for ")
     setup.engage_while(command)
 
 
 def test_second_autopilot_and_lost_terminal_each_release_channels(setup: BridgeSetup) -> None:
     command = partial(setup.peer.command, 0.0, 0.0, 0.0, 0.0)
-    setup.change_age_limits(1e3)  # a delay of the host does not release them before
+    setup.change_age_limits(PATIENT, PATIENT)
     setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
     setup.engage_while(command)
@@ -357,7 +381,7 @@ def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSe
     request = {"topic": "/ap/request", "type": "std_msgs/msg/UInt8", "rate": 5.0, "stamped": False}
     requests = {"enter": request | {"when": "engaging"}, "leave": request | {"when": "release"}}  # as with the map of PX4
     qos = {"reliability": "reliable", "durability": "volatile", "depth": 1}
-    setup.change_age_limits(1e3)  # a delay of the host does not end the request before
+    setup.change_age_limits(PATIENT, PATIENT)
     setup.change_map(conditions={"guided": condition}, engage_timeout=1e3)
     setup.change_map("messages", **requests)
     setup.change_map("topics", **{"/ap/mode": qos, "/ap/request": qos})
@@ -371,14 +395,14 @@ def test_engagement_that_is_not_waited_for_any_more_is_withdrawn(setup: BridgeSe
 
     client = start("flight_cli.cli", "engage")
     waiting = "waiting: the mode is not guided (data is 10)"
-    setup.peer.until(lambda: waiting in client.output or client.popen.poll() is not None, each=command)
+    setup.peer.until(lambda: client.has_logged(waiting), each=command)
     client.interrupt()
     setup.peer.until(lambda: client.popen.poll() is not None, each=command)
     assert client.end() == 130, client.output
-    assert any("ENGAGING -> RELEASE: disengaged by request" in line for line in bridge.lines)
+    setup.peer.until(lambda: bridge.has_logged("ENGAGING -> RELEASE: disengaged by request"))
 
 
-def test_lost_transmitter_releases_within_a_second(setup: BridgeSetup) -> None:
+def test_lost_transmitter_releases_within_a_second(setup: BridgeSetup, host_delays: HostDelays) -> None:
     """The transmitter says that the pilot is there, then that the pilot is lost, then nothing."""
     condition = {
         "topic": "/ap/transmitter",
@@ -390,7 +414,7 @@ def test_lost_transmitter_releases_within_a_second(setup: BridgeSetup) -> None:
         "transmitter": True,
         "source": "a test",
     }
-    setup.change_age_limits(PATIENT)  # of y and u: the transmitter alone releases
+    setup.change_age_limits(PATIENT, PATIENT)  # the transmitter alone releases
     setup.change_map(conditions={"transmitter": condition}, max_engaged=None)
     setup.change_map("topics", **{"/ap/transmitter": {"reliability": "reliable", "durability": "volatile", "depth": 1}})
     setup.autopilot()
@@ -404,16 +428,18 @@ def test_lost_transmitter_releases_within_a_second(setup: BridgeSetup) -> None:
             transmitter.publish(UInt8(data=here))
 
     for lost, reason in ((0, "the transmitter is lost (data is 0)"), (None, "transmitter: data is ")):
-        here = 1
-        setup.engage_while(command)
-        here, last = lost, time.time()
-        setup.until_released(bridge, command, reason)
-        assert setup.first_nan(last, command) <= 1.0 + LATE
+        released = ""
+        while reason not in released:  # the silence of a host that pauses releases for the age, before
+            here, begin = 1, len(bridge.lines)
+            setup.engage_while(command)
+            here, last = lost, time.time()
+            released = setup.first_release(bridge, begin, command)
+        assert setup.first_nan(last, command) <= 1.0 + LATE + host_delays.since(last)
 
 
-def test_blind_engagement_says_what_still_releases(setup: BridgeSetup, start: Start) -> None:
+def test_blind_engagement_says_what_still_releases(setup: BridgeSetup, start: Start, host_delays: HostDelays) -> None:
     """A map without a bound needs `--blind`. With `max_engaged` the end is announced, and then the channels are released."""
-    setup.change_age_limits(PATIENT)
+    setup.change_age_limits(PATIENT, PATIENT)
     setup.change_map(max_engaged=None)
     setup.autopilot()
     bridge = setup.bridge("-p", "dry_run:=false")
@@ -442,14 +468,17 @@ def test_blind_engagement_says_what_still_releases(setup: BridgeSetup, start: St
     setup.joys.clear()
     assert "max_engaged after 11 s" in engage().succeed().output
     engaged = stamp(setup.joys[0])
-    setup.peer.until(lambda: "ENGAGED: max_engaged releases in 10 s" in bridge.output, each=command)
+    setup.peer.until(lambda: bridge.has_logged("ENGAGED: max_engaged releases in 10 s"), each=command)
     setup.until_released(bridge, command, "engaged for 11 s, max_engaged of the map")
-    assert setup.first_nan(engaged, command) == pytest.approx(11.0, abs=LATE)
+    assert setup.first_nan(engaged, command) == pytest.approx(11.0, abs=LATE + host_delays.since(engaged))
 
 
-def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(setup: BridgeSetup) -> None:
+def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(
+    setup: BridgeSetup, host_delays: HostDelays
+) -> None:
     """The publisher of u stays alive and u returns: the age of u counts, not the presence of a publisher."""
     setup.autopilot()
+    setup.change_age_limits(PATIENT, MAX_AGE)
     setup.change_map("silence", neutral=NEUTRAL)
     bridge = setup.bridge("-p", "dry_run:=false")
     commanded = 0.02  # rad of elevator, within a tenth of its limit, as engagement requires
@@ -462,7 +491,7 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(se
 
     received = setup.peer.received
     setup.peer.until(lambda: received["y"] and received["bridge/would_send"], each=command)
-    assert setup.engage(each=command) == ""
+    setup.until_engaged(command)
     setup.peer.until(lambda: len(setup.joys) > 10, each=command)
     stale = last
 
@@ -474,10 +503,12 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_time(se
     released = [at for at, axes in sent if all(map(math.isnan, axes))]
     assert len(engaged) + len(neutral) + len(released) == len(sent)  # nothing else is sent
     assert engaged[0] < neutral[0] < released[0]
-    assert MAX_AGE - EARLY < max(engaged) < MAX_AGE + LATE
-    assert MAX_AGE - EARLY < min(neutral) < MAX_AGE + LATE
-    assert MAX_AGE + NEUTRAL - EARLY < min(released) < MAX_AGE + NEUTRAL + 2 * LATE
-    assert MAX_AGE + NEUTRAL + RELEASE - LATE < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * LATE
+    delay = host_delays.since(stale)
+    early, late = EARLY + delay, LATE + delay
+    assert MAX_AGE - early < max(engaged) < MAX_AGE + late
+    assert MAX_AGE - EARLY < min(neutral) < MAX_AGE + late
+    assert MAX_AGE + NEUTRAL - EARLY < min(released) < MAX_AGE + NEUTRAL + 2 * late
+    assert MAX_AGE + NEUTRAL + RELEASE - late < max(released) < MAX_AGE + NEUTRAL + RELEASE + 2 * late
 
     setup.joys.clear()
     setup.peer.spin(0.5, each=command)
@@ -527,7 +558,7 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup,
     setup.peer.until(lambda: flight.popen.poll() is not None)
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
-    flight.succeed()
+    assert flight.end() in {0, STATUS_INCOMPLETE}, flight.output  # incomplete: the host paused
     assert "request rejected" not in flight.output
     run = tmp_path / "runs" / "latest"
     log = read_run(run)
@@ -538,7 +569,8 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup,
     assert not u.any()  # what is sent at an engagement: the trim
     assert len(u) > 100  # of 450
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    assert (summary["outcome"], summary["engagements"]) == ("completed", [])
+    assert summary["outcome"].startswith("completed")
+    assert summary["engagements"] == []
     assert summary["notes"][0].startswith("never engaged")
     assert Path(setup.map).read_bytes() in [file.content for file in log.attachments]
     counts = Counter(message.topic for message in stored_messages(run))
@@ -548,8 +580,9 @@ def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup,
 
 
 def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
-    setup: BridgeSetup, start: Start, tmp_path: Path
+    setup: BridgeSetup, start: Start, tmp_path: Path, host_delays: HostDelays
 ) -> None:
+    begin = time.time()
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "10000", "--json")
     # A busy host may start the bridge later than the 10 s for which the command waits for one.
@@ -571,10 +604,9 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     assert engagement["reason"] == "disengaged by request"
     tape = read_run(run).tape
     mode, t = tape["internals"]["mode"], tape.time("internals")
-    engaged_ticks = np.flatnonzero(mode == Mode.ENGAGED)
-    (flies,) = np.split(t[engaged_ticks], np.flatnonzero(np.diff(engaged_ticks) > 1) + 1)
-    assert abs(engagement["start"] - flies[0]) < 1.0  # the timeout of an activation, which is reported when it has answered
-    assert engagement["stop"] - 0.1 < flies[-1] < engagement["stop"] + LATE
+    delay, flies = host_delays.since(begin), t[mode == Mode.ENGAGED]
+    assert abs(engagement["start"] - flies[0]) < 1.0 + delay  # the timeout of an activation, reported when it has answered
+    assert engagement["stop"] - 0.1 - delay < flies[-1] < engagement["stop"] + LATE + delay
     u, t_u = tape["u"].values, tape.time("u")
     assert not u[t_u < flies[0]].any()  # no integral before the engagement, none 2 s after it
     assert (t_u > engagement["stop"] + 2.0).any()

@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import HostDelays, Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -83,8 +83,8 @@ def channel(message: JointState, name: str) -> float:
 class HostDelay:
     """Host scheduling delay of a process since this was made: its thread was ready, and waited for a processor."""
 
-    def __init__(self, process: Process) -> None:
-        self._process = process
+    def __init__(self, process: Process, host_delays: HostDelays) -> None:
+        self._process, self._host_delays, self._begin = process, host_delays, time.time()
         self._before_ns = self._counted_ns()
 
     def _counted_ns(self) -> int:
@@ -96,8 +96,12 @@ class HostDelay:
         return waited + int(Path("/proc/stat").read_text(encoding="ascii").split()[8]) * KERNEL_TICK_NS
 
     def limit_ns(self) -> int:
-        """Upper limit of the delay. Steal time is counted in whole ticks of the kernel, so one more may have begun."""
-        return self._counted_ns() - self._before_ns + KERNEL_TICK_NS
+        """Upper limit of the delay. Steal time is counted in whole ticks of the kernel, so one more may have begun.
+
+        A host that pauses all processes need not count it.
+        """
+        paused_ns = nanoseconds(self._host_delays.since(self._begin))
+        return self._counted_ns() - self._before_ns + KERNEL_TICK_NS + paused_ns
 
 
 def engage(peer_node: Peer, y: float = 0.01) -> None:
@@ -126,12 +130,14 @@ def test_engages_bumpless_from_zero(start_node: Start, peer_node: Peer) -> None:
     assert channel(peer_node.received["internals"][0], "e.q") == 0.01
 
 
-def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(start_node: Start, osprey_gust: Scenario, peer_node: Peer) -> None:
+def test_failsafe_holds_u_ramps_to_trim_re_engages_bumpless(
+    start_node: Start, osprey_gust: Scenario, peer_node: Peer, host_delays: HostDelays
+) -> None:
     """Mode and u are checked at the instant of each tick. Ticks may overrun or be missed, with no other effect on u."""
-    hold_ns, ramp_ns, y = NANOSECONDS // 10, NANOSECONDS, 0.05
-    process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=1.0")
+    hold_ns, ramp_ns, y = NANOSECONDS // 10, nanoseconds(1.5), 0.05  # longer than a pause of the host
+    process = start_node("rise_di_controller", "-p", "hold:=0.1", "-p", "ramp:=1.5")
     engage(peer_node)
-    host_delay = HostDelay(process)
+    host_delay = HostDelay(process, host_delays)
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # y and y_m have stopped
     host_delay_ns = host_delay.limit_ns()
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.TRIM)
@@ -196,9 +202,11 @@ def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, p
     def conflict() -> None:
         peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.ones(4), "/foreign"))
 
-    def send_both() -> None:
-        conflict()
+    def send_both() -> (
+        None
+    ):  # y first: after a pause of the host that is longer than age limit, hold and ramp, any may take over
         peer_node.send(0.01)
+        conflict()
 
     peer_node.spin(0.05)  # the controller takes all samples
     with process.stopped():
@@ -383,11 +391,11 @@ def test_incompatible_type_and_quality_of_service_reported_with_peer(start_node:
         recorder.wait_for("/truth: /peer publishes with incompatible quality of service")
 
 
-def test_tick_rate_is_kept_over_overruns(start_node: Start, peer_node: Peer) -> None:
+def test_tick_rate_is_kept_over_overruns(start_node: Start, peer_node: Peer, host_delays: HostDelays) -> None:
     """Deadlines are absolute: after an overrun a tick is late, or skipped and counted. The deadlines after it do not move."""
     process = start_node("rise_di_controller", "-p", "max_age:=1.0")
     engage(peer_node)
-    host_delay, begin_ns, stopped_ns = HostDelay(process), time.time_ns(), 0
+    host_delay, begin_ns, stopped_ns = HostDelay(process, host_delays), time.time_ns(), 0
     peer_node.spin(1.0, each=lambda: peer_node.send(0.01))
     peer_node.until(lambda: peer_node.modes()[-1] == Mode.HOLD)  # y and y_m have stopped: each tick now publishes internals
     timeout_ns = stamp_ns(peer_node.received["internals"][-1])

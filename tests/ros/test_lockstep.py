@@ -17,7 +17,7 @@ import pytest
 from mcap.reader import make_reader
 from std_msgs.msg import String
 from tests import recordings
-from tests.ros.conftest import Process, Start
+from tests.ros.conftest import HostDelays, Process, Start
 from tests.ros.peer import INPUTS, Peer
 
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -117,16 +117,18 @@ LOG_SIZE = 1_000_000  # bytes; by then the liveliness monitor of every node is a
 
 
 @pytest.mark.parametrize("victim", ["aircraft", "controller", "recorder"])  # the next test kills the reference model
-def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(victim: str, start: Start, tmp_path: Path) -> None:
+def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
+    victim: str, start: Start, tmp_path: Path, host_delays: HostDelays
+) -> None:
     processes = nodes(start, scenario_file(tmp_path, 1e6))
     processes["aircraft"].wait_for_log(tmp_path / "run", LOG_SIZE)
     processes[victim].popen.kill()
-    killed = time.monotonic()
+    killed = time.time()
     for role, process in processes.items():
         if role != victim:
-            assert process.end(timeout=10.0) == 3, process.output
+            assert process.end() == 3, process.output
             # The liveliness lease is 1.8 s; the rest is for a busy host.
-            assert time.monotonic() - killed < 3.0, role
+            assert time.time() - killed < 3.0 + host_delays.since(killed), role
             assert f"lost contact with {victim}" in process.output, role
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) > 100
 

@@ -32,7 +32,7 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
     content["link"]["url"] = f"udpin:127.0.0.1:{port}"
     content["silence"]["max_age"] = 5.0  # s: a release by the age of u would hide that by the link
     for row in (*content["outputs"].values(), *content["pose"].values()):
-        row["max_age"] = 1.0  # s, for hosts under load
+        row["max_age"] = 2.0  # s: a host pauses for up to a second
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
     autopilot = start("tests.ros.mavlink_autopilot", str(SCENARIO), str(port)).wait_for("ready")
@@ -48,7 +48,7 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
             return str(node.call(SetBool, "bridge/engage", SetBool.Request(data=on), command).message)
 
         node.until(lambda: engage(on=True) == "", each=command)
-        node.until(lambda: f"channels 1500 {PULSE} 1500 1500" in autopilot.lines, each=command)
+        node.until(lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"), each=command)
         engage(on=False)
         node.until(lambda: autopilot.lines[-1] == TRIM, each=command)
         (y, attitude) = (node.received[topic][-1] for topic in ("y", "mavlink/ATTITUDE"))
@@ -57,5 +57,4 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
 
         node.until(lambda: engage(on=True) == "", each=command)
         autopilot.popen.kill()
-        lost = ("ENGAGED -> RELEASE: ", "old (mavlink/ATTITUDE)")
-        node.until(lambda: any(all(words in line for words in lost) for line in bridge.lines), each=command)
+        node.until(lambda: bridge.has_logged("ENGAGED -> RELEASE: ", "old (mavlink/ATTITUDE)"), each=command)

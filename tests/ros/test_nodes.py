@@ -71,7 +71,7 @@ def test_node_without_publisher_warns_keeps_waiting_and_shuts_down_cleanly(
     node = start_node(package).wait_for(f"waiting for {waits_for}: no publisher")
     assert node.popen.poll() is None
     node.popen.send_signal(number)
-    assert node.end(5.0) == 0
+    assert node.end() == 0
     assert "Traceback" not in node.output
 
 
@@ -82,7 +82,7 @@ def test_node_stopped_during_start_shuts_down_cleanly(number: signal.Signals, st
     # The start may be faster than the discovery.
     peer_node.until(lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output)
     node.popen.send_signal(number)
-    assert node.end(5.0) == 0
+    assert node.end() == 0
     assert "Traceback" not in node.output
 
 
@@ -125,7 +125,7 @@ def test_burst_of_signals_ends_node_as_one_signal_does(start_node: Start) -> Non
     for _ in range(50):
         node.popen.send_signal(signal.SIGTERM)
         node.popen.send_signal(signal.SIGINT)
-    assert node.end(5.0) == 0
+    assert node.end() == 0
 
 
 def test_missing_transport_profile_is_error_before_start(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,16 +3,18 @@
 """Replay of flights over real DDS from their logs: bit by bit, after faults of the controller and of the recorder too."""
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lifecycle_msgs.msg import Transition
 from tests import recordings
-from tests.ros.conftest import Start
+from tests.ros.conftest import HostDelays, Start
 from tests.ros.peer import Peer
 from tests.ros.test_controller import set_parameters
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
+from tests.ros.test_recorder import recorded
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -20,13 +22,13 @@ from flight_analysis.design.gain_selection import with_feedforward
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import flatten, nest
-from flight_core.rates import period_ns
+from flight_core.rates import NANOSECONDS, period_ns
 from flight_log.tape_reader import read_run
 from flight_ros.topics import publisher_qos
 
 pytestmark = pytest.mark.package("flight_analysis")
 
-PEER_TOPICS = ("internals",)
+PEER_TOPICS = ("internals", "/diagnostics")
 
 
 def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dict[str, Any]:
@@ -95,7 +97,9 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
     output = replayed(start, run)
-    assert output["ticks"] == output["checked"] > 150
+    # the host can stop a tick half-way, which then publishes no u to compare
+    unsent = [note.split()[0] for note in output["notes"] if "ticks have no sample on the topic u" in note]
+    assert output["ticks"] - sum(map(int, unsent)) == output["checked"] > 150, output["notes"]
     changes = [note.split(": ")[1] for note in output["notes"] if note.startswith("parameters changed before tick")]
     assert changes == ["Lambda, k_g", "upper"]
     # a change of one bit in one gain is detected
@@ -115,7 +119,7 @@ def test_log_of_killed_recorder_replayed(start: Start, tmp_path: Path) -> None:
 
 
 def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
-    start: Start, tmp_path: Path, peer_node: Peer
+    start: Start, tmp_path: Path, peer_node: Peer, host_delays: HostDelays
 ) -> None:
     scenario = scenario_file(tmp_path, 1e3, "osprey_gust")
     period = period_ns(load_scenario(scenario).controller.rate, "rate")
@@ -124,13 +128,15 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
         start(f"{package}.main", *parameters)
     more_than_history = publisher_qos(period).depth + 200
     peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history)
+    begin = time.time()
     recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
     recorder.wait_for("recording to")
-    receive_more(peer_node, 201)
+    peer_node.until(lambda: all(recorded(peer_node, topic) > 250 for topic in ("/y", "/y_m", "/u", "/internals")))
     recorder.interrupt().succeed()
     output = replayed(start, tmp_path / "run")
     assert output["checked"] < 0.99 * output["expected"]
     # the recorder is matched with one topic after the other: further first ticks may lack y or u, 7 on a busy host
-    assert 0 < output["ticks"] - output["checked"] < 50
+    delayed = host_delays.since(begin) * NANOSECONDS / period
+    assert 0 < output["ticks"] - output["checked"] < 50 + delayed
     assert output["checked"] > 150
     assert any(note.startswith("the log begins with sample ") for note in output["notes"])

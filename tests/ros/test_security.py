@@ -76,7 +76,7 @@ def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None
         send()
         publisher.publish(replayed)
 
-    peer_node.until(lambda: "receiving u from" in first.output, each=send)
+    peer_node.until(lambda: first.has_logged("receiving u from"), each=send)
     replayed = recorded[0]
     peer_node.until(partial(peer_node.counted, "refused u: old"), each=replay_beside)  # once it is older than max_age
     first.interrupt().succeed()
