@@ -6,6 +6,7 @@ import time
 from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -15,6 +16,9 @@ from flight_ros.topics import LIVELINESS
 
 SHUTDOWN_GRACE_NS = 600_000_000
 """Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another cause sends no report."""
+
+REPORT_TIMEOUT = Duration(seconds=0.2)
+"""Longest wait until all peers have a report, after which the node ends. The lost peer never acknowledges it."""
 
 ROLES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder")
 
@@ -62,6 +66,7 @@ class LivelinessMonitor:
     def report(self, role: str) -> None:
         """Publish the role that was lost, so that all peers name the role that ended first."""
         self._publisher.publish(String(data=role))
+        self._publisher.wait_for_all_acked(REPORT_TIMEOUT)
 
     def _on_report(self, message: String) -> None:
         if message.data in ROLES and message.data != self._role:
