@@ -322,6 +322,26 @@ def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
     assert made.propose(start.digest()).sentence.startswith(sentence)
 
 
+def test_prior_after_a_change_is_the_model_that_flew_and_the_file_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong model that looked like a change was the prior from then on, and each later model had entries at their bounds."""
+    made, file = made_learner(scenario()), load_airframe("osprey")
+    flew = file.with_matrices(file.matrix_a(), 1.1 * file.matrix_b(), np.ones((8, 3)))
+    at_bounds = tuple(Entry("B", "p", name, 1.0, -0.6, 0.1, 1.0) for name in ("aileron", "rudder"))
+    coloured = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
+    refused = Part(("aileron", "rudder"), ("p", "r"), at_bounds, coloured, coloured, "at a bound", 0.0, gusts=False)
+    identified = Mock(return_value=SimpleNamespace(parts=(refused,)))
+    monkeypatch.setattr(design_learner, "identify", identified)
+    monkeypatch.setattr(made, "_changes", lambda _: [Change(("p", "r"), 10.0, {"rudder": 0.4}, "")])
+    monkeypatch.setattr(made, "_model", flew)
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+    made.propose(made._proposed)
+    monkeypatch.setattr(made, "_changes", lambda _: [])
+    for _ in range(2):
+        made.propose(made._proposed)
+    assert [call.args[1] for call in identified.call_args_list] == [flew, file, flew]
+
+
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     white, flown = Prediction(np.ones(2), np.ones(2), 1.0), load_airframe("osprey")
     effects = Entry("B", "q", "elevator", 56.1499, -0.3, 0.02, 56.1499), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)

@@ -29,6 +29,7 @@ from flight_analysis.design.model_identification import (
     Identification,
     Part,
     Unknown,
+    another_airframe,
     best_known,
     identify,
     with_entries,
@@ -197,6 +198,9 @@ class Learner:
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
             )
+        if self._changed and any(another_airframe(part.entries, self._rough.name, AT_BOUND) for part in identified.parts):
+            # the model that flew may have been the wrong one, and not the aircraft have changed
+            self._prior = self._model if self._prior is self._rough else self._rough
         if not sentences:
             return Proposal(None, "; ".join(refusals) or "each part flies the law of the start from before on")
         proposed = self._designed(model, known, gone)
