@@ -27,7 +27,7 @@ from flight_view.flight import Flight
 
 pytestmark = pytest.mark.package("flight_view")
 
-PEER_TOPICS = ("target",)
+PEER_TOPICS = ("target", "truth")
 
 
 class Page:
@@ -84,7 +84,7 @@ def test_target_not_taken_by_guidance_ends_when_cancelled(peer_node: Peer) -> No
             sent.result()
 
 
-def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path: Path) -> None:
+def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path: Path, peer_node: Peer) -> None:
     flight = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e4, "osprey_gust")))  # ended below
     flight.wait_for_log(tmp_path / "runs", 50_000)
     run = next(path for path in (tmp_path / "runs").iterdir() if path.is_dir() and not path.is_symlink())
@@ -106,12 +106,13 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
 
     assert page.post("fault", values={"sensors.bias": [0.01, 0.0, 0.0, 0.0]})[0] == 200
     assert page.post("fault", values={"actuators.stuck_at": [None, None, None, 0]})[0] == 200
-    assert page.post("gust", axis="vertical", speed=3.0, length=10.0)[0] == 200
+    assert page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200  # 4 s: a pause of the host hides no gust
+    truth = peer_node.received["truth"]
+    peer_node.until(lambda: any(message.position[message.name.index("gust.vertical")] > 2.0 for message in truth[-1:]))
     status, refused = page.post("fault", values={"sensors.dropout": 2.0})
     assert (status, "sensors.dropout" in refused["refused"]) == (422, True)
     assert page.post("deactivate")[0] == 200
     assert page.post("activate")[0] == 200
-    time.sleep(1.5)  # the gust of 10 m at 25 m/s
     flight.interrupt()
     assert flight.end() == 130, flight.output
     assert watch.interrupt().end() == 0, watch.output
