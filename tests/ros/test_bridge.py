@@ -32,7 +32,7 @@ from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 from tests.ros.conftest import HostDelays, Process, Start, settable_clock
-from tests.ros.peer import HANG, Peer, peer, stamp_ns
+from tests.ros.peer import Peer, peer, stamp_ns
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -171,9 +171,9 @@ class BridgeSetup:
                 self.peer.until(pending.done)
                 assert pending.result() == ""
 
-    def until_logged(self, process: Process, *parts: str, timeout: float = 30.0) -> None:
+    def until_logged(self, process: Process, *parts: str) -> None:
         """Spin until a line of a process contains the parts, so that few messages wait to be read."""
-        self.peer.until(lambda: process.has_logged(*parts), timeout)
+        self.peer.until(lambda: process.has_logged(*parts))
 
     def wait_for_joys(self) -> None:
         """Wait for six further messages to the autopilot."""
@@ -255,7 +255,7 @@ def test_unchanged_controller_tracks_through_map_and_when_killed_releases_channe
     assert last + MAX_AGE < min(released) < MAX_AGE + late
     assert RELEASE - late < max(released) - min(released) < RELEASE + late
     assert len(released) > (RELEASE - late) * 40.0  # sent at 50 Hz
-    setup.until_logged(restarted, "-> INACTIVE", timeout=HANG)  # so that its integrals do not wind up
+    setup.until_logged(restarted, "-> INACTIVE")  # so that its integrals do not wind up
 
 
 def test_pilot_override_stopped_autopilot_and_end_of_bridge_each_release_channels(

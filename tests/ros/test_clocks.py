@@ -3,7 +3,9 @@
 """Clocks of nodes on other hosts: the estimate of offset and delay, and what a node says of a clock that differs."""
 
 import random
+import re
 import struct
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -54,8 +56,13 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
     controller = start_node("rise_di_controller")
     aircraft = start_node("aircraft_sim", within=shifted)
     name = f"/aircraft#{aircraft.popen.pid}"
-    controller.wait_for(f"the clock of {name} is 0.150 s behind this one: synchronise the hosts")
-    controller.wait_for(f"old: the clock of {name} is 0.150 s behind this one")
+    estimate = rf"the clock of {name} is (0\.\d+) s behind this one"
+
+    def told(sentence: str) -> bool:  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
+        return any(float(found) == pytest.approx(0.15, abs=0.01) for found in re.findall(sentence, controller.output))
+
+    controller.until(partial(told, f"{estimate}: synchronise the hosts"))
+    controller.until(partial(told, f"old: {estimate}"))
     with peer(topics=()) as peer_node:
         found: list[float] = []
 
@@ -64,5 +71,4 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
             found.extend(float(values[key]) for key in [f"clock of {name} (s)"] if key in values)
 
         peer_node.node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, take, 10)
-        peer_node.until(lambda: bool(found))
-    assert found[0] == pytest.approx(-0.15, abs=0.002)
+        peer_node.until(lambda: any(offset == pytest.approx(-0.15, abs=0.002) for offset in found))
