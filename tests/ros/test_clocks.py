@@ -59,7 +59,7 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
     estimate = rf"the clock of {name} is (0\.\d+) s behind this one"
 
     def told(sentence: str) -> bool:  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
-        return any(float(found) == pytest.approx(0.15, abs=0.01) for found in re.findall(sentence, controller.output))
+        return any(float(offset) == pytest.approx(0.15, abs=0.01) for offset in re.findall(sentence, controller.output))
 
     controller.until(partial(told, f"{estimate}: synchronise the hosts"))
     controller.until(partial(told, f"old: {estimate}"))
