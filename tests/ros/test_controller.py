@@ -202,10 +202,8 @@ def test_overrun_of_controller_does_not_free_publisher_lock(start_node: Start, p
     def conflict() -> None:
         peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.ones(4), "/foreign"))
 
-    def send_both() -> (
-        None
-    ):  # y first: after a pause of the host that is longer than age limit, hold and ramp, any may take over
-        peer_node.send(0.01)
+    def send_both() -> None:
+        peer_node.send(0.01)  # first: after a pause of the host beyond age limit, hold and ramp any publisher may take over
         conflict()
 
     peer_node.spin(0.05)  # the controller takes all samples
