@@ -17,10 +17,11 @@ import numpy as np
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.airspeed import at_speed, exponents, level_flight
 from flight_analysis.closed_loop.learning import Proposal
-from flight_analysis.design.change_test import ANGLE, RECORD, Change, change_test
+from flight_analysis.design.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from flight_analysis.design.gain_selection import ChannelPairing
 from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_analysis.design.model_identification import (
+    HELD_OUT,
     KNOWN,
     MAX_DEVIATION,
     MAX_WHITENESS,
@@ -249,9 +250,11 @@ class Learner:
     def _acts(self, name: str, identified: Identification) -> bool:
         """Whether an identified model predicts the held-out samples better than one that is identified without an input.
 
-        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not.
+        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not. Better
+        is a gain of log-likelihood above the limit of the test: with a fifth of a dead rudder's effect it was 1.1.
         """
-        return identified.after.log_likelihood > self._identified(without=name).after.log_likelihood
+        gain = identified.after.log_likelihood - self._identified(without=name).after.log_likelihood  # of a sample
+        return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN
 
     def _identified(self, without: str = "") -> Identification:
         """A and B from the record, about the prior, `without` the effect of an input; also from the model that flies on.
