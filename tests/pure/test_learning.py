@@ -328,7 +328,7 @@ def test_prior_after_a_change_is_the_model_that_flew_and_the_file_in_turns(monke
     """A wrong model that looked like a change was the prior from then on, and each later model had entries at their bounds."""
     made, file = made_learner(scenario()), load_airframe("osprey")
     flew = file.with_matrices(file.matrix_a(), 1.1 * file.matrix_b(), np.ones((8, 3)))
-    at_bounds = tuple(Entry("B", "p", name, 1.0, -0.8, 0.1, 1.0) for name in ("aileron", "rudder"))
+    at_bounds = tuple(Entry("B", "p", name, 1.0, -0.6, 0.1, 1.0) for name in ("aileron", "rudder"))
     coloured = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
     refused = Part(("aileron", "rudder"), ("p", "r"), at_bounds, coloured, coloured, "at a bound", 0.0, gusts=False)
     identified = Mock(return_value=SimpleNamespace(parts=(refused,)))

@@ -251,7 +251,7 @@ class Learner:
         """Whether an identified model predicts the held-out samples better than one that is identified without an input.
 
         The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not. Better
-        is a gain of log-likelihood above the limit of the test: with a fifth of a dead rudder's effect it was 1.1.
+        is a gain of log-likelihood above the limit of the test: beside a dead rudder, with wider bounds, it was 1.1.
         """
         gain = identified.after.log_likelihood - self._identified(without=name).after.log_likelihood  # of a sample
         return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN

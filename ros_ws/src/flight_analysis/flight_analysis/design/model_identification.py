@@ -41,10 +41,8 @@ from flight_core.vectors import FloatArray
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
-MAX_ERROR = 0.6  # 1, bound of the error of an entry that is 0, and in parts of PRIOR of the other parameters: two deviations
-MAX_FACTOR = 5.0
-"""1, bound of an entry over its nominal value, and of that over the entry: a rough model errs by a factor either way. Of a
-model that errs by exp(0.6 N) 0.7 % of the entries are beyond. Beyond 2.5 are 13 %."""
+MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
+MAX_FACTOR = 2.5  # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either way
 
 FOLLOWS = 10.0  # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up to 3
 COUPLED_GAIN = 20.0  # of log-likelihood of held-out samples by coupling: uncoupled aircraft have -20
@@ -121,7 +119,6 @@ class Unknown(NamedTuple):
     angle: float = 0.0  # rad, of pitch and bank at the begin of the recording
     effect: float = PRIOR  # 1, of an entry of B before the flight
     drift: float = DRIFT  # sizes/s per root s, of the disturbances
-    factor: float = MAX_FACTOR  # 1, bound of an entry over its nominal value, and of that over the entry
 
 
 KNOWN = Unknown()
@@ -169,7 +166,6 @@ class Entry(NamedTuple):
     error: float
     deviation: float
     unit: float  # of error and deviation, SI: the nominal value where it is not 0
-    factor: float = MAX_FACTOR  # 1, bound of the search: the value over the nominal one, and that over the value
 
     @property
     def name(self) -> str:
@@ -177,14 +173,9 @@ class Entry(NamedTuple):
         return f"{self.matrix}[{self.row}, {self.column}]"
 
     @property
-    def least(self) -> float:
-        """The lower bound of the error."""
-        return 1.0 / self.factor - 1.0 if self.nominal else -MAX_ERROR
-
-    @property
     def largest(self) -> float:
         """The upper bound of the error."""
-        return self.factor - 1.0 if self.nominal else MAX_ERROR
+        return MAX_FACTOR - 1.0 if self.nominal else MAX_ERROR
 
     @property
     def value(self) -> float:
@@ -219,7 +210,7 @@ class Search:
             self.coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1, coupled=coupled)
         self._period = recorded.period
         self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
-        self._drift, self._factor = unknown.drift, unknown.factor
+        self._drift = unknown.drift
         angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
         self._angles, self._angle_deviation = angles if unknown.angle else angles[:0], unknown.angle
         self._model, self._block, self._airframe = block.of(model), block, airframe
@@ -243,9 +234,8 @@ class Search:
         self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
-        self._lower, entries = -self._upper, self.nominal_entries()
-        self._lower[self._errors] = deviation / PRIOR * [entry.least for entry in entries]
-        self._upper[self._errors] = deviation / PRIOR * [entry.largest for entry in entries]
+        self._lower = -self._upper
+        self._upper[self._errors] = deviation / PRIOR * [entry.largest for entry in self.nominal_entries()]
         if len(of_delay):  # no u acts before it is sent
             self._lower[-1] = max(self._lower[-1], -self._delay / self._delay_deviation)
         self._winds = slice(len(deviation), len(deviation) + len(of_winds))
@@ -445,7 +435,7 @@ class Search:
         for matrix, unit, columns in zip("AB", self._units, (self.names.states, self.names.inputs), strict=True):
             values = self._model.A if matrix == "A" else self._model.B
             places += [
-                Entry(matrix, self.names.states[i], columns[j], float(values[i, j]), 0.0, 0.0, float(unit[i, j]), self._factor)
+                Entry(matrix, self.names.states[i], columns[j], float(values[i, j]), 0.0, 0.0, float(unit[i, j]))
                 for i, j in np.argwhere(unit)
             ]
         return [place._replace(deviation=deviation) for place, deviation in zip(places, self.prior.tolist(), strict=False)]
@@ -744,13 +734,12 @@ def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> s
     )
 
 
-def another_airframe(entries: Sequence[Entry], name: str, allowed: int = 0) -> str:
+def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> str:
     """The entries at a bound of the search, if more than `allowed`."""
-    at_bound = [entry.name for entry in entries if not entry.least < entry.error < entry.largest]
+    at_bound = [entry.name for entry in entries if not -MAX_ERROR < entry.error < entry.largest]
     if len(at_bound) > allowed:
-        factor = max(entry.factor for entry in entries)
         return (
-            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, {1.0 / factor:g} or {factor:g}"
+            f"airframe {name}: found {', '.join(at_bound)} at a bound of the search, {1.0 - MAX_ERROR:g} or {MAX_FACTOR:g}"
             " times the nominal value, expected a log of this airframe, in calm air if its effect of wind is not known"
         )
     return ""
