@@ -532,9 +532,9 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
 
 def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence_data.Row]:
     """Mean scores over WINDOWS of the flights to the end, of scores (N, W)."""
-    whole = values[np.isfinite(values).all(axis=1)]
-    for (first, end), mean in zip(WINDOWS, whole.mean(axis=0) if len(whole) else (), strict=bool(len(whole))):
-        yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
+    if len(whole := values[np.isfinite(values).all(axis=1)]):
+        for (first, end), mean in zip(WINDOWS, whole.mean(axis=0), strict=True):
+            yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
 
 
 def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
