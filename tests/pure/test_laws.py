@@ -28,7 +28,7 @@ from flight_analysis.report import layouts
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
-from rise_di_controller import guard, laws, params
+from rise_di_controller import guard, laws
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import ControllerState, GuardParams
@@ -732,9 +732,3 @@ def test_log_varied_only_within_law() -> None:
     assert vary(controller("pi"), {"K": [1.0] * 4}).model_dump()["K"] == (1.0,) * 4
     with pytest.raises(ParameterError, match=r"controller\.k_g: found a parameter of rise_di, expected those of pi: K, Lambda"):
         vary(controller("pi"), {"k_g": 1.0})
-
-
-def test_former_name_of_controller_config_warns() -> None:
-    """A law of an outside package that imports ControllerParameters still loads."""
-    with pytest.warns(FutureWarning, match="now ControllerConfig"):
-        assert params.ControllerParameters is ControllerConfig

@@ -3,10 +3,8 @@
 """The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the sentences about wrong input."""
 
 import ast
-import importlib
 import json
 import re
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, assert_type
@@ -99,35 +97,6 @@ def test_the_law_is_that_of_the_controller() -> None:
 # Old names
 
 
-OLD_NAMES = {
-    *("RecordedRun", "ReplayResult", "Scenario", "Signal", "Tape", "best_error", "data_frame", "error_metrics"),
-    *("load_scenario", "read_run", "recorded_scenario", "replay", "simulate", "summarise"),
-}
-
-
-@pytest.mark.parametrize("name", sorted(OLD_NAMES))
-def test_an_old_name_works_with_a_warning(name: str) -> None:
-    old = importlib.import_module("flight_analysis")
-    replacement = "find_scenario" if name == "load_scenario" else name
-    with pytest.warns(FutureWarning, match=rf"^flight_analysis\.{name}: .* rise_di\.{replacement} "):
-        value = getattr(old, name)
-    if name != "load_scenario":
-        assert value is getattr(rise_di, name)
-
-
-def test_old_names_are_imported_as_before() -> None:
-    with pytest.warns(FutureWarning, match="flight_analysis.load_scenario"):
-        from flight_analysis import load_scenario  # noqa: PLC0415
-    assert load_scenario(SCENARIO.path).controller == SCENARIO.controller
-
-
-def test_a_module_of_flight_analysis_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
-    from flight_analysis import metrics  # noqa: PLC0415
-
-    assert metrics is sys.modules["flight_analysis.metrics"]
-    assert not recwarn
-
-
 # A flight
 
 
@@ -144,14 +113,6 @@ def test_the_summary_of_a_tape_needs_nothing_else(tape: rise_di.Tape) -> None:
     assert summary == rise_di.summarise(tape, SOFT, tape.outcome)
     assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 2.0)
     assert summary["errors"]["q"]["whole"] == rise_di.error_metrics(rise_di.best_error(tape)[1]["q"])._asdict()
-
-
-def test_the_old_order_of_the_summary_works_with_a_warning(tape: rise_di.Tape) -> None:
-    old: Any = rise_di.summarise
-    with pytest.warns(FutureWarning, match=r"the order is summarise\(tape, scenario, outcome\)"):
-        assert old(SOFT, tape, tape.outcome) == rise_di.summarise(tape)
-    with pytest.warns(FutureWarning, match="the order is"):
-        assert old(SOFT, tape, "interrupted")["outcome"] == "interrupted"
 
 
 def test_a_data_frame_has_the_samples_of_the_tape(tape: rise_di.Tape) -> None:

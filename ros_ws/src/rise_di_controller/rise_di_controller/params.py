@@ -6,7 +6,6 @@ The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by th
 """
 
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import blake2b
 from itertools import combinations
@@ -474,14 +473,6 @@ class ControllerConfig(NodeConfig):
             nominal=self._flown_nominal(),
             vanes=tuple(self._model_states().index(name) for name in self.vanes),
         )
-
-
-def __getattr__(name: str) -> Any:
-    """Keep the name that laws of packages outside the stack import, for one minor version."""
-    if name == "ControllerParameters":
-        warnings.warn("rise_di_controller.params.ControllerParameters is now ControllerConfig", FutureWarning, stacklevel=2)
-        return ControllerConfig
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def as_controller(value: object, key: str) -> ControllerConfig:

@@ -3,7 +3,6 @@
 """Metrics of a flight for `summary.json` and the tables, with the units and columns of the tables."""
 
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -45,7 +44,6 @@ from flight_log.clock import SINCE_EPOCH_NS
 from rise_di_controller.linear_loop import delay_margin
 
 NO_VALUE = "-"
-OLD_ORDER = "summarise(scenario, tape, outcome): the order is summarise(tape, scenario, outcome), and summarise(tape) is enough"
 
 
 class DisplayUnit(NamedTuple):
@@ -142,11 +140,7 @@ def summarise(
 
     Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `of` is the account of
     the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
-    The order `summarise(scenario, tape, outcome)` of version 0.2 works with a warning.
     """
-    if isinstance(tape, Scenario):
-        warnings.warn(OLD_ORDER, FutureWarning, stacklevel=2)
-        return summarise(as_tape(scenario), tape, outcome)
     flown = as_tape(tape).scenario if scenario is None else scenario
     require(flown is not None, "scenario", "none on the tape of a log", "summarise(run.tape, recorded_scenario(run))")
     scenario = as_scenario(flown)
