@@ -478,17 +478,6 @@ def test_messages_decoded_together_equal_those_decoded_one_by_one(messages: list
     assert sorted(decoded) == one_by_one(messages)
 
 
-def test_messages_with_codes_are_decoded_together() -> None:
-    """Codes of earlier versions differ in each message."""
-    decode = decoder(JOINT_STATE)
-    assert decode is not None
-    (table,) = tables([vector(k, ("q",), (0.1 * k,), f"/aircraft#1;mac={k:032x}") for k in range(5)])
-    (samples,) = decode(table).samples
-    assert samples.sender == "/aircraft#1"
-    assert samples.stamp_ns.tolist() == list(range(5))
-    assert samples.values.tolist() == [[0.1 * k] for k in range(5)]
-
-
 def test_types_of_joint_state_are_those_of_ros_2() -> None:
     ours = joint_state_types().fielddefs
     assert {name: ours[name] for name in JOINT_STATE_TYPES} == {name: STORE.fielddefs[name] for name in JOINT_STATE_TYPES}

@@ -62,13 +62,6 @@ def test_decoder_follows_change_of_channel_names_or_publisher() -> None:
         assert (sample.value.tolist(), sample.sender) == ([1.0], frame_id)
 
 
-def test_code_of_earlier_version_is_no_part_of_sender() -> None:
-    decoder = Decoder(("q",))
-    for code in ("0" * 32, "f" * 32):  # as `rise-di play` publishes a log with codes
-        raw = Encoder(("q",), f"/aircraft#1;mac={code}").encode(5, np.array([1.0]))
-        assert decoded(decoder, raw).sender == sender_of(raw) == "/aircraft#1"
-
-
 @given(st.binary(max_size=100))
 def test_sender_of_any_bytes_is_text_or_none(raw: bytes) -> None:
     assert isinstance(sender_of(raw), str | None)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Attacks from this host and from another host: reception of y, forged and replayed u, transport. Keys of earlier versions."""
+"""Attacks from this host and from another host: reception of y, forged and replayed u, transport."""
 
 import json
 import shutil
@@ -15,14 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import psutil
 import pytest
-import yaml
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import INPUTS, Peer
 
-from autopilot_bridge.params import find_map, load_map
-from flight_bringup.scenarios import find_scenario
-from flight_core.parameters import ParameterError
 from flight_ros.messages import Encoder
 from flight_ros.topics import U
 from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
@@ -84,48 +80,6 @@ def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None
     second = aircraft(start_node, "-p", "max_age:=0.1")
     peer_node.until(partial(peer_node.counted, "refused u: old"), each=lambda: publisher.publish(replayed))
     assert "receiving u from" not in second.output
-
-
-# The message key of earlier versions
-
-REFUSAL = (
-    "found a message key, expected none: messages no longer carry codes; "
-    "DDS Security (SROS2), or a tunnel between hosts, protects a flight (docs/security.md)"
-)
-
-
-@pytest.mark.parametrize("node", ["aircraft_sim", "reference_model", "rise_di_controller"])
-def test_node_refuses_key_file(node: str, start_node: Start) -> None:
-    process = start_node(node, "-p", "key_file:=flight.key")
-    assert process.end() == 2
-    assert process.output.startswith("error: ")
-    assert process.output.endswith(f".key_file: {REFUSAL}")
-
-
-@pytest.mark.parametrize("section", ["aircraft", "reference_model", "controller", "recorder", "guidance", "flight"])
-def test_scenario_with_key_file_refused(section: str, start: Start, tmp_path: Path) -> None:
-    sections = yaml.safe_load(find_scenario("osprey_route").path.read_text(encoding="utf-8"))
-    sections[f"/**/{section}"]["ros__parameters"]["key_file"] = "flight.key"
-    path = tmp_path / "keyed.yaml"
-    path.write_text(yaml.safe_dump(sections), encoding="utf-8")
-    flight = start("flight_cli.cli", "fly", str(path), "--in-process", "--duration", "1")
-    assert flight.end() == 2
-    assert flight.output == f"error: {section}.key_file: {REFUSAL}"
-
-
-def test_map_with_key_file_refused(tmp_path: Path) -> None:
-    path = tmp_path / "keyed.yaml"
-    path.write_text("key_file: flight.key\n" + find_map("px4").read_text(encoding="utf-8"), encoding="utf-8")
-    with pytest.raises(ParameterError) as refused:
-        load_map(str(path))
-    assert str(refused.value).endswith(f"key_file: {REFUSAL}")
-
-
-@pytest.mark.parametrize("words", [("target", "altitude=60"), ("watch", "--control")])
-def test_command_refuses_key_file(words: tuple[str, ...], start: Start) -> None:
-    command = start("flight_cli.cli", *words, "--key-file", "flight.key")
-    assert command.end() == 2
-    assert command.output == f"error: --key-file: {REFUSAL}"
 
 
 # Sockets

@@ -9,19 +9,10 @@ from typing import Annotated
 import typer
 
 from flight_core.environment import require_ros_environment
-from flight_core.parameters import REMOVED, ParameterError, require
+from flight_core.parameters import ParameterError, require
 from flight_guidance.modes import ANGLES, TARGETS
 
 REFUSED = 1
-
-
-def _refuse_key(file: str | None) -> None:
-    if file is not None:
-        raise ParameterError(f"--key-file: {REMOVED['key_file']}")
-
-
-RemovedKeyFile = Annotated[str | None, typer.Option("--key-file", hidden=True, callback=_refuse_key)]
-"""An option of earlier versions, which is refused."""
 
 
 def target(
@@ -34,7 +25,6 @@ def target(
         ),
     ],
     namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
-    _: RemovedKeyFile = None,
 ) -> None:
     """Command a running guided flight, as in: rise-di target heading=90 altitude=1300. What is not named stays.
 

@@ -14,7 +14,6 @@ import typer
 from flight_bringup.processes import end_with_parent
 from flight_cli.log_options import LogScenario, scenario_file
 from flight_cli.route_options import parse_origin
-from flight_cli.target import RemovedKeyFile
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import missing
@@ -64,7 +63,6 @@ def watch(
         Path | None, typer.Option(metavar="FILE", help="GeoJSON of lines, polygons and points for the map, with --origin.")
     ] = None,
     origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for --background.")] = None,
-    _: RemovedKeyFile = None,
     runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.

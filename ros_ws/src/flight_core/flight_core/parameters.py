@@ -13,19 +13,10 @@ import difflib
 import inspect
 import json
 from collections.abc import Iterator, Mapping, Sequence, Set
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_origin
 
 from flight_core.fields import REQUIRED, Field, FieldInfo, Problems, short_repr
 from flight_core.text import bounded
-
-REMOVED: Mapping[str, str] = MappingProxyType(
-    {
-        "key_file": "found a message key, expected none: messages no longer carry codes; "
-        "DDS Security (SROS2), or a tunnel between hosts, protects a flight (docs/security.md)"
-    }
-)
-"""Keys of earlier versions, with the rest of the sentence that refuses a key. The scenario in a log may hold the keys."""
 
 
 class ParameterError(ValueError):
@@ -102,8 +93,6 @@ class Config:
         for name in values:
             if not isinstance(name, str):
                 problems.unknown.append(f"{key}: found the key {short_repr(name)}, expected a name")
-            elif name in REMOVED and name not in cls.model_fields:
-                problems.unknown.append(f"{key}.{name}: {REMOVED[name]}")
             elif name not in cls.model_fields:
                 problems.unknown.append(f"{key}.{name}: unknown key, expected {one_of(sorted(cls.model_fields), name)}")
         if len(problems.sentences()) > before:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publisher lock of a topic with a single publisher: samples of a conflicting publisher are ignored.
 
-A message names the publisher in `frame_id`.
+A message names the publisher in `frame_id`, e.g. "/controller#4711".
 """
 
 from collections.abc import Callable
@@ -10,12 +10,6 @@ from collections.abc import Callable
 from flight_core.vectors import ChannelError
 
 SENDER = "sender"  # the reason of a ChannelError for a sample of a conflicting publisher
-CODE = ";mac="  # begins the message authentication code that earlier versions appended to the publisher in `frame_id`
-
-
-def publisher_of(frame_id: str) -> str:
-    """The publisher in `header.frame_id`, e.g. "/controller#4711", without the code of earlier versions."""
-    return frame_id.partition(CODE)[0]
 
 
 class PublisherLock:

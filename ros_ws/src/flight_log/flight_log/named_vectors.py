@@ -17,7 +17,6 @@ from rosbags.serde.errors import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from flight_core.publisher_lock import publisher_of
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import FloatArray
 
@@ -139,11 +138,6 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
     return slice(start, start + marks.nbytes)
 
 
-def _code(frame_id: str) -> slice:
-    """The place of the message authentication code that earlier versions appended to the publisher; empty without a code."""
-    return slice(FRAME_ID + len(publisher_of(frame_id).encode()), FRAME_ID + len(frame_id.encode()))
-
-
 def decode_routes(table: Table) -> Decoded:
     """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT a waypoint."""
     samples, unreadable = [], 0
@@ -191,7 +185,7 @@ class _JointStateDecoder:
                 continue
             stamp = vector.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
-            samples.append(Samples(tuple(vector.name), stamps, vector.position[None], publisher_of(vector.header.frame_id)))
+            samples.append(Samples(tuple(vector.name), stamps, vector.position[None], vector.header.frame_id))
         if rest:
             self._learn(rest[-1])
         return Decoded(samples, unreadable)
@@ -228,8 +222,10 @@ class _JointStateDecoder:
         values = _position(marked, marks)
         if len(marked) != len(message) or message[values] != vector.position.tobytes():
             return
-        self._names, self._values, self._sender = tuple(vector.name), values, publisher_of(vector.header.frame_id)
+        self._names = tuple(vector.name)
+        self._values = values
+        self._sender = vector.header.frame_id
         self._template = np.frombuffer(message, dtype="<u4")  # a message without velocity and effort ends with their lengths
         constant = np.full(len(message), 255, dtype=np.uint8)
-        constant[STAMP] = constant[self._values] = constant[_code(vector.header.frame_id)] = 0
+        constant[STAMP] = constant[self._values] = 0
         self._constant = constant.view("<u4")

@@ -18,7 +18,6 @@ from builtin_interfaces.msg import Time
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from flight_core.publisher_lock import publisher_of
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
 from flight_ros.rclpy_private import DeserializationError
@@ -50,7 +49,7 @@ def from_message(message: JointState, wanted: Sequence[str]) -> StampedVector:
     """The wanted channels of a message. Raises ChannelError for invalid names, lengths or values."""
     stamp = message.header.stamp
     value = select(wanted, message.name, message.position)
-    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, publisher_of(message.header.frame_id))
+    return StampedVector(stamp.sec * NANOSECONDS + stamp.nanosec, value, message.header.frame_id)
 
 
 class Encoder:
@@ -129,7 +128,7 @@ class Decoder:
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # more than a named vector: the middleware decodes it each time
         self._names, self._place = list(message.name), encoder.place
-        self._sender = publisher_of(message.header.frame_id)
+        self._sender = message.header.frame_id
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
 
@@ -162,7 +161,7 @@ def sender_of(raw: bytes) -> str | None:
     if len(raw) < FRAME_ID_PLACE or (order := BYTE_ORDERS.get(raw[:2])) is None:
         return None
     length = int.from_bytes(raw[LENGTH_PLACE:FRAME_ID_PLACE], order)
-    return publisher_of(raw[FRAME_ID_PLACE : FRAME_ID_PLACE + length - 1].decode(errors="replace"))
+    return raw[FRAME_ID_PLACE : FRAME_ID_PLACE + length - 1].decode(errors="replace")
 
 
 def stamp_of(raw: bytes) -> int:

@@ -10,7 +10,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.serialization import deserialize_message, serialize_message
 
-from flight_core.publisher_lock import publisher_of
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError
 from flight_ros.rclpy_private import DeserializationError
@@ -48,6 +47,6 @@ def decode(raw: bytes) -> Report:
     except (DeserializationError, ValueError, RecursionError) as error:  # ValueError: of json, or not one status
         raise ChannelError("malformed", " ".join(str(error).split())) from None
     stamp = message.header.stamp
-    sender = publisher_of(message.header.frame_id)
+    sender = message.header.frame_id
     warns = status.level != DiagnosticStatus.OK
     return Report(stamp.sec * NANOSECONDS + stamp.nanosec, sender, status.message, values, warns)

@@ -16,7 +16,7 @@ from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 from rosbags.serde.errors import SerdeError
 
-from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_scenario_sections
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.metrics import ModelSpan, known_entries, settling_bands
 from flight_analysis.report.guided import mission_drawing
 from flight_analysis.report.run_folder import log_account
@@ -148,7 +148,6 @@ class Flight:
         self._asked = namespace is not None
         self._namespace = None if namespace is None else f"/{namespace.strip('/')}".rstrip("/")
         self._kinds: dict[str, str] = {}  # types of the topics of the log, by full name
-        self._takes_routes = True  # whether guidance takes a route in flight
         self._unreadable = 0
         self._start_ns: int | None = None  # by `truth`
         self._reference_ns: int | None = None  # of the first y_m
@@ -315,9 +314,7 @@ class Flight:
     def _take_scenario(self, content: bytes) -> None:
         try:
             path = Path("scenario.yaml")
-            self.scenario = parse_recorded_scenario(content, path)
-            # Guidance of an earlier version with a key refused every route.
-            self._takes_routes = not parse_scenario_sections(content, path).get("guidance", {}).get("key_file")
+            self.scenario = parse_scenario(content, path)
             self.described += 1
             self.description |= _described(self.scenario)  # reads the airframe, maybe a file of another machine
         except ParameterError as error:
@@ -452,7 +449,7 @@ class Flight:
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route received in flight replaces the route before, unless guidance refuses the new route."""
         guided = None if self.scenario is None else self.scenario.guidance
-        if guided is None or not self._takes_routes:
+        if guided is None:
             return
         try:
             self.description |= _mission(guided, waypoints)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.scenario import Scenario, parse_recorded_scenario, parse_recorded_sections
+from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
 from flight_core.arguments import FilePath
 from flight_core.arithmetic import arithmetic
 from flight_core.fields import short_repr
@@ -98,14 +98,14 @@ class ReplayResult(NamedTuple):
 
 def recorded_parameters(scenario: StoredFile) -> ControllerConfig:
     """The controller's section of the scenario in a log; further sections are not validated. Raises ParameterError."""
-    sections = parse_recorded_sections(scenario.content, Path(scenario.name))
+    sections = parse_scenario_sections(scenario.content, Path(scenario.name))
     return AnyLaw.validate_mapping(sections["controller"], "controller")
 
 
 def recorded_scenario(run: RecordedRun | StoredFile | FilePath) -> Scenario:
     """The scenario of a run, by the run as read, by its folder, or by its scenario as stored. Raises ParameterError."""
     stored = run if isinstance(run, StoredFile) else _as_run(run).scenario_file()
-    return parse_recorded_scenario(stored.content, Path(stored.name))
+    return parse_scenario(stored.content, Path(stored.name))
 
 
 def _as_run(run: RecordedRun | FilePath) -> RecordedRun:

@@ -14,7 +14,7 @@ from flight_core.arguments import FilePath, as_instance, as_path
 from flight_core.channels import RATES_AND_SPEED
 from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, read_file
-from flight_core.parameters import REMOVED, Config, ParameterError, one_of, require, require_channels
+from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
 from flight_guidance.fence import described
@@ -150,7 +150,7 @@ def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
-    """The scenario in the content of a file, validated. Raises ParameterError."""
+    """The scenario in the content of a file or of a log, validated. Raises ParameterError."""
     return scenario_of(path.stem, path, parse_scenario_sections(content, path))
 
 
@@ -167,17 +167,6 @@ def scenario_of(name: str, path: Path, sections: Mapping[str, Mapping[str, Any]]
 def parse_scenario_sections(content: bytes, path: Path) -> Sections:
     """The sections in the content of a scenario file, not validated yet. Raises ParameterError."""
     return parse_sections(content, path, tuple(name for name in SCHEMAS if name not in OPTIONAL), OPTIONAL)
-
-
-def parse_recorded_sections(content: bytes, path: Path) -> Sections:
-    """The sections in the scenario of a log, without the keys of earlier versions, not validated yet. Raises ParameterError."""
-    sections = parse_scenario_sections(content, path)
-    return {name: {key: section[key] for key in section if key not in REMOVED} for name, section in sections.items()}
-
-
-def parse_recorded_scenario(content: bytes, path: Path) -> Scenario:
-    """The scenario of a log, validated. Raises ParameterError."""
-    return scenario_of(path.stem, path, parse_recorded_sections(content, path))
 
 
 def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, controller: ControllerConfig) -> dict[str, Any]:

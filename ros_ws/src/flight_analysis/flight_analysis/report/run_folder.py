@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from aircraft_sim.jsbsim_aircraft import model_archive
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_recorded_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
 from flight_analysis.report.account import Account, account, flown, outcome_of_log
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise, summarise_imported
 from flight_core.arguments import FilePath
@@ -129,7 +129,7 @@ def log_account(recorded: RecordedRun) -> Account | None:
     if IMPORTED in recorded.metadata:
         return account(recorded.tape, None)
     try:
-        scenario = parse_recorded_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
+        scenario = parse_scenario(recorded.scenario_file().content, Path(recorded.scenario_file().name))
     except ParameterError:
         return None
     simulated = recorded.engagements is None
@@ -163,7 +163,7 @@ def recorded_scenario(run: Path, namespace: str | None = None) -> Scenario:
 def _scenario_in(recorded: RecordedRun, run: Path) -> Scenario:
     """The scenario in a log, with a path beside the log. Raises ParameterError."""
     stored = recorded.scenario_file()
-    return parse_recorded_scenario(stored.content, _folder(run) / stored.name)
+    return parse_scenario(stored.content, _folder(run) / stored.name)
 
 
 def _write_scenario(recorded: RecordedRun, path: Path) -> None:
