@@ -18,18 +18,15 @@ from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.arithmetic import (
-    ARITHMETIC,
-    ARITHMETIC_OF_HOST,
     MAX_ANGLE,
     PI_HIGH,
     PI_LOW,
-    arithmetic,
     inverse,
     product,
     sine,
 )
 from flight_core.parameters import ParameterError
-from flight_log.provenance import provenance, recorded_arithmetic
+from flight_log.provenance import provenance
 from flight_log.tape_reader import RecordedRun, StoredFile
 
 pytestmark = pytest.mark.package("flight_core")
@@ -107,33 +104,10 @@ def test_jax_is_near() -> None:
             assert np.abs(jax.jit(sine)(x) - sine(x)).max() < 1e-15
 
 
-def test_log_replays_with_arithmetic_of_its_provenance() -> None:
-    """A flight with feedforward and observer as an earlier version computed it, and as this version does."""
-    scenario = find_scenario("osprey_observer", 2.0)
-    stored = StoredFile("osprey_observer.yaml", scenario_yaml(scenario).encode())
-    for flown, different in ((ARITHMETIC_OF_HOST, ARITHMETIC), (ARITHMETIC, ARITHMETIC_OF_HOST)):
-        with arithmetic(flown):
-            tape = simulate(scenario)
-        equal = {}
-        for number in (flown, different):
-            names = {} if number == ARITHMETIC_OF_HOST else {"arithmetic": number}
-            run = RecordedRun(tape, stored, {"rise_di_versions": {"python": "3.12", **names}})
-            result = replay(run)
-            assert result.checked.all()
-            equal[number] = result.equal()
-        assert equal == {flown: True, different: False}
-
-
-def test_arithmetic_of_host_is_for_logs_without_number() -> None:
-    rng = np.random.default_rng(5)
-    matrix, x = rng.normal(size=(8, 8)), rng.normal(size=8)
-    with arithmetic(ARITHMETIC_OF_HOST):
-        assert product(matrix, x).tobytes() == (matrix @ x).tobytes()
-        assert sine(x).tobytes() == np.sin(x).tobytes()
-        assert inverse(matrix).tobytes() == np.linalg.inv(matrix).tobytes()
-    assert product(matrix, x).tobytes() != (matrix @ x).tobytes()
-    assert recorded_arithmetic(provenance()) == recorded_arithmetic({}) == ARITHMETIC
-    assert recorded_arithmetic({"rise_di_versions": {"python": "3.12"}}) == ARITHMETIC_OF_HOST
-    sentence = "arithmetic: found 7, expected 0 or 1: a later version recorded the log"
-    with pytest.raises(ParameterError, match=sentence), arithmetic("7"):
-        pass
+def test_log_of_another_arithmetic_refused() -> None:
+    scenario = find_scenario("osprey_servo", 0.5)
+    stored = StoredFile("osprey_servo.yaml", scenario_yaml(scenario).encode())
+    tape = simulate(scenario)
+    assert replay(RecordedRun(tape, stored, provenance())).equal()
+    with pytest.raises(ParameterError, match="arithmetic: found 7, expected 1: a later version recorded the log"):
+        replay(RecordedRun(tape, stored, {"rise_di_versions": {"arithmetic": "7"}}))

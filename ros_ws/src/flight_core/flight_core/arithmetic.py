@@ -7,20 +7,13 @@ bit. XLA, the compiler of JAX, may contract a product and a sum into a fused mul
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 
 import numpy as np
 
-from flight_core.parameters import require
 from flight_core.vectors import Array, FloatArray, Scalar, array_namespace
 
 ARITHMETIC = "1"
 """Number of this arithmetic in the provenance of a log."""
-
-ARITHMETIC_OF_HOST = "0"
-"""Arithmetic of logs without a number: `@`, `numpy.sin` and `numpy.linalg.inv`, whose last bits depend on the host."""
 
 MAX_ANGLE = 1e6
 """Largest angle of `sine`, rad: a larger angle counts as MAX_ANGLE."""
@@ -34,16 +27,12 @@ SINE_COEFFICIENTS = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range
 ROUNDING = 1.5 * 2.0**52
 """x + ROUNDING - ROUNDING is the integer nearest to x, half to even, for abs(x) < 2^51."""
 
-_of_host: ContextVar[bool] = ContextVar("_of_host", default=False)
-
 
 def product(matrix: Array, vector: Array) -> Array:
     """Sum of matrix[:, j] vector[j] over the columns j = 0, 1, ..., in this order; the shape is (k,) or (k, N).
 
     Shapes: matrix (k, s) and vector (s,) or (s, N), or N matrices (k, s, N) and vectors (s, N), s > 0.
     """
-    if matrix.ndim == 2 and _of_host.get():
-        return matrix @ vector
     if matrix.ndim == 2 and isinstance(vector, np.ndarray) and vector.ndim == 1:
         return np.add.accumulate(matrix * vector, axis=1)[:, -1]
     if matrix.ndim == vector[0].ndim + 1:
@@ -61,8 +50,6 @@ def sine(x: Scalar) -> Scalar:
     k. The remainder of the series is at most (pi / 2)^21 / 21! = 2.6e-16.
     """
     xp = array_namespace(x)
-    if _of_host.get():
-        return xp.sin(x)
     x = xp.minimum(xp.maximum(x, -MAX_ANGLE), MAX_ANGLE)
     k = _rounded(x * INVERSE_PI)
     odd = k - 2.0 * _rounded(0.5 * k)  # 0 for even k, -1 or 1 for odd k
@@ -81,8 +68,6 @@ def _rounded(x: Scalar) -> Scalar:
 
 def inverse(matrix: FloatArray) -> FloatArray:
     """Inverse of a regular matrix (m, m) by Gauss-Jordan elimination with the largest pivot of each column."""
-    if _of_host.get():
-        return np.asarray(np.linalg.inv(matrix))
     m = len(matrix)
     rows = np.hstack([matrix, np.eye(m)])
     for j in range(m):
@@ -93,15 +78,3 @@ def inverse(matrix: FloatArray) -> FloatArray:
             if i != j:
                 rows[i] = rows[i] - rows[i, j] * rows[j]
     return rows[:, m:]
-
-
-@contextmanager
-def arithmetic(number: str) -> Iterator[None]:
-    """Compute with the arithmetic of a log, for replay. Raises ParameterError for an unknown number."""
-    known = (ARITHMETIC_OF_HOST, ARITHMETIC)
-    require(number in known, "arithmetic", number, f"{' or '.join(known)}: a later version recorded the log")
-    token = _of_host.set(number == ARITHMETIC_OF_HOST)
-    try:
-        yield
-    finally:
-        _of_host.reset(token)

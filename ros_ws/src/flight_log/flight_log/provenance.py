@@ -15,7 +15,7 @@ from pathlib import Path
 
 import psutil
 
-from flight_core.arithmetic import ARITHMETIC, ARITHMETIC_OF_HOST
+from flight_core.arithmetic import ARITHMETIC
 
 # All packages of the stack, as in ros_ws/src.
 STACK = (
@@ -65,8 +65,8 @@ def provenance() -> dict[str, dict[str, str]]:
 
 
 def recorded_arithmetic(metadata: Mapping[str, Mapping[str, str]]) -> str:
-    """Number of the arithmetic of u in a log: versions without a number are older; a log without versions has the present."""
-    return metadata.get(VERSIONS, {"arithmetic": ARITHMETIC}).get("arithmetic", ARITHMETIC_OF_HOST)
+    """Number of the arithmetic of u in a log; that of this version where the log has none."""
+    return metadata.get(VERSIONS, {}).get("arithmetic", ARITHMETIC)
 
 
 def versions() -> dict[str, str]:

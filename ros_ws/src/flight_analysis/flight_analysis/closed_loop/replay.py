@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
 from flight_core.arguments import FilePath
-from flight_core.arithmetic import arithmetic
+from flight_core.arithmetic import ARITHMETIC
 from flight_core.fields import short_repr
 from flight_core.modes import Mode
 from flight_core.parameters import require
@@ -139,14 +139,15 @@ def replay(
     not begin with the flight, the law engages in the first tick, at the recorded u.
 
     `changes` are parameter changes in flight, in order, by default from the log, none beside `others`. A tick applies the
-    changes up to the parameters of the channel "parameters". The arithmetic is that of the log's provenance. Raises
-    ParameterError for `internals` of different channels or of a version with fewer channels, and for invalid changes.
+    changes up to the parameters of the channel "parameters". Raises ParameterError for `internals` of different channels or
+    of a version with fewer channels, for invalid changes, and for a log whose provenance names another arithmetic.
     """
     if isinstance(run, Tape):
         return _replay(run, parameters, others, changes)
     read = _as_run(run)
-    with arithmetic(recorded_arithmetic(read.metadata)):
-        return _replay(read, parameters, others, changes)
+    recorded = recorded_arithmetic(read.metadata)
+    require(recorded == ARITHMETIC, "arithmetic", recorded, f"{ARITHMETIC}: a later version recorded the log")
+    return _replay(read, parameters, others, changes)
 
 
 def _replay(
