@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy multiply-add of the same size.
 
-Then the tick with feedforward and observer in the stated arithmetic and in the arithmetic of the host (BLAS and libm).
-
 python -m benchmarks.law
 """
 
@@ -16,7 +14,6 @@ from benchmarks.sampling import new_table
 from rich.console import Console
 
 from flight_bringup.scenarios import find_scenario
-from flight_core.arithmetic import ARITHMETIC, ARITHMETIC_OF_HOST, arithmetic
 from flight_core.vectors import StampedVector
 from rise_di_controller import guard
 from rise_di_controller.law import engage, step, step_with_anti_windup
@@ -67,8 +64,8 @@ def measure() -> dict[str, tuple[float, float, float]]:
     }
 
 
-def arithmetic_cost() -> dict[str, tuple[float, float, float]]:
-    """Median, 99.9th percentile and maximum in us of a tick with feedforward and observer, by arithmetic."""
+def measure_observer() -> tuple[float, float, float]:
+    """Median, 99.9th percentile and maximum in us of a tick with feedforward and observer."""
     controller = find_scenario("osprey_observer").controller
     tuned, limits = controller.tuned_law(), controller.guard()
     rng = np.random.default_rng(1)
@@ -81,25 +78,17 @@ def arithmetic_cost() -> dict[str, tuple[float, float, float]]:
         references = [StampedVector(0, y_m[0]), StampedVector(stamp_ns, y_m[k])]
         return guard.tick(engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
 
-    cost = {}
-    for name, number in (("@ and numpy.sin", ARITHMETIC_OF_HOST), ("stated order of sums and sine", ARITHMETIC)):
-        with arithmetic(number):
-            cost[name] = percentiles(tick)
-    return cost
+    return percentiles(tick)
 
 
 def main() -> None:
     """Measure and print."""
-    measured = measure()
+    measured = measure() | {"guard.tick of osprey_observer": measure_observer()}
     floor = measured[FLOOR][0]
     title = f"One tick of four channels, {REPEATS} times, us"
     table = new_table(title, ("", "median", "99.9 %", "max", "median / floor"), texts=1)
     for name, (median, high, most) in measured.items():
         table.add_row(name, f"{median:.1f}", f"{high:.1f}", f"{most:.0f}", f"{median / floor:.1f}")
-    Console().print(table)
-    table = new_table("One tick of osprey_observer, us", ("arithmetic", "median", "99.9 %", "max"), texts=1)
-    for name, (median, high, most) in arithmetic_cost().items():
-        table.add_row(name, f"{median:.1f}", f"{high:.1f}", f"{most:.0f}")
     Console().print(table)
 
 
