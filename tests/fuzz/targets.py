@@ -11,6 +11,7 @@ import atexit
 import json
 import logging
 import math
+import re
 import shutil
 import struct
 import tempfile
@@ -21,8 +22,10 @@ from io import BytesIO
 from itertools import count
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 from tests.joint_states import JOINT_STATE, STORE, vector
 from tests.maps import MAP_FILES
@@ -33,10 +36,13 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
+from flight_analysis.c_export.constants import exportable, header
+from flight_analysis.c_export.library import model_description
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_bringup.scenarios import LIBRARY, find_scenario
 from flight_core.channels import POSE
+from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
@@ -118,6 +124,52 @@ def scenario(data: bytes, folder: Path) -> None:
                 Simulator(chosen.aircraft).sample(0, np.zeros(len(chosen.controller.inputs)))
 
     rejected(fly)
+
+
+NAMED = ("q", "V", "p", "r", "elevator", "thrust", "aileron", "rudder")
+OUTSIDE = re.compile(r'/\*.*?\*/|"(?:[^"\\\n]|\\.)*"', re.DOTALL)  # comments and strings of C
+NUMBER = re.compile(r"-?\b(0x)?[0-9a-f]+(\.[0-9a-f]*)?(p[+-]?\d+)?F?\b")
+
+
+def export(data: bytes, folder: Path) -> None:
+    """Names of channels, one a line, in the place of NAMED in an airframe and its scenario, up to the C code and its FMU.
+
+    Outside of strings and comments the code has the tokens that it has with NAMED. The names reach the code from the files,
+    and past the check of the files.
+    """
+    given = data.decode("utf-8", "replace").split("\n")
+    names = dict(zip(NAMED, given, strict=False))
+    flown = find_scenario("osprey_gust")
+    frame = folder / "frame.yaml"
+    frame.write_text(dump_yaml(_renamed(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")), names)))
+    sections = _renamed(yaml.safe_load(flown.path.read_text(encoding="utf-8")), names)
+    sections["/**/aircraft"]["ros__parameters"]["airframe"] = str(frame)
+    path = folder / "scenario.yaml"
+    path.write_text(dump_yaml(sections))
+    rejected(lambda: _check_code(exportable(load_scenario(path).controller)))
+    changed = {key: tuple(names.get(name, name) for name in getattr(flown.controller, key)) for key in ("outputs", "inputs")}
+    _check_code(exportable(flown.controller.model_copy(update=changed)))
+
+
+def _renamed(tree: Any, names: Mapping[str, str]) -> Any:
+    """A tree of YAML with other names, as keys and as values."""
+    if isinstance(tree, dict):
+        return {names.get(key, key): _renamed(value, names) for key, value in tree.items()}
+    return [_renamed(value, names) for value in tree] if isinstance(tree, list) else names.get(tree, tree)
+
+
+def _check_code(controller: RiseDiConfig) -> None:
+    """The code has the tokens of the shipped scenario's, but for the numbers, and the FMU the variables of the channels."""
+    text = header(controller, "fuzz", float32=False)
+    assert "??" not in text  # a trigraph of C
+    assert text.isascii()
+    assert _tokens(text) == _tokens(header(exportable(find_scenario("osprey_gust").controller), "fuzz", float32=False))
+    variables = ElementTree.fromstring(model_description(controller, "fuzz")).iter("ScalarVariable")
+    assert len([*variables]) == 2 * len(controller.outputs) + len(controller.effectors) + 4
+
+
+def _tokens(text: str) -> list[str]:
+    return NUMBER.sub("0", OUTSIDE.sub(" @ ", text)).split()
 
 
 def airframe(data: bytes, folder: Path) -> None:
@@ -267,6 +319,7 @@ TARGETS: Mapping[str, Target] = {
     "metadata": metadata,
     "scenario": scenario,
     "airframe": airframe,
+    "export": export,
     "map": channel_map,
     "message": message,
     "route": route,
@@ -379,6 +432,8 @@ _ROUTES = [
     b'{"fileType": "Plan", "geoFence": {"polygons": [{"polygon": [[47.4, 8.5], [47.41, 8.5], [47.4, 8.51]]}]}}',
 ]
 
+HOSTILE_NAME = 'q*/ __attribute__((constructor)) static void f(void) {} /*\nV", "\np\\\nr??/\n<e>&"\'\nx y\n\u00e9\n*/'
+
 _HEAD = b"GET / HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Page-Token: a-token\r\n\r\n"
 _REQUESTS = [
     _HEAD,
@@ -411,6 +466,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "metadata": _metadata,
     "scenario": lambda: _files(LIBRARY),
     "airframe": lambda: _files(AIRFRAMES),
+    "export": lambda: ["\n".join(NAMED).encode(), HOSTILE_NAME.encode()],
     "map": lambda: [path.read_bytes() for path in MAP_FILES.values()],
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
     "route": lambda: _ROUTES,

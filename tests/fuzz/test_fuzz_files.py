@@ -118,6 +118,9 @@ INPUTS = {
     "message": damaged("message") | st.binary(max_size=200),
     "route": damaged("route") | edited(SEEDS["route"]()[:3]),
     **{name: edited(SEEDS[name]()) for name in ("scenario", "airframe", "map")},
+    "export": st.lists(st.text(max_size=20) | st.sampled_from(["*/", "/*", '"', "\\", "??/", "q", "a.b"]), max_size=8).map(
+        lambda names: "\n".join(names).encode("utf-8", "surrogatepass")
+    ),
     "metadata": edited(SEEDS["metadata"]()) | st.binary(max_size=100),
     "targets": damaged("targets")
     | st.lists(st.floats(), max_size=200).map(lambda values: struct.pack(f"<{len(values)}d", *values)),

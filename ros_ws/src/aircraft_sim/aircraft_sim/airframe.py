@@ -17,7 +17,7 @@ from aircraft_sim.disturbance import AXES
 from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
-from flight_core.parameters import Config, Names, NonNegative, Number, Numbers, require
+from flight_core.parameters import Config, Name, Names, NonNegative, Number, Numbers, require
 from flight_core.units import quantity, si_per_unit
 from flight_core.vectors import FloatArray
 
@@ -55,11 +55,11 @@ class Product(Config):
 class Airframe(Config):
     """An airframe in the units of the file. `matrix_a` to `products` give SI arrays."""
 
-    name: str
+    name: str = Field(pattern=r"\w[\w .()+-]*", description="its name, also that of its files")
     source: str = Field(description="where the figures come from")
     speed: NonNegative = Field(default=0.0, description="the trim speed V0, m/s; 0 in hover")
-    states: dict[str, Unit] = Field(description="units by state")
-    inputs: dict[str, Input] = Field(description="unit and sign by input")
+    states: dict[Name, Unit] = Field(description="units by state")
+    inputs: dict[Name, Input] = Field(description="unit and sign by input")
     outputs: Names = Field(description="the outputs of y = C x: states, or the rows of C")
     A: Matrix = Field(description="A, a row a state")
     B: Matrix = Field(description="B, a row a state, a column an input")
@@ -67,7 +67,7 @@ class Airframe(Config):
         default=(), description="C, a row an output, a column a state; absent: the outputs are states"
     )
     D: tuple[Numbers, ...] = Field(default=(), description="the feedthrough of other tools' models; 0 or absent")
-    output_units: dict[str, Unit] = Field(default={}, description="units of the outputs of C that are not states")
+    output_units: dict[Name, Unit] = Field(default={}, description="units of the outputs of C that are not states")
     identities: bool = Field(
         default=True, description="check what physics fixes, as theta_dot = q; false for a model that differs on purpose"
     )

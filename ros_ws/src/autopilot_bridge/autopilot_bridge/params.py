@@ -13,7 +13,7 @@ from autopilot_bridge.channel_map import COMPONENTS, PATH, QUATERNION, Line, to_
 from flight_core.channels import POSE
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, read_yaml
-from flight_core.parameters import Config, NodeConfig, NonNegative, Number, Numbers, Positive, require
+from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Number, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
 MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
@@ -266,11 +266,11 @@ class ChannelMap(Config):
         description="how long an engagement lasts, s; needed without `--blind` where no condition tells the transmitter's loss",
     )
     silence: SilenceConfig = Field(description="failsafe for a u that times out")
-    outputs: Annotated[dict[str, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
+    outputs: Annotated[dict[Name, OutputRow], Field(min_length=1)] = Field(description="the channels of y")
     pose: dict[str, PoseRow] = Field(
         default={}, description="the channels of the pose; the newest stamp of the first row is the stamp of the pose"
     )
-    sensors: dict[str, PoseRow] = Field(
+    sensors: dict[Name, PoseRow] = Field(
         default={}, description="further measured channels, absolute values, for `envelope` and `engage_if` alone"
     )
     envelope: dict[str, Limits] = Field(
@@ -279,7 +279,7 @@ class ChannelMap(Config):
     engage_if: dict[str, Limits] = Field(
         default={}, description="limits of the same channels at an engagement alone: outside it is refused"
     )
-    inputs: Annotated[dict[str, InputRow], Field(min_length=1)] = Field(description="the channels of u")
+    inputs: Annotated[dict[Name, InputRow], Field(min_length=1)] = Field(description="the channels of u")
     trims: dict[str, MeasuredRow] = Field(
         default={}, description="sources of the raw values of inputs in trim, by input: captured at each engagement"
     )

@@ -10,7 +10,7 @@ import yaml
 
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.files import read_yaml, write_file, writing
+from flight_core.files import comment, read_yaml, write_file, writing
 from flight_core.parameters import ParameterError
 
 TUNED = Path(__file__).parent / "tuned"  # folder of the tuned gains, one file a scenario
@@ -66,7 +66,7 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
         "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
-        f"# Made by: {command} --tuning {','.join(objectives)}\n"
+        + comment([f"Made by: {command} --tuning {','.join(objectives)}"])
     )
     names = [*(law for law in LAWS if law in tuned), *(law for law in tuned if law not in LAWS)]
     laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in names}

@@ -160,7 +160,7 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
             is_number = parts[0] is int and isinstance(given, str) and re.fullmatch(r"-?\d{1,18}", given)  # a key of JSON
             name = int(given) if is_number else given
             if keys.takes(name):
-                table[name] = values.read(item, f"{key}.{name}", problems)
+                table[keys.content(name, key, problems)] = values.read(item, f"{key}.{name}", problems)
             else:
                 problems.others.append(f"{key}: found the key {short_repr(name)}, expected a name")
         return table

@@ -8,7 +8,7 @@ import os
 import re
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import chain
 from pathlib import Path
@@ -103,6 +103,11 @@ def _expanded_size(node: yaml.Node, sizes: dict[int, float]) -> float:
         children = chain.from_iterable(node.value) if isinstance(node, yaml.MappingNode) else node.value
         sizes[id(node)] = 1 + sum(_expanded_size(child, sizes) for child in children)
     return sizes[id(node)]
+
+
+def comment(lines: Iterable[str]) -> str:
+    """Lines as comments of a YAML file; unprintable characters, such as line ends of a file's name, as escapes."""
+    return "".join(f"# {printable(line)}".rstrip() + "\n" for line in lines)
 
 
 def is_file(path: Path) -> bool:

@@ -184,7 +184,9 @@ Positives = Annotated[tuple[Positive, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each above 0."""
 NonNegatives = Annotated[tuple[NonNegative, ...], Field(min_length=1)]
 """Type of a parameter: a list of at least one number, each 0 or more."""
-Names = Annotated[tuple[str, ...], Field(min_length=1)]
+Name = Annotated[str, Field(pattern=r"[A-Za-z][A-Za-z0-9_.]*")]
+"""Type of the name of a channel, a state or an input: it goes into C code, pages and files of other programs as it stands."""
+Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 

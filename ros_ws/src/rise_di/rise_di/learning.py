@@ -14,6 +14,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.design.learner import Learner
 from flight_analysis.design.model_identification import KNOWN, Entry
 from flight_analysis.design.sketch import ROUGH, sketched
+from flight_core.files import comment
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
@@ -131,4 +132,4 @@ def learned_yaml(result: LearnResult, origin: str) -> str:
     assert result.model is not None  # noqa: S101 - for the type checker
     lines = [f"The airframe {result.model.name}, with A and B learned from {origin}.", ""]
     lines += [f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}" for step in result.steps]
-    return "".join(f"# {line}".rstrip() + "\n" for line in lines) + as_yaml(result.model)
+    return comment(lines) + as_yaml(result.model)

@@ -139,7 +139,7 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         " * SPDX-License-Identifier: Apache-2.0",
         " *",
         f" * Parameters of the controller of {scenario}, written by `rise-di export`. rise_di.h has units and meaning.",
-        f" * y and y_m: {', '.join(controller.outputs)}; u: {', '.join(controller.effectors)}; {controller.rate:g} Hz.",
+        f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; {controller.rate:g} Hz.",
         " */",
         "#ifndef RISE_DI_PARAMETERS_H",
         "#define RISE_DI_PARAMETERS_H",
@@ -181,4 +181,18 @@ def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: 
 
 
 def _strings(names: tuple[str, ...]) -> str:
-    return ", ".join(f'"{name}"' for name in names)
+    """String literals of C; a character other than a letter, a digit or one of "_. " as the octal escape of each of its bytes.
+
+    Of names from a parameter set none has such a character.
+    """
+    return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
+
+
+def _octal(character: str) -> str:
+    plain = character.isascii() and (character.isalnum() or character in "_. ")
+    return character if plain else "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
+
+
+def _comment(names: tuple[str, ...]) -> str:
+    """Names in a comment of C, with the escapes of `_strings`: none ends the comment."""
+    return ", ".join("".join(map(_octal, name)) for name in names)

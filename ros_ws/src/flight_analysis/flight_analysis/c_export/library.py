@@ -14,6 +14,7 @@ import numpy as np
 
 from flight_analysis.c_export.events import GUARD_TICK, START, Recording
 from flight_analysis.c_export.proof import CODE, FLAGS, PARAMETERS, SOURCE, build
+from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -89,7 +90,7 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
     variables = []
     for group, names in groups.items():
         for i, name in enumerate(names):
-            of = f'name={quoteattr(f"{group}.{name}")} valueReference="{VALUE_REFERENCES[group] + i}"'
+            of = f'name={quoteattr(printable(f"{group}.{name}"))} valueReference="{VALUE_REFERENCES[group] + i}"'
             if group == "u":
                 variables.append(f'<ScalarVariable {of} causality="output" variability="discrete"><Real/></ScalarVariable>')
             else:
@@ -104,8 +105,8 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
     outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
     of_model = (
-        f'modelName={quoteattr(f"RISE-DI {scenario}")} guid="{controller.digest():012x}" generationTool="rise-di export" '
-        'variableNamingConvention="structured"'
+        f'modelName={quoteattr(printable(f"RISE-DI {scenario}"))} guid="{controller.digest():012x}" '
+        'generationTool="rise-di export" variableNamingConvention="structured"'
     )
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',

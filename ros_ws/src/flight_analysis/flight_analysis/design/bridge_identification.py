@@ -27,7 +27,7 @@ from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
 from flight_analysis.design.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
 from flight_analysis.design.response_identification import MIN_RATIO, Response, Spans
 from flight_analysis.design.sign_check import motion_as_channel_grows, output_signs
-from flight_core.files import dump_yaml
+from flight_core.files import comment, dump_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
@@ -542,7 +542,7 @@ def scenario_text(
         "recorder": {"rate": 100.0},
     }
     body = {f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}
-    return f"# {heading}\n" + dump_yaml(body)
+    return comment([heading]) + dump_yaml(body)
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,14 +29,14 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 # The airframe {{ airframe.name }} at {{ airframe.speed | digits(6) }} m/s: commands on every channel, servos, noise\
 {{ ", gusts" if gusts }}.
 # Lags, end stops, rates and noise are assumed: put those of your aircraft here, then select the gains again:
-# rise-di gains {{ path }} --scenario {{ scenario }} --write gains.yaml
+# rise-di gains {{ path | line }} --scenario {{ scenario | line }} --write gains.yaml
 
 /**/flight:
   ros__parameters: {duration: 40.0}        # s
 
 /**/aircraft:
   ros__parameters:
-    airframe: {{ path }}
+    airframe: {{ path | flow }}
     rate: {{ rate | flow }}                        # Hz, y and truth
     step: {{ step | flow }}                       # s, of the integration
 {% if gusts %}

@@ -7,7 +7,9 @@
 scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as the section of a scenario file.
 """
 
+import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,8 +48,10 @@ from flight_analysis.design.requirement import (
     within_requirement,
 )
 from flight_core.arguments import as_instance
+from flight_core.files import parse_yaml
 from flight_core.integrators import rk4
 from flight_core.parameters import LARGEST, ParameterError, require
+from flight_core.text import printable
 from flight_core.vectors import Array, FloatArray
 from reference_model import model
 from reference_model.command import command
@@ -618,6 +622,9 @@ def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) 
 # YAML
 
 
+PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")  # a string that needs no quotes, unless it is a word such as true
+
+
 def yaml_flow(value: Any, precision: int = 6) -> str:
     """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
     if isinstance(value, (list, tuple)):
@@ -629,13 +636,19 @@ def yaml_flow(value: Any, precision: int = 6) -> str:
     if isinstance(value, float):
         digits, mark, exponent = f"{value:.{precision}g}".partition("e")
         return (digits if "." in digits else digits + ".0") + mark + exponent
+    if isinstance(value, str) and not (PLAIN.fullmatch(value) and parse_yaml(value, "", "") == value):
+        return json.dumps(value, ensure_ascii=False)  # which is YAML too
     return str(value)
 
 
 def yaml_template(text: str) -> Template:
-    """A template of a YAML file: "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits."""
+    """A template of a YAML file.
+
+    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits, "| line" a text without a line end.
+    """
     environment = Environment(trim_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined, autoescape=False)  # noqa: S701 - no HTML
     environment.filters["flow"] = yaml_flow
+    environment.filters["line"] = printable
     environment.filters["digits"] = lambda value, count: f"{value:.{count}g}"
     return environment.from_string(text)
 

@@ -471,10 +471,10 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
-# JSBSim's {{ condition.name }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
+# JSBSim's {{ condition.name | line }} at {{ condition.speed | digits(6) }} m/s and {{ condition.altitude | digits(6) }} m: \
 {{ "guidance turns and climbs" if guided else "commands on every channel" }}, \
 {{ "moderate turbulence. It learns A and B in flight: docs/learning.md" if learns else "a gust from above" }}.
-# Written by: rise-di identify {{ condition.title }} --speed {{ condition.speed | digits(6) }} \
+# Written by: rise-di identify {{ condition.title | line }} --speed {{ condition.speed | digits(6) }} \
 --altitude {{ condition.altitude | digits(6) }}{{ " --guidance" if guided }}{{ " --learn" if learns }}
 # Commands in trim: {% for name in inputs %}{{ name }} {{ trim.commands[loop.index0] | digits(3) }}\
 {{ ", " if not loop.last }}{% endfor %}.
@@ -487,7 +487,7 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
 
 /**/aircraft:
   ros__parameters:
-    airframe: {{ condition.title if "/" not in condition.title else '"' ~ condition.title ~ '"' }}
+    airframe: {{ condition.title | flow }}
     speed: {{ condition.speed | flow }}  # m/s, true airspeed in trim
     altitude: {{ condition.altitude | flow }}  # m, above sea level
     rate: {{ rate | flow }}                # Hz, y and truth

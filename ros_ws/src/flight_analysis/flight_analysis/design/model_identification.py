@@ -36,6 +36,7 @@ from flight_analysis.design.innovation_filters import (
     filter_model,
     whole,
 )
+from flight_core.files import comment
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
@@ -708,7 +709,7 @@ def model_yaml(found: Identification, origin: str) -> str:
     if between := [entry for entry in found.entries if not entry.nominal]:
         lines += ["", "Entries between parts that do not couple in the nominal airframe, and their standard deviations, SI:"]
         lines += [f"  {entry.name}: {entry.value:.3g}, {entry.unit * entry.deviation:.3g}" for entry in between]
-    return "".join(f"# {line}".rstrip() + "\n" for line in lines) + as_yaml(found.airframe)
+    return comment(lines) + as_yaml(found.airframe)
 
 
 # Reasons against a model, each a sentence, or empty where there is none

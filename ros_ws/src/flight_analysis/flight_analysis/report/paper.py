@@ -27,6 +27,7 @@ from flight_core.files import replacing, write_file
 from flight_core.parameters import one_of, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
+from flight_core.text import printable
 from flight_core.units import FOOT, in_si
 
 if TYPE_CHECKING:  # it loads in some tenths of a second
@@ -230,7 +231,14 @@ def write_latex(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 def _tabular(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [" & ".join(map(latex_text, row)) + r" \\" for row in (heads, *rows)]
-    body = [f"% {title}", rf"\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}", r"\toprule", lines[0], r"\midrule", *lines[1:]]
+    body = [
+        f"% {printable(title)}",
+        rf"\begin{{tabular}}{{l{'r' * (len(heads) - 1)}}}",
+        r"\toprule",
+        lines[0],
+        r"\midrule",
+        *lines[1:],
+    ]
     return "\n".join([*body, r"\bottomrule", r"\end{tabular}", ""])
 
 
