@@ -17,7 +17,7 @@ import pytest
 from tests.builders import aircraft_parameters, truth_of
 from tests.conftest import REPOSITORY
 
-from aircraft_sim import isolated, jsbsim_trim
+from aircraft_sim import jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel, aircraft_names
@@ -26,6 +26,7 @@ from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
+from flight_core import isolated
 from flight_core.outcome import FlightEnded, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.units import FOOT
@@ -215,11 +216,11 @@ def test_computation_without_end_in_isolated_process_times_out_by_processor_time
 def test_isolated_process_keeps_limit_of_processor_time_that_user_has() -> None:
     code = (
         "import resource; resource.setrlimit(resource.RLIMIT_CPU, (60, 60))\n"
-        "from aircraft_sim import isolated\n"
+        "from flight_core import isolated\n"
         "print(*(isolated.call(resource.getrlimit, resource.RLIMIT_CPU, timeout=one) for one in (30.0, 90.0)))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
-    assert done.stdout == "[30, 60] [60, 60]\n"  # raising the second number needs a privilege, setrlimit(2)
+    assert done.stdout == "(30, 60) (60, 60)\n"  # raising the second number needs a privilege, setrlimit(2)
 
 
 def test_crash_exception_and_exit_of_isolated_process_are_errors_here() -> None:

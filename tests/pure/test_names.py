@@ -19,8 +19,9 @@ from flight_analysis.closed_loop.scenario import SCHEMAS
 from flight_analysis.design.gain_selection import yaml_flow, yaml_template
 from flight_analysis.report.paper import _tabular
 from flight_bringup.scenarios import LIBRARY as SCENARIOS
-from flight_core.files import comment, parse_yaml
+from flight_core.files import comment, dump_yaml, parse_yaml
 from flight_core.parameters import Config, ParameterError
+from rise_di import new_airframe
 
 FREE = {"conditions", "messages", "overrides", "topics", "fence", "link", "values"}
 """Sections of a map and of guidance whose keys name no channel."""
@@ -94,12 +95,14 @@ def test_every_file_of_the_repository_has_names_of_the_grammar() -> None:
     assert all(name.replace("_", "").replace(".", "").isalnum() and name[0].isalpha() for name in names)
 
 
-@pytest.mark.parametrize("name", ["../osprey", "a/b", "/x", ".hidden", "", "a\nb"])
-def test_airframe_whose_name_leaves_its_folder_is_refused(name: str) -> None:
-    """Commands write NAME.yaml into the folder of the user."""
-    values = yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8"))
-    with pytest.raises(ParameterError, match=r"^set\.name: found "):
-        Airframe.validate_mapping(values | {"name": name}, "set")
+@pytest.mark.parametrize("name", ["../osprey", "a/b", "/x"])
+def test_airframe_whose_name_leaves_the_folder_is_refused(name: str, tmp_path: Path) -> None:
+    """NAME.yaml is written into the folder that the user gives."""
+    source = tmp_path / "source.yaml"
+    source.write_text(dump_yaml(yaml.safe_load((AIRFRAMES / "osprey.yaml").read_text(encoding="utf-8")) | {"name": name}))
+    with pytest.raises(ParameterError, match=r"^name: found .*, expected the name of a file in the folder, without a /$"):
+        new_airframe(source, folder=tmp_path / "folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["source.yaml"]
 
 
 TEXTS = (

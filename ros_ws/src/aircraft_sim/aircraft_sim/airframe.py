@@ -55,7 +55,7 @@ class Product(Config):
 class Airframe(Config):
     """An airframe in the units of the file. `matrix_a` to `products` give SI arrays."""
 
-    name: str = Field(pattern=r"\w[\w .()+-]*", description="its name, also that of its files")
+    name: str
     source: str = Field(description="where the figures come from")
     speed: NonNegative = Field(default=0.0, description="the trim speed V0, m/s; 0 in hover")
     states: dict[Name, Unit] = Field(description="units by state")

@@ -7,10 +7,8 @@ STATES alone map between the two, with units and signs.
 """
 
 import difflib
-import io
 import os
-import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -26,7 +24,6 @@ from flight_core.vectors import FloatArray
 PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
 ROOT_VARIABLE = "JSBSIM_ROOT"  # environment: a folder with aircraft, engine and systems in place of the package's
 SUFFIX, MODEL_ELEMENT = ".xml", "fdm_config"  # of the file of a model
-ENGINES, SYSTEMS = ("Engines", "engine"), ("Systems", "systems")  # folders beside a model in which JSBSim looks
 
 
 class Command(NamedTuple):
@@ -153,6 +150,13 @@ def require_aircraft(airframe: str) -> str:
     return name
 
 
+def foreign_model(name: str) -> Path | None:
+    """The file of an aircraft's model that is not one of the package jsbsim: the user's own, or of $JSBSIM_ROOT; else None."""
+    if Path(name).is_absolute():
+        return Path(name)
+    return root() / "aircraft" / name / f"{name}{SUFFIX}" if os.environ.get(ROOT_VARIABLE) else None
+
+
 def root_of(model: Path) -> Path:
     """The folder of the engines and systems of a model: $JSBSIM_ROOT, the ROOT of ROOT/aircraft/NAME/NAME.xml, or the package.
 
@@ -187,55 +191,3 @@ def _first_element(path: Path) -> str:
         return str(element.tag)
     except (ElementTree.ParseError, OSError, StopIteration, UnicodeError):
         return ""
-
-
-def model_archive(model: Path) -> bytes:
-    """A zip file with a model of the user's own and the files it names, as a root of JSBSim: the same bytes for the same files.
-
-    aircraft/NAME/ has the model and the named files beside it, engine/ and systems/ those of the root.
-    Unpacked, jsbsim:FOLDER/aircraft/NAME flies.
-    """
-    names = {name.removesuffix(SUFFIX) for name in _named_files(model)}
-    stems = {Path(name).stem for name in names}
-    members = {f"aircraft/{model.stem}/{model.name}": model}
-    beside = {model.parent / f"{name}{SUFFIX}" for name in names}
-    beside |= {model.parent / folder / f"{stem}{SUFFIX}" for folder in (*ENGINES, *SYSTEMS) for stem in stems}
-    for path in sorted(path for path in beside if path.is_file() and path.is_relative_to(model.parent)):
-        members[f"aircraft/{model.stem}/{path.relative_to(model.parent)}"] = path
-    for folder in ("engine", "systems"):
-        of_root = (path for path in sorted((root_of(model) / folder).glob(f"*{SUFFIX}")) if path.stem in stems)
-        members |= {f"{folder}/{path.name}": path for path in of_root}
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, path in members.items():
-            archive.writestr(zipfile.ZipInfo(name), path.read_bytes(), zipfile.ZIP_DEFLATED)
-    return content.getvalue()
-
-
-def missing_engines(model: Path) -> str:
-    """A sentence on engines and thrusters that a model names and that are in no folder of JSBSim; "" where all are there."""
-    folders = *(model.parent / folder for folder in ENGINES), root_of(model) / "engine"
-    names = sorted({Path(name).stem for name in _named_files(model, ("engine", "thruster"))})
-    missing = [name for name in names if not any((folder / f"{name}{SUFFIX}").is_file() for folder in folders)]
-    return f"no {SUFFIX} of {', '.join(missing)} is in {folders[0]} or {folders[-1]}" if missing else ""
-
-
-def foreign_output(model: Path) -> str:
-    """A sentence on a file anywhere on this host that a model would write; "" where its output is relative, which is off."""
-    named = [model, *(model.parent / name for name in _named_files(model, ("output",)))]
-    outputs = (element for path in named if path.is_file() for element in _elements(path) if element.tag == "output")
-    absolute = [name for element in outputs if Path(name := element.get("name", "")).is_absolute()]
-    return f"its output would write {absolute[0]}, expected a model without the output" if absolute else ""
-
-
-def _named_files(model: Path, elements: Collection[str] = ()) -> list[str]:
-    """The files that a model names, in these elements or in all. Raises ParameterError for a file cut short."""
-    every = _elements(model)
-    return [name for element in every if (name := element.get("file")) and (not elements or element.tag in elements)]
-
-
-def _elements(model: Path) -> list[ElementTree.Element]:
-    try:
-        return [*ElementTree.parse(model).iter()]  # noqa: S314 - JSBSim reads the file too
-    except ElementTree.ParseError as error:
-        raise ParameterError(f"{model}: found XML with {error}, expected a whole file") from None

@@ -4,6 +4,7 @@
 
 import os
 import re
+import tempfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -11,7 +12,6 @@ from pathlib import Path
 import jsbsim
 import numpy as np
 
-from aircraft_sim import isolated
 from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
     RESIDUALS,
@@ -19,11 +19,12 @@ from aircraft_sim.jsbsim_aircraft import (
     Command,
     FlightCondition,
     Trim,
-    foreign_output,
-    missing_engines,
+    foreign_model,
     root,
-    root_of,
 )
+from aircraft_sim.jsbsim_files import model_files
+from flight_core import isolated
+from flight_core.notes import note
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds, seconds
@@ -241,27 +242,12 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
 
 
 def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
-    log = _Log()
-    jsbsim.set_logger(log)  # of this thread
-    model = Path(condition.name)
-    own = model.is_absolute()
-    fdm = jsbsim.FGFDMExec(str(root_of(model) if own else root()))
-    fdm.set_debug_level(0)
-    if own:
-        fdm.set_aircraft_path(str(model.parent))
-    fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
-    try:
-        problem = (missing_engines(model) or foreign_output(model)) if own else ""
-    except ParameterError as error:
-        problem = str(error)
-    if problem:
-        raise FlightEnded(f"{condition.title} cannot be loaded: {problem}")
-    try:
-        loaded = fdm.load_model(model.stem, not own)  # a model of JSBSim is in a folder of its name
-    except jsbsim.BaseError as error:
-        raise FlightEnded(f"{condition.title} cannot be loaded: {error_text(error)}") from None
-    if not loaded:
-        raise FlightEnded(f"{condition.title} cannot be loaded: {'; '.join(log.last) or 'JSBSim gives no reason'}")
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            fdm = _loaded(foreign_model(condition.name), condition.name, Path(folder))
+        except (ParameterError, jsbsim.BaseError, OSError) as error:
+            reason = error_text(error) if isinstance(error, jsbsim.BaseError) else str(error)
+            raise FlightEnded(f"{condition.title} cannot be loaded: {reason}") from None
     fdm.disable_output()
     fdm.set_dt(seconds(condition.step_ns))
     manager, engines = fdm.get_property_manager(), engine_count(fdm)
@@ -277,6 +263,26 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
         fdm[f"fcs/mixture-cmd-norm[{i}]"] = MIXTURE
         fdm[f"fcs/throttle-cmd-norm[{i}]"] = START[1]
         fdm[f"fcs/advance-cmd-norm[{i}]"] = 1.0  # propellers at fine pitch
+    return fdm
+
+
+def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
+    """A model of the package by its name, or a foreign one as a copy in a folder.
+
+    Raises ParameterError, OSError and BaseError.
+    """
+    log = _Log()
+    jsbsim.set_logger(log)  # of this thread
+    fdm = jsbsim.FGFDMExec(str(root() if foreign is None else folder))
+    fdm.set_debug_level(0)
+    fdm.set_output_path(os.devnull)  # some models write tables into the working folder while they load
+    if foreign is not None:
+        files = model_files(foreign)
+        fdm.set_aircraft_path(str(files.write(folder).parent))
+        if files.left_out:
+            note(f"{foreign.name}: left out {', '.join(files.left_out)}: a foreign model opens no socket and writes no file")
+    if not fdm.load_model(name if foreign is None else foreign.stem, foreign is None):
+        raise ParameterError("; ".join(log.last) or "JSBSim gives no reason")
     return fdm
 
 

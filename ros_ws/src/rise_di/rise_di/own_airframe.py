@@ -75,6 +75,8 @@ def new_airframe(
     airframe, note = import_airframe(
         source, name=name, speed=speed, states=states, inputs=inputs, outputs=outputs, thrust=thrust, text=text, **body
     )
+    is_file_name = Path(airframe.name).name == airframe.name
+    require(is_file_name, "name", repr(airframe.name), "the name of a file in the folder, without a /")
     place = as_path(folder, "folder", "the path of a folder")
     files = place / f"{airframe.name}.yaml", place / f"{airframe.name}_flight.yaml"
     own = isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()

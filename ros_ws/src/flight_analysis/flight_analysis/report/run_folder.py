@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from aircraft_sim.jsbsim_aircraft import model_archive
+from aircraft_sim.jsbsim_files import model_files
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, parse_scenario, scenario_yaml
 from flight_analysis.report.account import Account, account, flown, outcome_of_log
@@ -74,7 +74,7 @@ def attachments_for(
     if not scenario.aircraft.is_jsbsim:
         attached.append(_write(run / AIRFRAME, as_yaml(scenario.aircraft.sampled_airframe())))
     elif (model := Path(scenario.aircraft.flight_condition().name)).is_absolute():
-        attached.append(_write(run / AIRCRAFT, model_archive(model)))
+        attached.append(_write(run / AIRCRAFT, model_files(model).archive()))
     notes = _write(run / PROVENANCE, dump_yaml(provenance(), flow=False))
     return LogAttachments(scenario.path, tuple(attached), notes)
 

@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Confinement of a process by the Linux kernel: no network, and files written in one folder alone.
+
+Sources: unshare(2), landlock(7); include/uapi/linux/landlock.h.
+"""
+
+import ctypes
+import os
+import struct
+from pathlib import Path
+
+CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000
+CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # system calls, the same numbers on every architecture
+PATH_BENEATH, VERSION_FLAG = 1, 1
+NO_NEW_PRIVS = 38  # of prctl(2)
+WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
+CHANGES = WRITE_FILE | sum(1 << bit for bit in range(4, 13))  # write a file; remove and make files, folders, links, sockets
+REFER_VERSION, TRUNCATE_VERSION = 2, 3  # of landlock, with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
+REFER = 1 << 13
+
+_LIBC = ctypes.CDLL(None, use_errno=True)
+
+
+def confine(folder: Path) -> list[str]:
+    """Take this process off the network, and let it change files beneath `folder` alone; it must have one thread.
+
+    Returns a sentence for each of the two that the kernel does not permit.
+    """
+    ways = []
+    if _LIBC.unshare(CLONE_NEWUSER | CLONE_NEWNET):
+        ways.append(f"foreign files are read with access to the network: the kernel refuses a namespace ({_reason()})")
+    if not _write_beneath(folder):
+        ways.append(f"foreign files are read with the right to write files: the kernel refuses landlock ({_reason()})")
+    return ways
+
+
+def _write_beneath(folder: Path) -> bool:
+    """Restrict changes of files to `folder` and /dev/null; whether the kernel does."""
+    version = _LIBC.syscall(CREATE_RULESET, None, 0, VERSION_FLAG)
+    if version < 1:
+        return False
+    changes = CHANGES | REFER * (version >= REFER_VERSION) | TRUNCATE * (version >= TRUNCATE_VERSION)
+    ruleset = _LIBC.syscall(CREATE_RULESET, struct.pack("=Q", changes), 8, 0)
+    if ruleset < 0:
+        return False
+    for path, rights in ((folder, changes), (Path(os.devnull), changes & (WRITE_FILE | TRUNCATE))):
+        opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
+        refused = _LIBC.syscall(ADD_RULE, ruleset, PATH_BENEATH, struct.pack("=Qi", rights, opened), 0)
+        os.close(opened)
+        if refused:
+            return False
+    restricted = not _LIBC.prctl(NO_NEW_PRIVS, 1, 0, 0, 0) and not _LIBC.syscall(RESTRICT_SELF, ruleset, 0)
+    os.close(ruleset)
+    return restricted
+
+
+def _reason() -> str:
+    return os.strerror(ctypes.get_errno())

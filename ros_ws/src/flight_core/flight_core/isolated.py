@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Process isolation: what reads foreign models and logs runs in a subprocess of limited time, memory, files and network."""
+
+import json
+import math
+import os
+import pickle
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from flight_core import confinement
+from flight_core.memory import DATA_LIMIT, limit_memory
+from flight_core.notes import note
+from flight_core.outcome import FlightEnded
+from flight_core.parameters import ParameterError
+
+RESULT = "result"  # the file of the result in the working folder
+ERRORS = MappingProxyType({"ended": FlightEnded, "refused": ParameterError})  # raised here as in the subprocess
+WAIT = 20.0  # times the processor time is waited for: so long may other work keep the processor from the subprocess
+FILE_LIMIT = 1 << 30  # bytes of a file that the subprocess writes
+
+NUMPY = frozenset({"_frombuffer", "_reconstruct", "dtype", "ndarray", "scalar"})
+"""What a pickled array names. Unlike another name in a pickle, none of them runs code of the sender's choice."""
+
+
+class IsolatedCallError(RuntimeError):
+    """The subprocess crashed or timed out. The message is the rest of a sentence: "was killed by SIGSEGV"."""
+
+
+def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: int = DATA_LIMIT) -> Any:
+    """Return value of function(*arguments) in a fresh process, confined to an empty working folder.
+
+    The subprocess finds the function by module and name. Arguments must fit JSON; the return value consists of plain values,
+    arrays, and named tuples of the function's module. FlightEnded and ParameterError of the function are raised here too.
+
+    The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time, or WAIT times as many of
+    wall time: an endless computation is found on a busy machine too, and a finite computation gets enough time. Where the
+    kernel permits, it has no network and writes in its folder alone; where not, a warning says so once. Raises
+    IsolatedCallError where the process crashes (a segmentation fault, an exception) or returns nothing in that time.
+    """
+    call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            process = subprocess.run(  # noqa: S603 - this interpreter and this module
+                [sys.executable, "-P", "-m", __name__, call_text],
+                capture_output=True,
+                text=True,
+                errors="replace",
+                stdin=subprocess.DEVNULL,
+                timeout=WAIT * timeout,
+                cwd=folder,
+                env=os.environ | {"TMPDIR": folder, "OPENBLAS_NUM_THREADS": "1"},  # each thread takes memory
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise IsolatedCallError(f"timed out after {WAIT * timeout:g} s") from None
+        if process.returncode == -signal.SIGXCPU:
+            raise IsolatedCallError(f"timed out after {timeout:g} s of processor time")
+        if process.returncode < 0:
+            raise IsolatedCallError(f"was killed by {signal.Signals(-process.returncode).name}")
+        file = Path(folder) / RESULT
+        if process.returncode or not file.is_file():
+            last = (process.stderr.strip() or "no result").splitlines()[-1]
+            raise IsolatedCallError(f"exited with status {process.returncode} ({last})")
+        with file.open("rb") as stream:
+            kind, value, open_ways = _Reader(stream, function.__module__).load()
+    for way in open_ways:
+        note(way)
+    if kind in ERRORS:
+        raise ERRORS[kind](value)
+    return value
+
+
+class _Reader(pickle.Unpickler):
+    """Reads plain values, arrays, and named tuples of a module. Raises IsolatedCallError for another name."""
+
+    def __init__(self, stream: Any, module: str) -> None:
+        super().__init__(stream)
+        self._module = module
+
+    def find_class(self, module: str, name: str) -> Any:
+        if module.partition(".")[0] == "numpy" and name in NUMPY:
+            return super().find_class(module, name)
+        if (module, name) == ("builtins", "dict"):
+            return dict
+        found = getattr(import_module(self._module), name, None) if module == self._module else None
+        if isinstance(found, type) and issubclass(found, tuple):
+            return found
+        raise IsolatedCallError(f"returned {module}.{name}, which is no plain value")
+
+
+class _Writer(pickle.Pickler):
+    """Writes a mapping that cannot be changed, which pickle does not, as a dict."""
+
+    def reducer_override(self, value: object) -> Any:
+        return (dict, (dict(value),)) if isinstance(value, MappingProxyType) else NotImplemented
+
+
+def main() -> None:
+    """Entry point of the subprocess: limits, then the call in JSON; the result goes into the file RESULT."""
+    timeout, memory, module, name, arguments = json.loads(sys.argv[1])
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]  # that of the user, which no process may raise
+    soft = math.ceil(float(timeout))
+    resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
+    limit_memory(memory)
+    for limit, most in ((resource.RLIMIT_FSIZE, FILE_LIMIT), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(limit, (min(most, own) if (own := resource.getrlimit(limit)[1]) >= 0 else most, own))
+    open_ways = confinement.confine(Path.cwd())
+    try:
+        result = ("value", getattr(import_module(module), name)(*arguments), open_ways)
+    except FlightEnded as error:
+        result = ("ended", str(error), open_ways)
+    except ParameterError as error:
+        result = ("refused", str(error), open_ways)
+    with Path(RESULT).open("wb") as stream:
+        _Writer(stream).dump(result)
+
+
+if __name__ == "__main__":
+    main()
