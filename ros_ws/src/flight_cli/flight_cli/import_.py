@@ -19,7 +19,7 @@ from flight_core.rates import NANOSECONDS
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
 from flight_log.tape_writer import write_run
-from flight_log.vehicle_log import read_vehicle_log
+from flight_log.vehicle_log import read_foreign_log
 
 PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
 
@@ -45,7 +45,7 @@ def import_(
         for name, value in (("from", start), ("until", stop)):
             require(value is None or value >= 0.0, name, value, "0 s or more")
     channel_map = load_map(map_name)
-    read = read_vehicle_log(log)
+    read = read_foreign_log(log)
     tape = imported(channel_map, read, Window(start, stop), servos=servos)
     folder = output or Path("runs") / log.stem
     require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")

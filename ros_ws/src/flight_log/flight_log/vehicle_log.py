@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flight_core import isolated
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -209,7 +210,8 @@ def read_vehicle_log(path: Path) -> VehicleLog:
     except ParameterError:  # of a package that is missing
         raise
     except Exception as error:  # pymavlink raises Exception itself for a damaged format
-        raise ParameterError(f"{path}: found {kind} that cannot be decoded ({error}), expected {EXPECTED}") from None
+        reason = str(error) or type(error).__name__
+        raise ParameterError(f"{path}: found {kind} that cannot be decoded ({reason}), expected {EXPECTED}") from None
     require(bool(log.tables), str(path), f"{kind} without a message of y or u", "the log of a flight")
     return log
 
@@ -314,6 +316,7 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
     if path.stat().st_size < ULOG_HEAD:
         raise ValueError("its head is cut")
     try:
+        _require_short(ULog(str(path), parse_header_only=True).message_formats)
         log = ULog(str(path))
     except ULogException as error:
         raise ValueError(error) from None
@@ -407,3 +410,43 @@ def _table(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Tab
     """A table in the order of its stamps, without samples of a repeated stamp."""
     stamps, places = np.unique(stamp_ns, return_index=True)
     return Table(stamps, {name: values[places] for name, values in fields.items()})
+
+
+ULOG_VALUES = 65535
+"""Values of a message of a ULog at most: its length in bytes is a number of 16 bits."""
+
+
+def _require_short(formats: Mapping[str, Any]) -> None:
+    """Raise ValueError for a format with more values than a message holds: pyulog makes a field of each value."""
+    counts: dict[str, int] = {}
+
+    def count(name: str) -> int:
+        if name not in counts and name in formats:
+            counts[name] = sum(max(size, 1) * count(kind) for kind, size, _ in formats[name].fields)
+        return counts.get(name, 1)
+
+    for name in formats:
+        if count(name) > ULOG_VALUES:
+            raise ValueError(f"a message {name} of {count(name)} values")
+
+
+LIMITS = (5.0, 6.0)
+"""Processor time of the decoding, s, and s a megabyte of the log: pymavlink takes 1.2 s a megabyte of DataFlash here."""
+
+MEMORY = (1 << 30, 100)
+"""Data of the decoding, bytes, and bytes a byte of the log: pymavlink takes some 35."""
+
+
+def read_foreign_log(path: Path) -> VehicleLog:
+    """`read_vehicle_log` in an isolated process: a log of a few bytes may claim billions of values. Raises ParameterError."""
+    require(path.is_file(), str(path), "no such file", EXPECTED)
+    size = path.stat().st_size
+    timeout, memory = LIMITS[0] + LIMITS[1] * size / 1e6, MEMORY[0] + MEMORY[1] * size
+    try:
+        return isolated.call(_read_absolute, str(path.absolute()), timeout=timeout, memory=memory)  # type: ignore[no-any-return]
+    except isolated.IsolatedCallError as error:
+        raise ParameterError(f"{path}: found {file_kind(path)} whose decoding {error}, expected {EXPECTED}") from None
+
+
+def _read_absolute(path: str) -> VehicleLog:
+    return read_vehicle_log(Path(path))

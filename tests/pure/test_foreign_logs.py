@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Logs of autopilots from elsewhere: decoded in an isolated process, in time and memory that follow from their size."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.vehicle_logs import write_ulog
+
+from flight_core import isolated
+from flight_core.parameters import ParameterError
+from flight_log.vehicle_log import read_foreign_log, read_vehicle_log
+
+HEAD = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+
+
+def message(kind: str, body: bytes) -> bytes:
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def nested(count: int) -> bytes:
+    """A ULog with `count` x `count` fields in a message: pyulog makes a name for each of them."""
+    formats = (f"bomb:uint64_t timestamp;b[{count}] x;", f"b:float[{count}] y;")
+    added = message("A", struct.pack("<BH", 0, 1) + b"bomb")
+    return HEAD + message("B", bytes(40)) + b"".join(message("F", text.encode()) for text in formats) + added
+
+
+@pytest.mark.parametrize("count", [256, 3000, 65535])
+def test_log_that_claims_more_values_than_a_message_holds_is_refused(count: int, tmp_path: Path) -> None:
+    """65,535 bytes at most, the length of a message in 16 bits (PX4 guide, ULog file format)."""
+    path = tmp_path / "nested.ulg"
+    path.write_bytes(nested(count))
+    with pytest.raises(ParameterError, match=rf"cannot be decoded \(a message bomb of {count * count + 1} values\)"):
+        read_vehicle_log(path)
+
+
+def test_log_of_long_messages_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "nested.ulg"
+    path.write_bytes(nested(255))  # 65,026 values
+    with pytest.raises(ParameterError, match="found a ULog of PX4 without a message of y or u"):
+        read_vehicle_log(path)
+
+
+def test_decoding_without_end_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "log.ulg"
+    path.write_bytes(HEAD)
+    monkeypatch.setattr(isolated, "WAIT", 0.0)
+    with pytest.raises(ParameterError, match=r"log\.ulg: found a ULog of PX4 whose decoding timed out after 0 s, expected"):
+        read_foreign_log(path)
+
+
+def test_limits_follow_from_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(isolated, "call", lambda *_, **limits: given.update(limits))
+    path = tmp_path / "large.ulg"
+    path.write_bytes(HEAD)
+    with path.open("ab") as stream:
+        stream.truncate(10_000_000)
+    read_foreign_log(path)
+    assert given == {"timeout": 5.0 + 60.0, "memory": (1 << 30) + 1_000_000_000}
+
+
+def test_log_from_the_isolated_process_is_that_of_this_one(tmp_path: Path) -> None:
+    path = tmp_path / "flight.ulg"
+    stamps = range(0, 2_000_000, 20_000)
+    rows = [(stamp, (1.0, 0.01 * k, 0.0, 0.0)) for k, stamp in enumerate(stamps)]
+    write_ulog(path, {"vehicle_attitude": ("float[4] q;", rows)}, {"FW_AIRSPD_TRIM": 25.0})
+    here, there = read_vehicle_log(path), read_foreign_log(path)
+    assert there._replace(tables={}) == here._replace(tables={})
+    assert there.tables.keys() == here.tables.keys()
+    for name, table in here.tables.items():
+        assert np.array_equal(there.tables[name].stamp_ns, table.stamp_ns)
+        assert all(np.array_equal(there.tables[name].fields[field], values) for field, values in table.fields.items())
+    assert there.source("theta") == here.source("theta")
+
+
+def test_file_that_is_no_log_is_one_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("a,b\n1,2\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match="found a CSV file, expected a DataFlash log"):
+        read_foreign_log(path)
+    with pytest.raises(ParameterError, match="no such file"):
+        read_foreign_log(tmp_path / "absent.bin")
