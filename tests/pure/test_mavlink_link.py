@@ -29,10 +29,13 @@ PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
 class Peer:
     """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
 
-    def __init__(self, port: int, system: int = 1, phrase: str = "") -> None:
+    def __init__(self, port: int, system: int = 1, phrase: str = "", component: int = 1, kind: str = "udpout") -> None:
         self.connection: Any = mavutil.mavlink_connection(
-            f"udpout:127.0.0.1:{port}", source_system=system, source_component=1, dialect="ardupilotmega"
+            f"{kind}:127.0.0.1:{port}", source_system=system, source_component=component, dialect="ardupilotmega"
         )
+        # Of MAVLink 2 from the begin: the parser that pymavlink makes at the first packet of MAVLink 2 has no passphrase.
+        self.connection.mav = mavlink.MAVLink(self.connection, srcSystem=system, srcComponent=component)
+        self.connection.mav.robust_parsing, self.connection.first_byte = True, False
         if phrase:
             self.connection.setup_signing(hashlib.sha256(phrase.encode()).digest())
         self.requested: dict[int, float] = {}  # Hz by message
@@ -41,6 +44,14 @@ class Peer:
         """A heartbeat, armed and in MANUAL."""
         time.sleep(0.01)
         self.connection.mav.heartbeat_send(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4)
+
+    def attitude(self, pitchspeed: float, since_boot: float) -> None:
+        """An ATTITUDE, rad/s, with the time since boot, s."""
+        self.connection.mav.attitude_send(round(1e3 * since_boot), 0.0, 0.0, 0.0, 0.0, pitchspeed, 0.0)
+
+    def received(self) -> list[Any]:
+        """All that has come and was not taken yet."""
+        return list(iter(self.connection.recv_msg, None))
 
     def answer(self) -> Any:
         """The next message, after an answer where it is a request."""
@@ -64,15 +75,15 @@ def ends() -> Iterator[Ends]:
     links: list[Link] = []
     peers: list[Peer] = []
 
-    def make(passphrase_file: str | None = None, **rates: float) -> tuple[Link, int]:
+    def make(passphrase_file: str | None = None, kind: str = "udpin", at: int = 0, **rates: float) -> tuple[Link, int]:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        links.append(Link(LinkConfig(url=f"udpin:127.0.0.1:{port}", rates=rates, passphrase_file=passphrase_file)))
+            port = at or free.getsockname()[1]
+        links.append(Link(LinkConfig(url=f"{kind}:127.0.0.1:{port}", rates=rates, passphrase_file=passphrase_file)))
         return links[-1], port
 
-    def peer(port: int, system: int = 1, phrase: str = "") -> Peer:
-        peers.append(Peer(port, system, phrase))
+    def peer(port: int, **options: Any) -> Peer:
+        peers.append(Peer(port, **options))
         return peers[-1]
 
     yield Ends(make, peer)
@@ -143,6 +154,112 @@ def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) ->
     assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]  # released, set, as is, as is
 
 
+def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
+    """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of this host."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot.attitude(0.1, since_boot=50.0)
+    until(lambda: queue, autopilot.received)
+    second.attitude(0.9, since_boot=50.0)  # also with the right time since boot
+    until(lambda: made.conflict, autopilot.received)
+    locked, foreign = (end.connection.port.getsockname()[1] for end in (autopilot, second))
+    assert made.conflict == (
+        f"a second sender, 127.0.0.1:{foreign}, sends as the autopilot: 127.0.0.1:{locked} was first and is taken alone"
+    )
+    assert made.conflict in made.problem()
+    autopilot.attitude(0.1, since_boot=50.1)
+    until(lambda: len(queue) == 2, autopilot.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    overrides: list[Any] = []
+
+    def send() -> None:
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        overrides.extend(message for message in autopilot.received() if message.get_type() == "RC_CHANNELS_OVERRIDE")
+
+    until(lambda: len(overrides) >= 5, send)
+    assert second.received() == []  # neither overrides nor heartbeats nor requests
+
+
+def test_next_sender_gets_the_messages_once_the_first_one_is_silent(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
+    made, port = ends.link(HEARTBEAT=5.0)
+    made.start()
+    first, second = ends.peer(port), ends.peer(port)
+    until(first.received, first.beat)
+    until(second.received, second.beat)
+    first.received()
+    sent: list[Any] = []
+
+    def send() -> None:
+        second.beat()
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        sent.extend(second.received())
+
+    until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in sent], send)
+    assert first.received() == []
+
+
+def test_conflict_of_second_sender_ends_after_its_last_message(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, port = ends.link()
+    made.start()
+    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot.beat()
+    until(lambda: made.conflict, second.beat)
+    now = time.monotonic
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: now() + 3.1)
+    assert made.conflict == ""
+
+
+def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
+    """Two autopilots with one number behind a router have one address, and times since boot of their own."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    router = ends.peer(port)
+    for pitchspeed, since_boot in ((0.1, 100.0), (0.9, 40.0), (0.1, 100.1), (0.9, 400.0), (0.1, 100.2)):
+        router.attitude(pitchspeed, since_boot)
+    until(lambda: len(queue) == 3, router.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 3
+    assert made.conflict.endswith(" jumps: a second autopilot sends there, or it has started again")
+
+
+def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) -> None:
+    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves, on the link or beside it."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot = ends.peer(port)
+    autopilot.attitude(0.1, since_boot=50.0)
+    for component in (154, 191, 0):
+        routed = mavlink.MAVLink(autopilot.connection, srcSystem=1, srcComponent=component)
+        routed.attitude_send(50_000, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
+        ends.peer(port, component=component).attitude(0.9, since_boot=50.0)
+    autopilot.attitude(0.1, since_boot=50.1)  # of the packets to one socket the last one is read last
+    until(lambda: len(queue) == 2, autopilot.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    assert made.conflict == ""
+
+
+def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
+    autopilot = ends.peer(0, kind="tcpin")
+    made, _ = ends.link(kind="tcp", at=autopilot.connection.listen.getsockname()[1])
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot.received()  # accepts the call
+    autopilot.attitude(0.1, since_boot=50.0)
+    until(lambda: queue, autopilot.received)
+    assert queue[0].message.pitchspeed == pytest.approx(0.1)
+    received: list[Any] = []
+
+    def send() -> None:
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        received.extend(message.get_type() for message in autopilot.received())
+
+    until(lambda: "RC_CHANNELS_OVERRIDE" in received, send)
+
+
 def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:
     made, port = ends.link()
     made.start()
@@ -184,6 +301,19 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(e
     unsigned.start()
     until(lambda: unsigned.conflict, ends.peer(port, phrase="a phrase").beat)
     assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+
+
+def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
+    ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier one has set this variable."""
+    monkeypatch.delenv("MAVLINK20", raising=False)
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    until(lambda: made._refused, ends.peer(port).beat)
+    assert not queue
 
 
 def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,16 +9,21 @@ SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as pymavlink has them.
 import hashlib
 import time
 from collections import deque
+from collections.abc import Sequence
+from copy import deepcopy
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from autopilot_bridge.autopilot_lock import AutopilotLock
 from autopilot_bridge.params import MAVLINK, LinkConfig
 from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
@@ -27,11 +32,17 @@ SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
 GCS, INVALID = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
 BEAT = 1.0  # s; ArduPilot's FS_GCS_ENABL waits 5 s for the next one
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
-SILENCE = 3.0  # s without the autopilot, after which all rates are requested again: it may have started again
+SILENCE = 3.0  # s without the autopilot, after which all rates are requested again, and another sender may take its place
 MEASURED = 5.0  # s over which the rate of a message is measured
 GRANTED = 0.7  # of a requested rate: below, the link or the autopilot does not keep up
 QUEUE = 256  # messages between two ticks
 RETRIES = 2  # of a connection by TCP, 1 s each
+POLL = 0.1  # s, the longest wait for a packet
+PACKET = 65535  # bytes, the largest of UDP
+
+
+Address = tuple[Any, ...]
+"""Host and port of a sender over UDP, else the URL."""
 
 
 class ReceivedMessage(NamedTuple):
@@ -58,12 +69,18 @@ def message_type(name: str) -> Any:
     return type(name, (), {"__init__": init, "fields": tuple(zeros), "packed": of_message})
 
 
+def _text(address: Address) -> str:
+    return ":".join(map(str, address))
+
+
 def _zero(kind: str) -> Any:
     return 0.0 if kind in {"float", "double"} else np.dtype(kind.partition("_t")[0]).type(0)
 
 
 class Link:
     """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none.
+
+    The autopilot is the sender that `AutopilotLock` holds. Its messages alone are taken, and over UDP it alone gets messages.
 
     With a passphrase each message is signed, and messages without a valid signature are refused. Source: MAVLink guide, message
     signing; the key of a passphrase is that of MAVProxy and Mission Planner.
@@ -72,8 +89,10 @@ class Link:
     def __init__(self, config: LinkConfig) -> None:
         require_package("pymavlink")
         from pymavlink import mavutil  # noqa: PLC0415 - an extra
+        from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
 
         self._config = config
+        self._is_udp = config.url.startswith("udp")
         try:
             self._connection: Any = mavutil.mavlink_connection(
                 config.url,
@@ -89,10 +108,15 @@ class Link:
             raise ParameterError(
                 f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
             ) from None
+        # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the passphrase then.
+        self._connection.mav = dialect.MAVLink(self._connection, srcSystem=config.source_system)
         if config.passphrase_file is not None:
             passphrase = read_file(Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase").strip()
             self._connection.setup_signing(hashlib.sha256(passphrase).digest())
-        self.conflict = ""
+        self._parser = self._new_parser(self._connection.mav.signing)
+        self._lock = AutopilotLock(nanoseconds(SILENCE))
+        self._clash = ""  # what ends with another configuration alone
+        self._second, self._second_at = "", 0.0  # the sentence on a second sender, and when it sent last
         self.stations: set[int] = set()  # systems of ground stations beside this bridge
         self._refused = ""  # why the last message was refused, for its signature
         self._queues: dict[str, deque[ReceivedMessage]] = {}
@@ -103,6 +127,12 @@ class Link:
         self._beat, self._alive, self._began = 0.0, 0.0, time.monotonic()
         self._sending, self._closed = Lock(), Event()
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
+
+    @property
+    def conflict(self) -> str:
+        """Who else sends as the autopilot or as the bridge, or a setting that excludes an engagement."""
+        second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
+        return "; ".join(filter(None, (self._clash, second)))
 
     def listen(self, name: str) -> deque[ReceivedMessage]:
         """The queue in which messages of a name arrive."""
@@ -131,9 +161,9 @@ class Link:
         now = time.monotonic()
         if now - max(self._alive, self._began) > SILENCE:
             silence = f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
-            return "; ".join(filter(None, (silence, self._refused)))
+            return "; ".join(filter(None, (silence, self._refused, self.conflict)))
         denied = [sentence for at, sentence in self._denied.items() if at == name or not name]
-        return "; ".join([*denied, *self._slow(now, name)])
+        return "; ".join(filter(None, [self.conflict, *denied, *self._slow(now, name)]))
 
     def _slow(self, now: float, name: str) -> list[str]:
         """The messages that come at less than their requested rates."""
@@ -154,24 +184,48 @@ class Link:
                 return  # the cable is out: the ages of what is received say so
 
     def _receive(self) -> None:
+        now = time.monotonic()
         while not self._closed.is_set():
-            now = time.monotonic()
+            before, now = now, time.monotonic()
+            self._lock.overran(max(0, nanoseconds(now - before - POLL)))
             if now - self._beat >= BEAT:
                 self._beat = now
                 self._send(self._connection.mav.heartbeat_encode(GCS, INVALID, 0, 0, 0))
             self._request(now)
             try:
-                message = self._connection.recv_match(blocking=True, timeout=0.1)
+                data, address = self._packet()
             except OSError:
-                self._closed.wait(0.1)
+                self._closed.wait(POLL)
                 continue
-            if message is not None:
-                self._take(message, time.time_ns())
+            received_ns = time.time_ns()
+            for message in self._parsed(data, address):
+                self._take(message, address, received_ns)
 
-    def _take(self, message: Any, received_ns: int) -> None:
+    def _packet(self) -> tuple[bytes, Address]:
+        """The next bytes, empty where none come within POLL, and their sender: of TCP and of a serial line there is one."""
+        if not self._connection.select(POLL):
+            return b"", ()
+        if self._is_udp:
+            data, address = self._connection.port.recvfrom(PACKET)
+            return data, address
+        return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
+
+    def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
+        """The messages of a packet. A message that goes on in the next packet is read from the autopilot alone."""
+        if not self._is_udp or _text(address) == self._lock.address:
+            return self._parser.parse_buffer(data) or ()
+        # A copy: a forged signature with a late time would make each later one of the autopilot count as replayed.
+        return self._new_parser(deepcopy(self._connection.mav.signing)).parse_buffer(data) or ()
+
+    def _new_parser(self, signing: Any) -> Any:
+        parser = type(self._connection.mav)(None)
+        parser.robust_parsing, parser.signing = True, signing
+        return parser
+
+    def _take(self, message: Any, address: Address, received_ns: int) -> None:
         name, now = message.get_type(), time.monotonic()
         if message.get_srcSystem() == self._config.source_system:
-            self.conflict = (
+            self._clash = (
                 f"another sender on {self._config.url} has system {self._config.source_system} too, and the autopilot takes its"
                 " RC overrides: give it another number"
             )
@@ -181,10 +235,10 @@ class Link:
             self._refused = "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
         if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
             return
+        if not self._admits(message, address, now):
+            return
         if message.get_header().incompat_flags & SIGNED and self._config.passphrase_file is None:
-            self.conflict = "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
-        if now - self._alive > SILENCE:
-            self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
+            self._clash = "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
         self._alive = now
         if name == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL:
             self._answered(message.result)
@@ -195,6 +249,28 @@ class Link:
                 instants.popleft()
         if (queue := self._queues.get(name)) is not None:
             queue.append(ReceivedMessage(message, received_ns))
+
+    def _admits(self, message: Any, address: Address, now: float) -> bool:
+        """Whether a message with the number of the autopilot is from the locked sender; rates are requested from a new one."""
+        sender, before, now_ns = _text(address), self._lock.address, nanoseconds(now)
+        milliseconds = getattr(message, "time_boot_ms", None) if message.get_type() in self._queues else None
+        since_boot_ns = None if milliseconds is None else 1_000_000 * milliseconds
+        try:
+            self._lock.check(sender, since_boot_ns, now_ns)
+        except ChannelError as error:
+            self._second, self._second_at = str(error), now
+            return False
+        changed = self._lock.refresh(sender, since_boot_ns, now_ns)
+        if changed:
+            self._parser = self._new_parser(self._connection.mav.signing)
+            if before is not None:
+                self._second, self._second_at = f"the autopilot at {sender} is new, or has started again; before: {before}", now
+        if changed and self._is_udp:
+            with self._sending:
+                self._connection.clients = {address}
+        if changed or now - self._alive > SILENCE:
+            self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
+        return True
 
     def _request(self, now: float) -> None:
         """Request one rate after another: an answer does not say to which message it belongs."""

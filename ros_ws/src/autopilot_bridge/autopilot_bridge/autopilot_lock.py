@@ -1,0 +1,76 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Lock of a MAVLink link to one autopilot, by the address of its packets and by the time since boot in its messages."""
+
+from flight_core.publisher_lock import SENDER, PublisherLock
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import ChannelError
+
+CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within it are not told apart
+
+
+class AutopilotLock:
+    """Locks to the autopilot that is heard first, until it is silent; then to the next one, as a topic to its publisher.
+
+    Two autopilots behind one address differ by the time since boot in their messages. The time of one autopilot never goes back
+    and does not advance by more than the time that passes here; a message may come late. An autopilot that has started again
+    is another one until messages of the start before have been missing for the same silence.
+    """
+
+    def __init__(self, silence_ns: int) -> None:
+        self._silence_ns = silence_ns
+        self._addresses, self._starts = self._new_lock(), self._new_lock()
+        self._newest_ns = 0  # the largest time since boot
+        self._boot_ns = 0  # the earliest instant of the boot, by the messages so far: that of the message with the least delay
+
+    def _new_lock(self) -> PublisherLock:
+        return PublisherLock(lambda: (self._silence_ns, self._silence_ns))
+
+    @property
+    def address(self) -> str | None:
+        """The address of the autopilot; None where none has been heard."""
+        return self._addresses.publisher
+
+    def overran(self, duration_ns: int) -> None:
+        """Leave a time out of the silences: the receiver itself did not run."""
+        self._addresses.overran(duration_ns)
+        self._starts.overran(duration_ns)
+
+    def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
+        """Raise ChannelError, reason "sender", for a message of a second autopilot before the first one is silent.
+
+        `since_boot_ns` is None for a message without the time since boot.
+        """
+        try:
+            self._addresses.check(address, now_ns)
+        except ChannelError:
+            sentence = f"a second sender, {address}, sends as the autopilot: {self.address} was first and is taken alone"
+            raise ChannelError(SENDER, sentence) from None
+        if since_boot_ns is None or address != self.address:
+            return
+        try:
+            self._starts.check(self._start(since_boot_ns, now_ns), now_ns)
+        except ChannelError:
+            sentence = f"the time since boot from {address} jumps: a second autopilot sends there, or it has started again"
+            raise ChannelError(SENDER, sentence) from None
+
+    def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
+        """Lock to the sender of a message that `check` let pass. Returns whether it is another one, or has started again."""
+        changed = self._addresses.refresh(address, now_ns)
+        if changed:
+            self._starts = self._new_lock()
+        if since_boot_ns is None:
+            return changed
+        known = self._starts.publisher is not None
+        boot_ns = now_ns - since_boot_ns
+        if self._starts.refresh(self._start(since_boot_ns, now_ns), now_ns):
+            self._newest_ns, self._boot_ns = since_boot_ns, boot_ns
+            return changed or known
+        self._newest_ns, self._boot_ns = max(self._newest_ns, since_boot_ns), min(self._boot_ns, boot_ns)
+        return changed
+
+    def _start(self, since_boot_ns: int, now_ns: int) -> str:
+        """The start of a time since boot, by its instant: the locked start where the time continues that one's."""
+        boot_ns = now_ns - since_boot_ns
+        advances = since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
+        return self._starts.publisher if self._starts.publisher is not None and advances else str(boot_ns)
