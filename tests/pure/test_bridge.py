@@ -533,6 +533,151 @@ def test_ardupilot_is_not_engaged_while_pilots_switch_is_on() -> None:
     assert bridge.engage(at(0.0)) == "pilot override active: switch"
 
 
+def mavlink_bridge(override_time: float = 0.5, max_engaged: float = 120.0) -> Bridge:
+    """A bridge with the map of ArduPilot over MAVLink, ready in MANUAL; the parameter RC_OVERRIDE_TIME in s."""
+    bridge = new_bridge(unlimited("ardupilot_mavlink").model_copy(update={"max_engaged": max_engaged}))
+    bridge.take_parameter("RC_OVERRIDE_TIME", override_time)
+    receive_mavlink(bridge, 0.0)
+    for name, us in STICKS.items():
+        receive_outputs(bridge, 0.0, (trim_key(name),), us)
+    return bridge
+
+
+def receive_mavlink(bridge: Bridge, t: float) -> None:
+    """y, u and the conditions of the map of ArduPilot over MAVLink, in MANUAL, armed and in the air."""
+    receive_outputs(bridge, t, tuple(bridge.outputs))
+    receive_u(bridge, t)
+    for name, raw in {"manual": 0.0, "armed": 128.0, "flying": 2.0}.items():
+        bridge.take_condition(name, raw, at(t))
+
+
+def engaged_mavlink_bridge(max_engaged: float = 120.0) -> Bridge:
+    bridge = mavlink_bridge(max_engaged=max_engaged)
+    assert bridge.engage(at(0.0)) == ""
+    assert sent(bridge, 0.0) == {"override"}
+    return bridge
+
+
+def stop(bridge: Bridge, how: str) -> None:
+    """End an engagement as no pilot does."""
+    if how == "y ends":
+        receive_u(bridge, 0.25)
+    elif how == "u ends":
+        receive_outputs(bridge, 0.25, tuple(bridge.outputs))
+    elif how == "conditions end":
+        for t in np.arange(0.1, 1.65, 0.1).tolist():
+            receive_outputs(bridge, t, tuple(bridge.outputs))
+            receive_u(bridge, t)
+            bridge.step(at(t))
+    elif how == "another publisher":
+        bridge.conflict = how
+    elif how == "max_engaged":
+        receive_mavlink(bridge, 1.0)
+        bridge.step(at(1.0))
+    else:
+        bridge.disengage(how, at(0.2))
+    bridge.step(at(0.25))
+
+
+@pytest.mark.parametrize("how", ["y ends", "u ends", "conditions end", "another publisher", "max_engaged", "bridge shut down"])
+def test_release_that_no_pilot_requested_asks_for_a_mode_that_flies_until_the_mode_changes(how: str) -> None:
+    bridge = engaged_mavlink_bridge(1.0 if how == "max_engaged" else 120.0)
+    stop(bridge, how)
+    assert bridge.phase is Phase.RELEASE, bridge.reason
+    assert sent(bridge, 0.3) == {"override", "mode_after"}
+    bridge.take_condition("manual", 12.0, at(0.4))
+    assert sent(bridge, 0.4) == {"override"}
+
+
+@pytest.mark.parametrize("how", ["override", "request", "mode", "disarmed", "landed"])
+def test_release_by_the_pilot_leaves_the_mode(how: str) -> None:
+    bridge = engaged_mavlink_bridge()
+    if how == "override":
+        bridge.take_override("switch", 1900.0, at(0.1))
+    elif how == "request":
+        bridge.disengage("disengaged by request", at(0.1), by_pilot=True)
+    else:
+        name, raw = {"mode": ("manual", 2.0), "disarmed": ("armed", 0.0), "landed": ("flying", 1.0)}[how]
+        bridge.take_condition(name, raw, at(0.1))
+    assert bridge.step(at(0.1)) is Phase.RELEASE
+    assert sent(bridge, 0.1) == {"override"}
+
+
+def test_pilot_who_takes_over_during_a_release_keeps_the_mode() -> None:
+    bridge = engaged_mavlink_bridge()
+    bridge.disengage("bridge shut down", at(0.1))
+    assert "mode_after" in sent(bridge, 0.1)
+    bridge.take_override("switch", 1900.0, at(0.2))
+    assert sent(bridge, 0.2) == {"override"}
+
+
+def with_failsafe() -> Bridge:
+    """A bridge with the map of PX4 whose request for Hold is not sent after a release by the pilot."""
+    content = unlimited("px4").model_dump()
+    content["messages"]["leave"]["when"] = "failsafe"
+    return new_bridge(ChannelMap.validate_mapping(content, "map"))
+
+
+def test_mode_is_asked_for_after_each_engagement_and_not_after_one_that_did_not_begin() -> None:
+    bridge = with_failsafe()
+    refresh(bridge, 0.0)
+    assert bridge.engage(at(0.0)) == ""
+    bridge.disengage("the controller ended", at(0.1))
+    assert bridge.phase is Phase.RELEASE
+    bridge.take_condition("offboard", 14.0, at(0.1))
+    assert sent(bridge, 0.1) == set()  # it waited for offboard
+    for begin, by_pilot in ((1.0, False), (2.0, True), (3.0, False)):
+        refresh(bridge, begin, offboard=14.0)
+        bridge.step(at(begin))
+        assert bridge.engage(at(begin)) == ""
+        bridge.disengage("the flight ended", at(begin + 0.1), by_pilot=by_pilot)
+        assert sent(bridge, begin + 0.1) == (set() if by_pilot else {"leave"})
+
+
+def test_lost_transmitter_asks_for_the_mode() -> None:
+    """A condition that does not hold is a choice of the pilot or the autopilot, but for the loss of the transmitter."""
+    bridge = with_failsafe()
+    refresh(bridge, 0.0, offboard=14.0)
+    assert bridge.engage(at(0.0)) == ""
+    bridge.take_condition("transmitter", 0.0, at(0.1))
+    assert bridge.step(at(0.1)) is Phase.RELEASE
+    assert sent(bridge, 0.1) == {"leave"}
+
+
+OVERRIDE_TIME = "where the link is cut the last u stands so long, and 0.5 s is enough: param set RC_OVERRIDE_TIME 0.5"
+
+
+@pytest.mark.parametrize("seconds", [-1.0, 0.0, 3.0])  # without end, no overrides, ArduPilot's default
+def test_engagement_needs_a_short_timeout_of_overrides(seconds: float) -> None:
+    bridge = mavlink_bridge(seconds)
+    assert bridge.engage(at(0.0)) == f"RC_OVERRIDE_TIME is {seconds:g}, expected 0.2 to 1: {OVERRIDE_TIME}"
+    bridge.take_parameter("RC_OVERRIDE_TIME", 0.5)
+    assert bridge.engage(at(0.0)) == ""
+    bridge.take_parameter("RC_OVERRIDE_TIME", seconds)
+    assert bridge.step(at(0.0)) is Phase.ENGAGED  # a parameter refuses, and does not end
+
+
+def test_engagement_without_an_answer_about_a_parameter_is_refused() -> None:
+    bridge = mavlink_bridge()
+    bridge._parameters.clear()
+    unknown = "RC_OVERRIDE_TIME not received yet: the autopilot does not answer, or has no such parameter"
+    assert bridge.engage(at(0.0)) == unknown
+
+
+def test_problem_of_the_link_refuses_an_engagement_is_said_while_engaged_and_stands_beside_what_ends_it() -> None:
+    bridge = mavlink_bridge()
+    bridge.problem = "ATTITUDE comes at 4 Hz"
+    assert bridge.engage(at(0.0)) == "ATTITUDE comes at 4 Hz"
+    bridge.problem = ""
+    assert bridge.engage(at(0.0)) == ""
+    bridge.problem = "ATTITUDE comes at 4 Hz"
+    assert bridge.step(at(0.1)) is Phase.ENGAGED
+    assert bridge.reason.startswith("ATTITUDE comes at 4 Hz; ")
+    receive_u(bridge, 0.25)
+    assert bridge.step(at(0.25)) is Phase.RELEASE
+    assert bridge.reason.endswith("s old (mavlink/VFR_HUD); ATTITUDE comes at 4 Hz")
+
+
 def test_engagement_needs_sources_of_trims() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
     receive_outputs(bridge, 0.6, tuple(bridge.outputs))

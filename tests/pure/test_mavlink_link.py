@@ -5,7 +5,7 @@
 import hashlib
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.maps import named_map
 
 from autopilot_bridge.channel_map import set_field
-from autopilot_bridge.mavlink_link import Link, message_type
+from autopilot_bridge.mavlink_link import COMPANION, Link, message_type
 from autopilot_bridge.params import ChannelMap, LinkConfig
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
@@ -23,6 +23,8 @@ from flight_core.vectors import ChannelError
 pytestmark = pytest.mark.package("autopilot_bridge")
 
 DENIED = 2  # MAV_RESULT_DENIED, which ArduPilot answers to a rate that it does not grant
+STATION_SILENCE = 5.0  # s
+SENDER = ("127.0.0.1", 14550)
 PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
 
 
@@ -75,11 +77,19 @@ def ends() -> Iterator[Ends]:
     links: list[Link] = []
     peers: list[Peer] = []
 
-    def make(passphrase_file: str | None = None, kind: str = "udpin", at: int = 0, **rates: float) -> tuple[Link, int]:
+    def make(
+        passphrase_file: str | None = None,
+        kind: str = "udpin",
+        at: int = 0,
+        parameters: Sequence[str] = (),
+        **rates: float,
+    ) -> tuple[Link, int]:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
             free.bind(("127.0.0.1", 0))
             port = at or free.getsockname()[1]
-        links.append(Link(LinkConfig(url=f"{kind}:127.0.0.1:{port}", rates=rates, passphrase_file=passphrase_file)))
+        url = f"{kind}:127.0.0.1:{port}"
+        config = LinkConfig(url=url, rates=rates, passphrase_file=passphrase_file, station_silence=STATION_SILENCE)
+        links.append(Link(config, parameters))
         return links[-1], port
 
     def peer(port: int, **options: Any) -> Peer:
@@ -91,6 +101,28 @@ def ends() -> Iterator[Ends]:
         made.close()
     for end in peers:
         end.connection.close()
+
+
+BEAT = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4, 3)
+
+
+def received(message: Any, system: int = 1, component: int = 1) -> Any:
+    """A message as it is decoded after its way over a link."""
+    packed = message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
+    return mavlink.MAVLink(None).parse_char(packed)
+
+
+class Clock:
+    """A monotonic clock that the test sets, s."""
+
+    now = 1000.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: made.now)
+    return made
 
 
 def until(condition: Callable[[], object], each: Callable[[], object]) -> None:
@@ -267,6 +299,132 @@ def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> 
     until(lambda: made.conflict, other.beat)
     assert "another sender" in made.conflict
     assert "system 255 too" in made.conflict
+
+
+@pytest.mark.parametrize("name", ["RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"])
+def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(ends: Ends, name: str) -> None:
+    made, _ = ends.link()
+    made._take(
+        received(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3), system=255, component=190), SENDER, 0
+    )
+    assert made.conflict == ""  # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    sticks = {
+        "RC_CHANNELS_OVERRIDE": mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
+        "MANUAL_CONTROL": mavlink.MAVLink_manual_control_message(1, 0, 0, 0, 0, 0),
+    }
+    made._take(received(sticks[name], system=255, component=190), SENDER, 0)
+    assert "has system 255 too" in made.conflict
+    assert "switch the joystick of a ground station off" in made.conflict
+
+
+def test_other_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    second = ends.peer(port, system=1)
+    second.connection.mav.srcComponent = COMPANION
+    until(lambda: made.conflict, second.beat)
+    assert made.conflict == f"another bridge is on udpin:127.0.0.1:{port}: end it"
+
+
+def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
+    """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none of the map, has none."""
+    made, port = ends.link(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
+    made.start()
+    peer, messages = ends.peer(port), list[Any]()
+
+    def take() -> None:
+        peer.beat()
+        messages.extend(message for message in [peer.answer()] if message is not None)
+
+    until(lambda: {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"} <= {message.get_type() for message in messages}, take)
+    senders = {(message.get_srcSystem(), message.get_srcComponent()) for message in messages}
+    assert senders == {(1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER4)}
+    beat = next(message for message in messages if message.get_type() == "HEARTBEAT")
+    assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+    made.send(message_type("RC_CHANNELS_OVERRIDE")())
+    messages.clear()
+    until(lambda: any(message.get_type() == "RC_CHANNELS_OVERRIDE" for message in messages), take)
+    override = next(message for message in messages if message.get_type() == "RC_CHANNELS_OVERRIDE")
+    assert override.get_srcSystem() == 255
+    messages.clear()
+    until(lambda: any(message.get_type() == "HEARTBEAT" for message in messages), take)
+    assert {message.get_srcSystem() for message in messages if message.get_type() == "HEARTBEAT"} == {1}  # also after it
+
+
+def test_parameter_is_read_and_an_autopilot_that_starts_again_is_asked_again(ends: Ends, clock: Clock) -> None:
+    made, _ = ends.link(parameters=("RC_OVERRIDE_TIME",))
+    value = mavlink.MAVLink_param_value_message(b"RC_OVERRIDE_TIME", 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+    made._take(received(value, system=2), SENDER, 0)
+    assert made.parameters == {}  # of another autopilot
+    made._take(received(value), SENDER, 0)
+    assert made.parameters == {"RC_OVERRIDE_TIME": 0.5}
+    clock.now += 4.0
+    made._take(received(BEAT), SENDER, 0)
+    assert made.parameters == {}
+
+
+def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_mend(ends: Ends, clock: Clock) -> None:
+    made, _ = ends.link(ATTITUDE=40.0)
+    attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+
+    def come(seconds: float, hz: float) -> None:
+        for _ in range(round(seconds * hz)):
+            clock.now += 1.0 / hz
+            made._take(attitude, SENDER, 0)
+            made._to_request |= made._rates.step(clock.now)
+
+    come(1.0, 40.0)
+    assert made.refusal() == "the rate of ATTITUDE is not known yet"
+    come(2.0, 40.0)
+    assert (made.refusal(), made.lost()) == ("", "")
+    made._to_request.clear()  # granted
+    come(5.0, 4.0)
+    rate = "ATTITUDE comes at 4 Hz, requested are 40 Hz"
+    assert made.refusal().startswith(f"{rate}; requested again; a ground station on this link requests rates of its own")
+    assert made.refusal().endswith("give the bridge a port of its own")
+    assert made.lost() == f"{rate}; for 2 s"
+    assert made._to_request == {"ATTITUDE": 40.0}
+    come(3.0, 40.0)
+    assert made.lost() == ""
+    assert made.refusal().startswith("ATTITUDE came at 4 Hz")
+    come(20.0, 40.0)
+    assert made.refusal() == ""
+
+
+def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Clock) -> None:
+    """A request of 50 Hz is denied, and the 40 Hz of an earlier one stay: 80 % of it."""
+    made, _ = ends.link(ATTITUDE=50.0)
+    attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    made._take(attitude, SENDER, 0)
+    made._requested = "ATTITUDE", clock.now
+    made._take(received(mavlink.MAVLink_command_ack_message(511, DENIED)), SENDER, 0)
+    assert made.problem().startswith("the autopilot denied 50 Hz of ATTITUDE")
+    for _ in range(120):
+        clock.now += 0.025
+        made._take(attitude, SENDER, 0)
+        made._rates.step(clock.now)
+    assert made.problem() == ""
+
+
+def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock: Clock) -> None:
+    """Overrides hide its silence from the autopilot. One that was never heard is not missed."""
+    made, _ = ends.link()
+    made._take(received(BEAT), SENDER, 0)
+    clock.now += 60.0
+    assert made.lost() == ""
+    assert "no such station is heard: it acts after each release" in made.station()
+    station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    made._take(received(station, system=250, component=190), SENDER, 0)
+    clock.now += 60.0
+    assert made.lost() == ""  # of another number: the autopilot does not watch it either
+    made._take(received(station, system=255, component=190), SENDER, 0)
+    assert "ground station 255: station 255, which is heard, ends the engagement by 5 s of silence" in made.station()
+    clock.now += 4.9
+    assert made.lost() == ""
+    clock.now += 0.2
+    assert made.lost() == "ground station 255 is silent for 5 s"
+    made._take(received(station, system=255, component=190), SENDER, 0)
+    assert made.lost() == ""
 
 
 def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:

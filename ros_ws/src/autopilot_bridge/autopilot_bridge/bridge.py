@@ -60,7 +60,8 @@ class Bridge:
         self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
         self.reason = "not engaged yet"  # why the bridge is not engaged, what an engagement waits for, or lacks
-        self.conflict = ""  # the topics of the autopilot that have another publisher, as a sentence; set by the node
+        self.conflict = ""  # what refuses and ends an engagement, such as another publisher, as a sentence; set by the node
+        self.problem = ""  # what refuses an engagement and does not end one yet, as a rate of the link; set by the node
         sources = {trim_key(name): row for name, row in channel_map.trims.items()}
         self._rows: dict[str, MeasuredRow] = {**channel_map.pose, **channel_map.sensors, **channel_map.outputs, **sources}
         self._readings: dict[str, Reading] = {}
@@ -72,9 +73,11 @@ class Bridge:
         self._moves = np.ones(len(self.inputs), dtype=bool)  # whether the newest u differs from the one before
         self.u_lock = PublisherLock(self._u_timeouts_ns)
         self._conditions: dict[str, Reading] = {}
+        self._parameters: dict[str, float] = {}
         self._overrides: dict[str, Reading] = {}
         self._overrides_at_engagement: dict[str, float] = {}
         self._phase_ns = 0  # start of the phase
+        self._keeps_mode = True  # whether a release leaves the mode: a pilot requested it, or nothing was flown
         self._blind = False  # whether the engagement goes on without the transmitter
         self._limit_ns: dict[str, int] = {}  # since when inputs are at a limit
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
@@ -125,11 +128,15 @@ class Bridge:
         """Take the field of a condition. A condition that is lost ends an engagement at the next step."""
         self._conditions[name] = Reading(now_ns, raw)
 
+    def take_parameter(self, name: str, value: float) -> None:
+        """Take a parameter of the autopilot."""
+        self._parameters[name] = value
+
     def take_override(self, name: str, raw: float, now_ns: int) -> None:
         """Take the field of a pilot override. Beyond its threshold the bridge disengages at once."""
         self._overrides[name] = Reading(now_ns, raw)
         if self._is_active(name, now_ns):
-            self.disengage(f"pilot override by {name}", now_ns)
+            self.disengage(f"pilot override by {name}", now_ns, by_pilot=True)
 
     # State
 
@@ -227,7 +234,7 @@ class Bridge:
         """What an engagement lacks, as a sentence."""
         ends = self._end_ns is not None and now_ns >= self._end_ns - END_WARNING_NS
         warning = f"max_engaged releases in {seconds(END_WARNING_NS):g} s, unless engaged again" if ends else ""
-        return "; ".join(filter(None, (warning, self._silent_overrides(now_ns), self._blindness())))
+        return "; ".join(filter(None, (warning, self.problem, self._silent_overrides(now_ns), self._blindness())))
 
     def u_timed_out(self, now_ns: int) -> bool:
         """Whether no u was received, or none for longer than its age limit."""
@@ -248,6 +255,8 @@ class Bridge:
             lambda _: self.conflict,
             self._active_overrides,
             lambda now_ns: self._unmet(now_ns, awaited=False),
+            lambda _: self.problem,
+            lambda _: self._unfit_parameters(),
             lambda _: "" if self._blind or self._watches_transmitter or self.channel_map.max_engaged else UNBOUNDED,
             self._missing,
             lambda _: self._outside(),
@@ -257,6 +266,18 @@ class Bridge:
         )
         dry_run = "dry_run is true: nothing is sent" if self.dry_run else ""
         return "; ".join(filter(None, (dry_run, next(filter(None, (check(now_ns) for check in checks)), ""))))
+
+    def _unfit_parameters(self) -> str:
+        """The parameters of the autopilot with which the bridge does not engage, as a sentence."""
+        sentences = []
+        for name, row in self.channel_map.parameters.items():
+            value = self._parameters.get(name)
+            lower, upper = row.within
+            if value is None:
+                sentences.append(f"{name} not received yet: the autopilot does not answer, or has no such parameter")
+            elif not lower <= value <= upper:
+                sentences.append(f"{name} is {value:g}, expected {lower:g} to {upper:g}: {row.sentence}")
+        return "; ".join(sentences)
 
     def _active_overrides(self, now_ns: int) -> str:
         active = [name for name in self.channel_map.overrides if self._is_active(name, now_ns)]
@@ -322,8 +343,12 @@ class Bridge:
             }
             self._enter(Phase.ENGAGED, now_ns)
 
-    def disengage(self, reason: str, now_ns: int) -> None:
-        """Disengage from any phase: return the channels to the autopilot."""
+    def disengage(self, reason: str, now_ns: int, *, by_pilot: bool = False) -> None:
+        """Disengage from any phase: return the channels to the autopilot.
+
+        `by_pilot`: the pilot requested it, and the mode stays as it is.
+        """
+        self._keeps_mode |= by_pilot
         if self.phase not in {Phase.DISENGAGED, Phase.RELEASE}:
             self.reason = reason
             self._enter(Phase.RELEASE, now_ns)
@@ -341,7 +366,8 @@ class Bridge:
             self.disengage(lost, now_ns)
         elif self.phase is Phase.ENGAGED:
             measured = _sentence(self.stale(now_ns))
-            reasons = "; ".join(filter(None, (self._lost(now_ns), measured))) or self._outside()
+            cause = self.problem if measured else ""
+            reasons = "; ".join(filter(None, (self._lost(now_ns), measured, cause))) or self._outside()
             if ended := reasons or self._does_not_answer(now_ns):
                 self.disengage(ended, now_ns)
             elif timeout := self._u_timeout(now_ns):
@@ -434,11 +460,24 @@ class Bridge:
             return phase is Phase.ENGAGING
         if when == "release":
             return phase is Phase.RELEASE and not self._unmet(now_ns, awaited=True)
+        if when == "failsafe":
+            return phase is Phase.RELEASE and not (self._keeps_mode or self._is_contradicted())
         own = [row.release for row in self.channel_map.inputs.values() if row.message == name]
         return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in own)
 
+    def _is_contradicted(self) -> bool:
+        """Whether a condition does not hold by its last value: the pilot or the autopilot chose another mode, or has landed.
+
+        One that tells the loss of the transmitter does not count: then nobody flies.
+        """
+        rows = self.channel_map.conditions.items()
+        readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
+        return any(reading is not None and not row.holds(reading.value) for row, reading in readings)
+
     def _enter(self, phase: Phase, now_ns: int) -> None:
         self.phase, self._phase_ns = phase, now_ns
+        if phase in {Phase.ENGAGING, Phase.ENGAGED}:
+            self._keeps_mode = phase is Phase.ENGAGING
         if phase is Phase.ENGAGED:
             self._limit_ns = {}
             self._begin_time(now_ns)

@@ -2,8 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A MAVLink link to an autopilot, as a source and a sink of messages of a channel map.
 
-A thread receives, sends a heartbeat each second and requests the rates of messages. Source: MAVLink guide (heartbeat protocol,
-SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as pymavlink has them.
+A thread receives, sends a heartbeat each second, requests the rates of messages and reads parameters. All of these it sends as
+a companion computer of the autopilot. The messages of the map alone have the number of the ground station, because ArduPilot
+takes RC overrides of no other. Its failsafe FS_GCS_ENABL counts overrides as heartbeats of the station; those of a companion do
+not count. Source: MAVLink guide (heartbeat and parameter protocols, SET_MESSAGE_INTERVAL), common.xml and ardupilotmega.xml as
+pymavlink has them; ArduPilot, GCS_Common.cpp, handle_rc_channels_override and handle_heartbeat; tried with ArduPlane in SITL.
 """
 
 import hashlib
@@ -18,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from autopilot_bridge.autopilot_lock import AutopilotLock
+from autopilot_bridge.message_rates import MessageRates
 from autopilot_bridge.params import MAVLINK, LinkConfig
 from flight_core.files import read_file
 from flight_core.installation import require_package
@@ -27,15 +31,21 @@ from flight_core.vectors import ChannelError
 
 DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
+COMPANION = 194  # MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground station,
+# such as 0 or 190, ArduPilot would not forward the station's heartbeats any more (MAVLink_routing.cpp, handle_heartbeat)
 SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # MAV_CMD, MAV_RESULT
 SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
-GCS, INVALID = 6, 8  # MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID
-BEAT = 1.0  # s; ArduPilot's FS_GCS_ENABL waits 5 s for the next one
+GCS, ONBOARD, INVALID = 6, 18, 8  # MAV_TYPE_GCS, MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID
+STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
+BEAT = 1.0  # s
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
 SILENCE = 3.0  # s without the autopilot, after which all rates are requested again, and another sender may take its place
-MEASURED = 5.0  # s over which the rate of a message is measured
-GRANTED = 0.7  # of a requested rate: below, the link or the autopilot does not keep up
+READ_AGAIN = 5.0  # s, after which a parameter is requested again: a ground station may have set it
 QUEUE = 256  # messages between two ticks
+TAKEN = (
+    "requested again; a ground station on this link requests rates of its own (MAVProxy: set streamrate -1), or the link is too"
+    " slow: give the bridge a port of its own"
+)
 RETRIES = 2  # of a connection by TCP, 1 s each
 POLL = 0.1  # s, the longest wait for a packet
 PACKET = 65535  # bytes, the largest of UDP
@@ -81,12 +91,13 @@ class Link:
     """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none.
 
     The autopilot is the sender that `AutopilotLock` holds. Its messages alone are taken, and over UDP it alone gets messages.
+    `parameters` are names of parameters of the autopilot that are read.
 
     With a passphrase each message is signed, and messages without a valid signature are refused. Source: MAVLink guide, message
     signing; the key of a passphrase is that of MAVProxy and Mission Planner.
     """
 
-    def __init__(self, config: LinkConfig) -> None:
+    def __init__(self, config: LinkConfig, parameters: Sequence[str] = ()) -> None:
         require_package("pymavlink")
         from pymavlink import mavutil  # noqa: PLC0415 - an extra
         from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
@@ -97,7 +108,8 @@ class Link:
             self._connection: Any = mavutil.mavlink_connection(
                 config.url,
                 baud=config.baud,
-                source_system=config.source_system,
+                source_system=config.system,
+                source_component=COMPANION,
                 dialect=DIALECT,
                 autoreconnect=True,
                 retries=RETRIES,
@@ -109,7 +121,7 @@ class Link:
                 f"link.url: found {config.url}, which cannot be opened ({error}), expected {expected}"
             ) from None
         # That of pymavlink is of MAVLink 1 until a packet of MAVLink 2 comes, and forgets the passphrase then.
-        self._connection.mav = dialect.MAVLink(self._connection, srcSystem=config.source_system)
+        self._connection.mav = dialect.MAVLink(self._connection, srcSystem=config.system, srcComponent=COMPANION)
         if config.passphrase_file is not None:
             passphrase = read_file(Path(config.passphrase_file), "link.passphrase_file", "a file with a passphrase").strip()
             self._connection.setup_signing(hashlib.sha256(passphrase).digest())
@@ -120,11 +132,15 @@ class Link:
         self.stations: set[int] = set()  # systems of ground stations beside this bridge
         self._refused = ""  # why the last message was refused, for its signature
         self._queues: dict[str, deque[ReceivedMessage]] = {}
-        self._heard: dict[str, deque[float]] = {}  # instants of messages by name, of the last MEASURED seconds
+        self.parameters: dict[str, float] = {}  # of the autopilot, as it last told
+        self._to_read = tuple(parameters)
         self._to_request = dict(config.rates)
         self._requested: tuple[str, float] | None = None  # the message whose interval was requested, and when
         self._denied: dict[str, str] = {}
         self._beat, self._alive, self._began = 0.0, 0.0, time.monotonic()
+        self._rates = MessageRates(config.rates, self._began)
+        self._read = 0.0  # when the parameters were requested
+        self._station_heard: float | None = None  # the ground station with the number of the RC overrides
         self._sending, self._closed = Lock(), Event()
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
 
@@ -143,11 +159,11 @@ class Link:
         self._thread.start()
 
     def send(self, message: Any) -> None:
-        """Send a message of `message_type`, to the autopilot of the configuration."""
+        """Send a message of `message_type` to the autopilot, with the number of the ground station."""
         fields = message.packed.fieldnames
         values = {field: getattr(message, field) for field in fields}
         values |= {"target_system": self._config.system, "target_component": AUTOPILOT}
-        self._send(message.packed(*(values[field] for field in fields)))
+        self._send(message.packed(*(values[field] for field in fields)), self._config.source_system)
 
     def close(self) -> None:
         """End the thread and the connection."""
@@ -162,23 +178,40 @@ class Link:
         if now - max(self._alive, self._began) > SILENCE:
             silence = f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
             return "; ".join(filter(None, (silence, self._refused, self.conflict)))
-        denied = [sentence for at, sentence in self._denied.items() if at == name or not name]
-        return "; ".join(filter(None, [self.conflict, *denied, *self._slow(now, name)]))
+        names = [name] if name else list(self._config.rates)
+        slow = [sentence for at, sentence in self._rates.slow(now).items() if at in names]
+        denied = [sentence for at, sentence in self._denied.items() if at in names and not self._rates.comes(at, now)]
+        return "; ".join(filter(None, [self.conflict, *slow, *denied, *([TAKEN] if slow else [])]))
 
-    def _slow(self, now: float, name: str) -> list[str]:
-        """The messages that come at less than their requested rates."""
-        if now - self._began < 2.0 * MEASURED or self._to_request:
-            return []
-        slow = []
-        for at, rate in self._config.rates.items():
-            found = sum(now - instant < MEASURED for instant in tuple(self._heard.get(at, ()))) / MEASURED
-            if name in {"", at} and at not in self._denied and found < GRANTED * rate:
-                slow.append(f"{at} comes at {found:.3g} Hz, requested are {rate:g} Hz")
-        return slow
+    def refusal(self) -> str:
+        """Why an engagement would not have the rates of the map, as a sentence."""
+        unknown = self._rates.unknown(time.monotonic())
+        return self.problem() or (f"the rate of {', '.join(unknown)} is not known yet" if unknown else "")
 
-    def _send(self, message: Any) -> None:
+    def lost(self) -> str:
+        """What ends an engagement, as a sentence: a rate that stays slow, or the silence of the ground station."""
+        now = time.monotonic()
+        limit = self._config.station_silence
+        is_silent = limit is not None and self._station_heard is not None and now - self._station_heard > limit
+        station = f"ground station {self._config.source_system} is silent for {limit:g} s" if is_silent else ""
+        return "; ".join(filter(None, (self._rates.lasting(now), station)))
+
+    def station(self) -> str:
+        """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a sentence."""
+        system, limit = self._config.source_system, self._config.station_silence
+        counted = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
+        if self._station_heard is None:
+            return (
+                f"{counted}, and no such station is heard: it acts after each release, FS_LONG_TIMEOUT after the last override"
+            )
+        watched = "is not watched" if limit is None else f"ends the engagement by {limit:g} s of silence"
+        return f"{counted}: station {system}, which is heard, {watched}"
+
+    def _send(self, message: Any, system: int) -> None:
+        """Send as a system, with the component COMPANION."""
         with self._sending:
             try:
+                self._connection.mav.srcSystem = system
                 self._connection.mav.send(message)
             except OSError:
                 return  # the cable is out: the ages of what is received say so
@@ -190,8 +223,10 @@ class Link:
             self._lock.overran(max(0, nanoseconds(now - before - POLL)))
             if now - self._beat >= BEAT:
                 self._beat = now
-                self._send(self._connection.mav.heartbeat_encode(GCS, INVALID, 0, 0, 0))
+                self._send(self._connection.mav.heartbeat_encode(ONBOARD, INVALID, 0, 0, 0), self._config.system)
+            self._to_request |= self._rates.step(now)
             self._request(now)
+            self._request_parameters(now)
             try:
                 data, address = self._packet()
             except OSError:
@@ -224,13 +259,18 @@ class Link:
 
     def _take(self, message: Any, address: Address, received_ns: int) -> None:
         name, now = message.get_type(), time.monotonic()
-        if message.get_srcSystem() == self._config.source_system:
+        system = message.get_srcSystem()
+        is_station = name == "HEARTBEAT" and message.type == GCS
+        if system == self._config.source_system and (name in STICKS or (name == "HEARTBEAT" and not is_station)):
             self._clash = (
-                f"another sender on {self._config.url} has system {self._config.source_system} too, and the autopilot takes its"
-                " RC overrides: give it another number"
+                f"another sender on {self._config.url} has system {system} too, and the autopilot takes its RC overrides:"
+                " give it another number, or switch the joystick of a ground station off"
             )
-        elif name == "HEARTBEAT" and message.type == GCS:
-            self.stations.add(message.get_srcSystem())
+        elif (system, message.get_srcComponent()) == (self._config.system, COMPANION):
+            self._clash = f"another bridge is on {self._config.url}: end it"
+        elif is_station:
+            self.stations.add(system)
+            self._station_heard = now if system == self._config.source_system else self._station_heard
         if name == "BAD_DATA" and "signature" in str(message.reason):
             self._refused = "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
         if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
@@ -242,11 +282,9 @@ class Link:
         self._alive = now
         if name == "COMMAND_ACK" and message.command == SET_MESSAGE_INTERVAL:
             self._answered(message.result)
-        if name in self._config.rates:
-            instants = self._heard.setdefault(name, deque())
-            instants.append(now)
-            while now - instants[0] > MEASURED:
-                instants.popleft()
+        if name == "PARAM_VALUE":
+            self.parameters[message.param_id] = message.param_value
+        self._rates.take(name, now)
         if (queue := self._queues.get(name)) is not None:
             queue.append(ReceivedMessage(message, received_ns))
 
@@ -270,6 +308,8 @@ class Link:
                 self._connection.clients = {address}
         if changed or now - self._alive > SILENCE:
             self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
+            self._rates.begin(now)
+            self.parameters.clear()
         return True
 
     def _request(self, now: float) -> None:
@@ -279,11 +319,19 @@ class Link:
         name, rate = next(iter(self._to_request.items()))
         identity = message_type(name).packed.id
         self._requested = name, now
-        self._send(
-            self._connection.mav.command_long_encode(
-                self._config.system, AUTOPILOT, SET_MESSAGE_INTERVAL, 0, identity, 1e6 / rate, 0, 0, 0, 0, 0
-            )
-        )
+        encode = self._connection.mav.command_long_encode
+        interval = encode(self._config.system, AUTOPILOT, SET_MESSAGE_INTERVAL, 0, identity, 1e6 / rate, 0, 0, 0, 0, 0)
+        self._send(interval, self._config.system)
+
+    def _request_parameters(self, now: float) -> None:
+        """Request each parameter, at first until it is known."""
+        known = all(name in self.parameters for name in self._to_read)
+        if now - self._alive > SILENCE or now - self._read < (READ_AGAIN if known else ANSWER):
+            return
+        self._read = now
+        for name in self._to_read:
+            encode = self._connection.mav.param_request_read_encode
+            self._send(encode(self._config.system, AUTOPILOT, name.encode(), -1), self._config.system)
 
     def _answered(self, result: int) -> None:
         if self._requested is None:

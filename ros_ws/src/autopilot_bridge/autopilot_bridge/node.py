@@ -51,6 +51,7 @@ from flight_ros.topics import ENGAGEMENT, POSE, PUBLISH, Topic, U, Y
 
 WOULD_SEND = Topic("bridge/would_send", JointState)
 LEFT = "no publisher any more. Where the autopilot flies on, its client may not come back by itself: start its agent again"
+RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
 RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
 
 ACTIVATION_TIMEOUT_NS = NANOSECONDS  # of the controller at engagement; it answers within some of its ticks
@@ -80,8 +81,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         rows_by_topic: dict[str, list[NamedRow]] = {}
         for name, row in named:
             rows_by_topic.setdefault(row.topic, []).append((name, row))
-        self._link = None if self._map.link is None else mavlink_link.Link(self._map.link)
+        self._link = None if self._map.link is None else mavlink_link.Link(self._map.link, tuple(self._map.parameters))
         self._known_stations: set[int] = set()  # systems of ground stations that were told
+        self._overrides_sticks = any(message.topic == RC_OVERRIDE for message in self._map.messages.values())
+        self._conflict = ""  # the topics that have two publishers, as a sentence
         self._recorded: dict[str, tuple[Callable[[bytes], None], Encoder]] = {}  # what comes over MAVLink, as named vectors
         self._readers: list[tuple[PolledSubscription | MavlinkReader, list[NamedRow]]] = []
         for topic, rows in rows_by_topic.items():
@@ -155,6 +158,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         for subscription, rows in self._readers:
             for received in subscription.take():
                 self._read(subscription, rows, received.message, received.received_ns or now_ns + step_ns, now_ns, step_ns)
+        self._watch_link()
         sample = self._bridge.y(now_ns)
         if sample is None:
             self._require_first_y(now_ns)
@@ -236,7 +240,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
     def _engage(self, request: Any, response: Any) -> Any:
         if request.data:
             return self._request_engagement(response, blind=False)
-        self._bridge.disengage("disengaged by request", self.now_ns())
+        self._bridge.disengage("disengaged by request", self.now_ns(), by_pilot=True)
         response.success = True
         self._log_phase()
         return response
@@ -305,6 +309,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self.get_logger().warning(bounded(f"{sentence}: {reason}"))
         else:
             self.get_logger().info(sentence)
+        engaged = phase is Phase.ENGAGED and before is not Phase.ENGAGED
+        if engaged and self._link is not None and self._overrides_sticks:
+            self.get_logger().info(self._link.station())
         if phase is not before and Phase.ENGAGED in (phase, before):
             self._activate(active=phase is Phase.ENGAGED)
         self._engagement.publish(KeyValue(key=phase.name, value=reason))
@@ -389,7 +396,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
             for topic, count in counts.items()
             if count > (topic not in setpoints)
         ]
-        self._bridge.conflict = "; ".join(filter(None, [*conflicts, "" if self._link is None else self._link.conflict]))
+        self._conflict = "; ".join(conflicts)
+        self._watch_link()
+
+    def _watch_link(self) -> None:
+        """Tell the bridge what is wrong with topics and link, and the parameters of the autopilot."""
+        bridge, link = self._bridge, self._link
+        bridge.conflict = self._conflict
+        if link is None:
+            return
+        bridge.conflict = "; ".join(filter(None, (self._conflict, link.conflict, link.lost())))
+        bridge.problem = link.refusal()
+        for name, value in tuple(link.parameters.items()):
+            bridge.take_parameter(name, value)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
         bridge, now_ns = self._bridge, self.now_ns()

@@ -47,6 +47,7 @@ Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"]
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
+ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]  # common.xml, PARAM_VALUE: 16 characters
 SystemId = Annotated[int, Field(ge=1, le=255)]
 Raw = Annotated[float, Field(allow_inf_nan=True)]  # of a message field, which may be NaN, infinite or FLT_MAX for "no value"
 Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # of a message field: from int64 to uint64
@@ -150,9 +151,10 @@ class MessageRow(Config):
     topic: TopicName = Field(description="the autopilot's topic")
     type: MessageType = Field(description="its type, package/msg/Type")
     rate: Rate = Field(description="the rate at which it is sent, Hz")
-    when: Literal["engaged", "heartbeat", "engaging", "release"] = Field(
+    when: Literal["engaged", "heartbeat", "engaging", "release", "failsafe"] = Field(
         description="engaged: from engagement to the end of the release; heartbeat: from the request to the release; engaging:"
-        " while the engagement waits for a condition; release: during the release while the conditions hold"
+        " while the engagement waits for a condition; release: during the release while the conditions hold; failsafe: the same"
+        " after a release that no pilot requested, also where the conditions are not reported any more"
     )
     stamped: bool = Field(description="whether header.stamp is set to the instant of sending")
     values: dict[str, Value] = Field(default={}, description="values of its other fields, by their paths")
@@ -212,6 +214,14 @@ class OverrideRow(WatchedRow):
         return (self.above is not None and raw > self.above) or (self.below is not None and raw < self.below)
 
 
+class ParameterRow(Config):
+    """A parameter of the autopilot that an engagement needs, read over the MAVLink link."""
+
+    within: Limits = Field(description="the least and the greatest value with which the bridge engages")
+    sentence: str = Field(min_length=1, description="what another value does, and how to mend it")
+    source: str = Field(min_length=1, description="where the row is from")
+
+
 class QosRow(Config):
     """The quality of service of a topic."""
 
@@ -230,7 +240,14 @@ class LinkConfig(Config):
     baud: Baud = Field(default=57600, description="the rate of a serial device, bit/s")
     system: SystemId = Field(default=1, description="the autopilot's system, MAV_SYSID; its component is 1")
     source_system: SystemId = Field(
-        default=255, description="the system of the bridge: ArduPilot takes RC overrides of MAV_GCS_SYSID alone, 255 by default"
+        default=255,
+        description="the system of the map's messages: ArduPilot takes RC overrides of its ground station alone, MAV_GCS_SYSID,"
+        " 255 by default. All else is sent as the autopilot's companion computer",
+    )
+    station_silence: Positive | None = Field(
+        default=None,
+        description="how long the ground station with the number `source_system` may be silent, once it was heard, s: then the"
+        " bridge disengages, because the autopilot takes the RC overrides for heartbeats of the station; null: without end",
     )
     passphrase_file: str | None = Field(
         default=None,
@@ -286,6 +303,9 @@ class ChannelMap(Config):
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
     conditions: dict[str, ConditionRow] = Field(default={}, description="the conditions of an engagement")
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
+    parameters: dict[ParameterName, ParameterRow] = Field(
+        default={}, description="parameters of the autopilot that an engagement needs, by name"
+    )
     topics: dict[str, QosRow] = Field(default={}, description="the quality of service by topic; none for MAVLink")
     link: LinkConfig | None = Field(default=None, description="the MAVLink link of rows with a type mavlink/msg/NAME")
 
@@ -344,6 +364,11 @@ class ChannelMap(Config):
             thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
             found = " and ".join(thresholds) or "no threshold"
             require(len(thresholds) == 1, f"overrides.{name}", found, "one of above, below and moved")
+
+        for parameter, required in self.parameters.items():
+            require(self.link is not None, "link", "none", f"one, for parameters.{parameter}")
+            lower, upper = required.within
+            require(lower <= upper, f"parameters.{parameter}.within", [lower, upper], "the lower end before the upper one")
 
     def _check_fields(self) -> None:
         rows = self._readers() | {"inputs": self.inputs}

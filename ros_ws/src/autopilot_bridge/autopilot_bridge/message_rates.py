@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the messages of a link come at their requested rates. It reads no clock: every instant is an argument, in s."""
+
+from collections import deque
+from collections.abc import Mapping
+
+COUNTED = 2.0  # s over which messages are counted: a host that pauses for half a second does not make a rate slow
+MESSAGES = 4  # counted at least, where COUNTED has fewer
+GRANTED = 0.7  # of a requested rate: below, the rate is slow
+SLOW_ENDS = 2.0  # s: an engagement ends after a slow rate of this length. A rate that is requested again comes back sooner
+REMEMBERED = 20.0  # s after a rate was taken, in which an engagement is refused: MAVProxy requests its own rates every 15 s
+REPEATED = 1.0  # s between two requests of a slow rate
+JUDGED = 0.1  # s between two judgements
+PAUSE = 0.4  # s without a judgement: the host paused
+GAPS = 3  # between the newest messages: their mean is the rate now
+
+
+class MessageRates:
+    """Counts messages by name. `requested` has their rates, Hz."""
+
+    def __init__(self, requested: Mapping[str, float], now: float) -> None:
+        self._requested = dict(requested)
+        self.begin(now)
+
+    def begin(self, now: float) -> None:
+        """Begin again: the autopilot may have started again, and the rates are requested."""
+        self._rates = {name: _Rate(rate, now) for name, rate in self._requested.items()}
+        self._stepped = now
+
+    def take(self, name: str, now: float) -> None:
+        """Count a message."""
+        if (rate := self._rates.get(name)) is not None:
+            rate.take(now)
+
+    def step(self, now: float) -> dict[str, float]:
+        """Judge each rate every JUDGED. Returns the rates to request again, Hz by name.
+
+        After a pause of the host the messages that have come meanwhile are counted first.
+        """
+        passed = now - self._stepped
+        if passed < JUDGED:
+            return {}
+        self._stepped = now
+        if passed > PAUSE:
+            return {}
+        return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
+
+    def slow(self, now: float) -> dict[str, str]:
+        """The messages that are slow, or whose rate was taken less than REMEMBERED ago, each with a sentence."""
+        sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
+        return {name: sentence for name, sentence in sentences.items() if sentence}
+
+    def lasting(self, now: float) -> str:
+        """The messages that are slow for SLOW_ENDS or longer, as a sentence."""
+        lasting = [rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)]
+        return "; ".join([*lasting, f"for {SLOW_ENDS:g} s"]) if lasting else ""
+
+    def comes(self, name: str, now: float) -> bool:
+        """Whether a message comes at its rate."""
+        return self._rates[name].is_known(now) and not self._rates[name].sentence(name, now)
+
+    def unknown(self, now: float) -> list[str]:
+        """The names of the messages that were not counted for long enough."""
+        return [name for name, rate in self._rates.items() if not rate.is_known(now)]
+
+
+class _Rate:
+    """The rate of a message."""
+
+    def __init__(self, requested: float, now: float) -> None:
+        self.requested = requested  # Hz
+        self._window = max(COUNTED, MESSAGES / requested)  # s
+        self._began = now
+        self._instants: deque[float] = deque()  # of its messages within the window
+        self._lowest = requested  # Hz, since it is slow
+        self._slow_since: float | None = None
+        self._reached = False
+        self._taken: float | None = None  # when it was slow last, after it had been reached
+        self._repeated: float | None = None  # when it was requested again
+
+    def take(self, now: float) -> None:
+        self._instants.append(now)
+        self._drop_old(now)
+
+    def is_known(self, now: float) -> bool:
+        return now - self._began >= self._window
+
+    def lasts(self, now: float) -> bool:
+        return self._slow_since is not None and now - self._slow_since >= SLOW_ENDS
+
+    def step(self, now: float) -> bool:
+        """Judge the rate. Returns whether it is to be requested again."""
+        if not self.is_known(now):
+            return False
+        self._drop_old(now)
+        counted = len(self._instants) / self._window
+        if counted >= GRANTED * self.requested:
+            self._reached = True
+            self._slow_since = None
+            return False
+        if self._slow_since is None:
+            self._slow_since = now
+            self._lowest = self.requested
+        self._lowest = min(self._lowest, counted, self._present())
+        self._taken = now if self._reached else None
+        if self._repeated is not None and now - self._repeated < REPEATED:
+            return False
+        self._repeated = now
+        return True
+
+    def sentence(self, name: str, now: float) -> str:
+        rate = f"at {self._lowest:.2g} Hz, requested are {self.requested:g} Hz"
+        if self._slow_since is not None:
+            return f"{name} comes {rate}"
+        if self._taken is not None and now - self._taken < REMEMBERED:
+            return f"{name} came {rate}, less than {REMEMBERED:g} s ago"
+        return ""
+
+    def _drop_old(self, now: float) -> None:
+        while self._instants and now - self._instants[0] > self._window:
+            self._instants.popleft()
+
+    def _present(self) -> float:
+        """The mean rate of the newest messages, Hz: the count still has those from before a fall."""
+        if len(self._instants) <= GAPS:
+            return len(self._instants) / self._window
+        return GAPS / max(self._instants[-1] - self._instants[-1 - GAPS], 1e-3)
