@@ -38,6 +38,7 @@ from autopilot_bridge.channel_map import (
     version_faults,
 )
 from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
+from flight_analysis.design.map_check import check_map, definitions_below
 from flight_cli.cli import application
 from flight_core import installation
 from flight_core.parameters import ParameterError
@@ -257,6 +258,56 @@ def test_check_map_finds_field_that_row_cannot_use(key: str, change: dict[str, s
     result = CliRunner().invoke(application(["check-map"]), ["check-map", str(tmp_path / "changed.yaml"), "--json"])
     found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
     assert found == {f"pose.{key}": [fault]}
+
+
+def test_request_of_a_service_is_checked_against_the_sources_of_a_package(tmp_path: Path) -> None:
+    """The fields of the answer, below the line ---, do not count."""
+    (tmp_path / "package.xml").write_text("<package><name>ardupilot_msgs</name></package>", encoding="utf-8")
+    for section in ("msg", "srv"):
+        (tmp_path / section).mkdir()
+    service = tmp_path / "srv" / "ModeSwitch.srv"
+    channel_map = named_map("ardupilot")
+    for text, fault in (("uint8 mode\n---\nbool status", ""), ("uint8 number\n---\nuint8 mode", "no mode")):
+        service.write_text(text, encoding="utf-8")
+        kinds = [kind for _, _, kind in channel_map.used_topics()]
+        rows = check_map(channel_map, [definitions_below(tmp_path, kinds)])
+        assert [row.faults for row in rows if row.key == "messages.mode_after"] == [(fault,)]
+
+
+def test_service_is_requested_and_does_not_fly() -> None:
+    """Its answer takes a round trip: setpoints and heartbeats are messages."""
+    content = named_map("ardupilot").model_dump()
+    assert [name for name, row in named_map("ardupilot").messages.items() if row.is_service] == ["mode_after"]
+    content["messages"]["mode_after"]["when"] = "heartbeat"
+    with pytest.raises(ParameterError, match=r"messages\.mode_after\.type: found the service ardupilot_msgs/srv/ModeSwitch"):
+        ChannelMap.validate_mapping(content, "map")
+
+
+def test_type_of_a_service_is_found_in_its_package() -> None:
+    loaded: list[str] = []
+
+    def load(name: str) -> Any:
+        loaded.append(name)
+        return Message(ModeSwitch=int)
+
+    assert message_type("ardupilot_msgs/srv/ModeSwitch", load) is int
+    assert loaded == ["ardupilot_msgs.srv"]
+
+
+def test_parameters_of_the_autopilot_need_a_link_a_name_and_limits() -> None:
+    content = named_map("ardupilot_mavlink").model_dump()
+    row = content["parameters"]["RC_OVERRIDE_TIME"]
+    over_dds = named_map("ardupilot").model_dump()
+    for changed, sentence in (
+        (
+            {**over_dds, "parameters": {"RC_OVERRIDE_TIME": row}},
+            "link: found none, expected one, for parameters.RC_OVERRIDE_TIME",
+        ),
+        ({**content, "parameters": {"RC_OVERRIDE_TIME": row | {"within": [1.0, 0.5]}}}, "the lower end before the upper one"),
+        ({**content, "parameters": {"rc override time": row}}, "parameters.rc override time: found no name of a parameter"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            ChannelMap.validate_mapping(changed, "map")
 
 
 def test_map_of_older_sources_of_ardupilot_needs_only_message_types_of_common_interfaces() -> None:

@@ -481,6 +481,17 @@ def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.Monkey
     assert made.problem() == f"no message of system 1 over udpin:127.0.0.1:{port} for 3 s"
 
 
+@pytest.mark.parametrize(("name", "key"), [("ardupilot", "mode"), ("ardupilot_mavlink", "param2")])
+def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(name: str, key: str) -> None:
+    """The numbers of the modes are those that pymavlink has of ArduPlane, MAV_CMD those of common.xml."""
+    row = named_map(name).messages["mode_after"]
+    assert row.when == "failsafe"
+    assert row.values[key] == {mode: number for number, mode in mavutil.mode_mapping_apm.items()}["LOITER"]
+    if name == "ardupilot_mavlink":
+        assert row.values["command"] == mavlink.MAV_CMD_DO_SET_MODE
+        assert row.values["param1"] == mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
 def test_wrong_map_or_message_is_one_sentence() -> None:
     with pytest.raises(ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"):
         message_type("ALTITUD")

@@ -149,7 +149,8 @@ def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer
     used = [row for channel_map in maps for row in channel_map.used_topics()]
     sent, received = ([row for row in used if row[0].startswith("messages.") is is_sent] for is_sent in (True, False))
     # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
-    published = {in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")}
+    requested = {topic for _, topic, kind in sent if "/srv/" in kind}
+    published = {in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")} - requested
     published |= {in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")}
     subscribed = {in_full(topic, "bridge") for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
     policy = allowed()["bridge"]
@@ -157,7 +158,7 @@ def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer
     own = discovered(peer_node, ("bridge",))["bridge"]
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe
-    assert (own.reply, own.request) == (policy.reply, policy.request)
+    assert (own.reply, own.request | requested) == (policy.reply, policy.request)
 
 
 def test_the_policy_allows_no_wildcard() -> None:
@@ -166,8 +167,7 @@ def test_the_policy_allows_no_wildcard() -> None:
 
 
 @pytest.mark.parametrize("node", allowed())
-def test_policy_allows_no_service_request_but_those_of_bridge_to_controller(node: str) -> None:
-    """The controller is active only while the bridge is engaged."""
-    assert allowed()[node].request == (
-        frozenset({"/controller/change_state", "/controller/get_state"}) if node == "bridge" else frozenset()
-    )
+def test_policy_allows_no_service_request_but_those_of_bridge_to_controller_and_autopilot(node: str) -> None:
+    """The controller is active only while the bridge is engaged. ArduPilot is asked for a mode after a release."""
+    requested = {"/controller/change_state", "/controller/get_state", "/ap/mode_switch"}
+    assert allowed()[node].request == (frozenset(requested) if node == "bridge" else frozenset())

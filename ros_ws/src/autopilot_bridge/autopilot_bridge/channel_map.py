@@ -169,10 +169,10 @@ def read_raw(message: Any, path: str, function: str, turned_by: str | None = Non
 
 
 def message_type(name: str, load: Callable[[str], Any] = importlib.import_module) -> type:
-    """The class of "package/msg/Type". Raises ParameterError with the package to install."""
-    package, _, kind = name.split("/")
+    """The class of "package/msg/Type" or "package/srv/Type". Raises ParameterError with the package to install."""
+    package, section, kind = name.split("/")
     try:
-        module = load(f"{package}.msg")
+        module = load(f"{package}.{section}")
     except ModuleNotFoundError:
         raise ParameterError(f"{name}: {missing(package)}") from None
     message_class = getattr(module, kind, None)

@@ -13,6 +13,8 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.client import Client
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
@@ -130,7 +132,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         return reader
 
     def _make(self, name: str, row: MessageRow) -> "OutgoingMessage":
-        message = _message_type(row.type)()
+        kind = _message_type(row.type)
+        message = kind.Request() if row.is_service else kind()
         rows = [(number, channel) for number, channel in enumerate(self._map.inputs.values()) if channel.message == name]
         try:
             for path, value in row.values.items():
@@ -145,6 +148,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             raise ParameterError(f"map {self._map.name}: messages.{name} of type {row.type}: {error}") from None
         if self._link is not None and row.topic.startswith(f"{MAVLINK}/"):
             return OutgoingMessage(MavlinkPublisher(self._link, row.topic), message, row, rows)
+        if row.is_service:
+            return OutgoingMessage(ServiceCaller(self.create_client(kind, row.topic)), message, row, rows)
         publisher = self.create_publisher(type(message), row.topic, _qos(self._map.topics[row.topic]))
         return OutgoingMessage(publisher, message, row, rows)
 
@@ -371,7 +376,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         outgoing = (
             partial(self.endpoints.check_subscribers, outgoing_message.publisher)
             for outgoing_message in self._outgoing.values()
-            if not isinstance(outgoing_message.publisher, MavlinkPublisher)
+            if isinstance(outgoing_message.publisher, Publisher)
         )
         return [*super().graph_checks(), *outgoing, self._find_conflicts]
 
@@ -387,7 +392,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
             if isinstance(subscription, PolledSubscription) and not all(isinstance(row, OverrideRow) for _, row in rows)
         }
         publishers = [self._outgoing[row.message].publisher for row in self._map.inputs.values()]
-        setpoints = {publisher.topic_name for publisher in publishers if not isinstance(publisher, MavlinkPublisher)}
+        setpoints = {publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)}
         own = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())  # two messages may share a topic
         counts = {topic: self.count_publishers(topic) - own[topic] for topic in sorted(read | setpoints)}
         conflicts = [
@@ -425,6 +430,19 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 time.sleep(0.01)
         if self._link is not None:
             self._link.close()
+
+
+class ServiceCaller:
+    """A service of the autopilot in the place of a publisher."""
+
+    def __init__(self, client: Client) -> None:
+        self._client, self.topic_name = client, str(client.srv_name)
+
+    def publish(self, request: Any) -> None:
+        """Request it, without regard to the answer. Raises ChannelError without the service."""
+        if not self._client.service_is_ready():
+            raise ChannelError("service", f"{self.topic_name}: no such service")
+        self._client.call_async(request)
 
 
 class OutgoingMessage:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schema of a channel map file, and the parameters of the bridge node."""
 
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from itertools import product
@@ -46,8 +47,9 @@ UNITS: Mapping[str, str] = MappingProxyType(dict.fromkeys(("q", "p", "r"), "rad/
 Rate = Annotated[float, Field(ge=1, le=1000)]
 Function = Literal["value", "norm", "airspeed_of_pressure", "roll_of_quaternion", "pitch_of_quaternion", "yaw_of_quaternion"]
 MessageType = Annotated[str, Field(pattern=r"^[a-z]\w*/msg/[A-Z]\w*$")]
+SentType = Annotated[str, Field(pattern=r"^[a-z]\w*/(msg|srv)/[A-Z]\w*$")]
 TopicName = Annotated[str, Field(pattern=r"^/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*$")]
-ParameterName = Annotated[str, Field(pattern=r"^[A-Z][A-Z0-9_]{0,15}$")]  # common.xml, PARAM_VALUE: 16 characters
+PARAMETER = re.compile(r"[A-Z][A-Z0-9_]{0,15}")  # the name of a parameter; common.xml, PARAM_VALUE: 16 characters
 SystemId = Annotated[int, Field(ge=1, le=255)]
 Raw = Annotated[float, Field(allow_inf_nan=True)]  # of a message field, which may be NaN, infinite or FLT_MAX for "no value"
 Integer = Annotated[int, Field(ge=-(2**63), lt=2**64)]  # of a message field: from int64 to uint64
@@ -146,10 +148,10 @@ class InputRow(MovingRow):
 
 
 class MessageRow(Config):
-    """A message to the autopilot. A message without a field of an input is a heartbeat."""
+    """A message to the autopilot, or a request of a service. A message without a field of an input is a heartbeat."""
 
-    topic: TopicName = Field(description="the autopilot's topic")
-    type: MessageType = Field(description="its type, package/msg/Type")
+    topic: TopicName = Field(description="the autopilot's topic or service")
+    type: SentType = Field(description="its type, package/msg/Type or package/srv/Type")
     rate: Rate = Field(description="the rate at which it is sent, Hz")
     when: Literal["engaged", "heartbeat", "engaging", "release", "failsafe"] = Field(
         description="engaged: from engagement to the end of the release; heartbeat: from the request to the release; engaging:"
@@ -158,6 +160,15 @@ class MessageRow(Config):
     )
     stamped: bool = Field(description="whether header.stamp is set to the instant of sending")
     values: dict[str, Value] = Field(default={}, description="values of its other fields, by their paths")
+
+    @property
+    def is_service(self) -> bool:
+        """Whether it is a request of a service."""
+        return "/srv/" in self.type
+
+    def _check(self) -> None:
+        flies = self.is_service and self.when in {"engaged", "heartbeat"}
+        require(not flies, "type", f"the service {self.type}", f"a message: an answer takes too long for when: {self.when}")
 
 
 class WatchedRow(Config):
@@ -303,7 +314,7 @@ class ChannelMap(Config):
     messages: Annotated[dict[str, MessageRow], Field(min_length=1)] = Field(description="the messages to the autopilot")
     conditions: dict[str, ConditionRow] = Field(default={}, description="the conditions of an engagement")
     overrides: dict[str, OverrideRow] = Field(default={}, description="the pilot overrides")
-    parameters: dict[ParameterName, ParameterRow] = Field(
+    parameters: dict[str, ParameterRow] = Field(
         default={}, description="parameters of the autopilot that an engagement needs, by name"
     )
     topics: dict[str, QosRow] = Field(default={}, description="the quality of service by topic; none for MAVLink")
@@ -366,6 +377,8 @@ class ChannelMap(Config):
             require(len(thresholds) == 1, f"overrides.{name}", found, "one of above, below and moved")
 
         for parameter, required in self.parameters.items():
+            is_name = PARAMETER.fullmatch(parameter) is not None
+            require(is_name, f"parameters.{parameter}", "no name of a parameter", "one such as RC_OVERRIDE_TIME")
             require(self.link is not None, "link", "none", f"one, for parameters.{parameter}")
             lower, upper = required.within
             require(lower <= upper, f"parameters.{parameter}.within", [lower, upper], "the lower end before the upper one")
@@ -383,7 +396,7 @@ class ChannelMap(Config):
         for key, topic, kind in self.used_topics():
             if kind.startswith(f"{MAVLINK}/"):
                 self._check_mavlink(key, topic, kind)
-            else:
+            elif "/msg/" in kind:
                 require(topic in self.topics, f"{key}.topic", topic, "one with a quality of service in `topics`")
             other = types.setdefault(topic, kind)
             require(other == kind, f"{key}.type", kind, f"{other}, as elsewhere in this map for {topic}")

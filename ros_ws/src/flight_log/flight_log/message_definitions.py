@@ -29,7 +29,7 @@ def definition(name: str) -> Definition:
     rosbags knows the common types of ROS 2 Jazzy: the same fields and the same hash, without comments.
     """
     try:
-        description = json.loads(_read(name, "json"))
+        description = json.loads(read_definition(name, "json"))
     except ParameterError:
         from flight_log.named_vectors import typestore  # noqa: PLC0415 - loads rosbags, which a recorder lacks
 
@@ -37,20 +37,21 @@ def definition(name: str) -> Definition:
         if name not in store.fielddefs:
             raise
         return Definition(name, store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
-    parts = [_read(name, "msg")]
+    parts = [read_definition(name, "msg")]
     for referenced in description["type_description_msg"]["referenced_type_descriptions"]:
         package, _, kind = referenced["type_name"].partition("/msg/")
-        parts.append(f"{'=' * 80}\nMSG: {package}/{kind}\n{_read(referenced['type_name'], 'msg')}")
+        parts.append(f"{'=' * 80}\nMSG: {package}/{kind}\n{read_definition(referenced['type_name'], 'msg')}")
     hashes = {entry["type_name"]: entry["hash_string"] for entry in description["type_hashes"]}
     return Definition(name, "\n".join(parts), hashes[name])
 
 
-def _read(name: str, suffix: str) -> str:
-    package, _, kind = name.partition("/msg/")
+def read_definition(name: str, suffix: str) -> str:
+    """The file of "pkg/msg/Type" or "pkg/srv/Type" with a suffix. Raises ParameterError where no installed package has it."""
+    package, section, kind = name.split("/")
     # The wheels install into the prefix of the interpreter and do not set AMENT_PREFIX_PATH.
     prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     for prefix in prefixes:
-        path = Path(prefix) / "share" / package / "msg" / f"{kind}.{suffix}"
+        path = Path(prefix) / "share" / package / section / f"{kind}.{suffix}"
         if path.is_file():
             return path.read_text(encoding="utf-8")
     raise ParameterError(f"{name}: no {kind}.{suffix} in {', '.join(prefixes)}; install the package {package}")

@@ -20,7 +20,7 @@ from autopilot_bridge.params import MAVLINK, ChannelMap
 from flight_core.files import read_file
 from flight_core.installation import require_package
 from flight_core.parameters import ParameterError, require
-from flight_log.message_definitions import definition
+from flight_log.message_definitions import definition, read_definition
 from flight_log.named_vectors import typestore
 
 Types = Mapping[str, tuple[Any, Any]]
@@ -28,6 +28,7 @@ Types = Mapping[str, tuple[Any, Any]]
 
 PACKAGE = re.compile(rb"<name>\s*(\w+)\s*</name>")  # of a package.xml (REP 149)
 CONSTANT = re.compile(r"\b[A-Z][A-Z0-9]*_[A-Z0-9_]+\b")
+REQUEST = re.compile(r"^---\s*$", re.MULTILINE)  # what ends the request in the definition of a service
 VERSION = "MESSAGE_VERSION"  # the constant of PX4's definitions
 
 
@@ -42,19 +43,19 @@ class CheckedRow(NamedTuple):
 
 def definitions_below(folder: Path, kinds: Iterable[str]) -> Types:
     """Message types and those that they contain, of the packages below a folder. Raises ParameterError where it has none."""
-    expected = "a folder with the sources of a message package: package.xml and msg/*.msg"
+    expected = "a folder with the sources of a message package: package.xml, msg/*.msg and srv/*.srv"
     require(folder.is_dir(), "--definitions", f"{folder}, which is no folder", expected)
     packages = {}
     for path in sorted(folder.rglob("package.xml")):
         if (match := PACKAGE.search(read_file(path, str(path), "a package.xml"))) and (path.parent / "msg").is_dir():
-            packages[match[1].decode()] = path.parent / "msg"
+            packages[match[1].decode()] = path.parent
     require(bool(packages), "--definitions", f"{folder} without one", expected)
     types: dict[str, tuple[Any, Any]] = {}
     waiting = list(kinds)
     while waiting:
         kind = waiting.pop()
-        package, _, name = kind.split("/")
-        path = packages.get(package, folder) / f"{name}.msg"
+        package, section, name = kind.split("/")
+        path = packages.get(package, folder) / section / f"{name}.{section}"
         if kind in types or package not in packages or not path.is_file():
             continue
         types |= _parsed(read_file(path, str(path), "a message definition").decode(errors="replace"), kind)
@@ -75,6 +76,8 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
             if kind.startswith(f"{MAVLINK}/"):
                 fields = mavlink_link.message_type(kind.rpartition("/")[2]).fields
                 types[kind] = [], [(name, (Nodetype.BASE, ("float64", 0))) for name in fields]
+            elif "/srv/" in kind:
+                types |= _parsed(read_definition(kind, "srv"), kind)
             else:
                 types |= _parsed(definition(kind).text, kind)
         except ParameterError:
@@ -98,7 +101,11 @@ def is_known(types: Types, kind: str) -> bool:
 
 
 def _parsed(text: str, kind: str) -> Types:
+    """The types of a definition, of a service that of its request."""
     try:
+        if "/srv/" in kind:
+            (request,) = get_types_from_msg(REQUEST.split(text)[0], kind).values()
+            return {kind: request}
         return get_types_from_msg(text, kind)
     except (TypesysError, ValueError, LookupError) as error:
         raise ParameterError(f"{kind}: found a definition that cannot be read ({error}), expected one of ROS 2") from None
