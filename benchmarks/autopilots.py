@@ -212,13 +212,13 @@ def own_log() -> dict[str, Any]:
 
     Each with gains of its own experiment. The autopilot's DataFlash log of the experiment is imported and identified too.
     """
-    from tests.sitl.kit import BRIDGE, ArduPlane  # noqa: PLC0415 - after the kit's place is known
+    from tests.sitl.kit import OVERRIDE_TIME, ArduPlane  # noqa: PLC0415 - after the kit's place is known
 
     results: dict[str, Any] = {}
     for name in ("ardupilot", "ardupilot_mavlink"):
         plane = ArduPlane(FOLDER / f"own_log_{name}")
         plane.throttle = FASTER_THROTTLE
-        with _flying(plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, MAV_GCS_SYSID=BRIDGE):
+        with _flying(plane, SIM_SERVO_SPEED=0.03, AIRSPEED_CRUISE=FASTER, RC_OVERRIDE_TIME=OVERRIDE_TIME):
             narrower = ("    upper: 0.3\n", "    upper: 0.2\n")  # of the thrust, whose trim is 0.63 to 0.75 there
             channel_map = plane.patient_map(name, narrower) if name == "ardupilot" else plane.mavlink_map(narrower)
             found = plane.folder / "found"

@@ -13,6 +13,7 @@ import math
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import time
@@ -27,6 +28,7 @@ import psutil
 import yaml
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
+from tests.sitl.shared_link import STATION
 
 from autopilot_bridge.params import find_map
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -43,7 +45,7 @@ POLL = 0.1  # s, between two questions to the autopilot
 ENGAGEMENTS = 4  # attempts: some seconds of level flight end the climb that a fault before has left
 BOUNDED = 100.0  # s: a longer flight is engaged without the bound of the maps, 120 s
 MAX_AGE = 1.0  # s, in place of the shipped maps' 0.2 s: a busy host stops autopilot and agent for half a second
-BRIDGE = 254  # system of the bridge over MAVLink, and MAV_GCS_SYSID: the ground station of the kit is 255
+OVERRIDE_TIME = 0.5  # s, RC_OVERRIDE_TIME: the map of MAVLink requires 1 s or less
 OWN_SIGNALS = {
     **{name: ("ATTITUDE", f"{axis}speed") for name, axis in (("q", "pitch"), ("p", "roll"), ("r", "yaw"))},
     "V": ("VFR_HUD", "airspeed"),
@@ -384,8 +386,31 @@ class ArduPlane(Autopilot):
 
     def mavlink_map(self, *changes: tuple[str, str]) -> str:
         """The map `ardupilot_mavlink` with longer ages, on the second serial port, beside the ground station of the kit."""
-        link = ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), ("source_system: 255", f"source_system: {BRIDGE}")
-        return self.patient_map("ardupilot_mavlink", *link, *changes)
+        return self.patient_map("ardupilot_mavlink", ("url: udpin:127.0.0.1:14551", "url: tcp:127.0.0.1:5763"), *changes)
+
+    def shared_map(self) -> str:
+        """The map `ardupilot_mavlink` with longer ages, on the link of `shared_link`, with the number of its station."""
+        return self.patient_map("ardupilot_mavlink", ("source_system: 255", f"source_system: {STATION}"))
+
+    @contextmanager
+    def shared_link(self) -> Iterator[Callable[[str], None]]:
+        """Start `tests.sitl.shared_link`, whose station is the autopilot's; what is given sends it a word."""
+        path = str(self.folder / "link.sock")
+        link = self._module("tests.sitl.shared_link", path)
+        self.say("param", "MAV_GCS_SYSID", str(STATION))
+        try:
+            link.wait_for("ready")
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as control:
+
+                def command(word: str) -> None:
+                    control.sendto(word.encode(), path)
+
+                yield command
+        finally:
+            link.popen.terminate()
+            link.end()
+            Path(path).unlink(missing_ok=True)
+            self.say("param", "MAV_GCS_SYSID", "255")
 
     def dataflash(self) -> Path:
         """The newest log that the autopilot wrote itself."""

@@ -11,22 +11,23 @@ from typing import NamedTuple
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
-from tests.sitl.kit import BRIDGE, ArduPlane, guided_scenario
+from tests.sitl.kit import OVERRIDE_TIME, ArduPlane, guided_scenario
 
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
 SCENARIO = find_scenario(str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml"))
+LOITERS = 5.0  # s after a release, a guard: the request goes out at once
 LATE = 0.5  # s, for a busy host: a parameter passes through several processes
 SERVOS = {"aileron": 1, "elevator": 2, "thrust": 3, "rudder": 4}
 
 
 @pytest.fixture(scope="module")
 def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ArduPlane]:
-    """An ArduPlane in flight, with servos of 0.03 s, that takes overrides of the bridge."""
+    """An ArduPlane in flight, with servos of 0.03 s and a short timeout of overrides."""
     autopilot = ArduPlane(tmp_path_factory.mktemp("run"))
     try:
-        autopilot.up(SIM_SERVO_SPEED=0.03, MAV_GCS_SYSID=BRIDGE)
+        autopilot.up(SIM_SERVO_SPEED=0.03, RC_OVERRIDE_TIME=OVERRIDE_TIME)
         autopilot.take_off()
         yield autopilot
     finally:
@@ -96,6 +97,8 @@ def test_bridge_releases_with_the_reason_of_a_trouble_or_flies_on(
         deadline = began + trouble.within + 5.0
         while time.time() < deadline and "RELEASE" not in flight.output:
             time.sleep(0.2)
+        if trouble.reason:
+            plane.until(lambda state: state["mode"] == "LOITER", timeout=LOITERS)
         afterwards.close()
         flight.interrupt()
         flight.end()
@@ -170,8 +173,152 @@ def test_transmitter_lost_while_engaged_is_bounded_by_max_engaged(plane: ArduPla
         assert "the loss of the transmitter cannot be seen over this link" in flight.output
         with plane.without_transmitter():
             flight.wait_for("RELEASE")
-            plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=10.0)
+            plane.until(lambda state: state["mode"] in {"CIRCLE", "RTL"}, timeout=20.0)
         flight.interrupt()
         flight.end()
     (engagement,) = plane.summary()["engagements"]
     assert engagement["reason"] == f"engaged for {bound:g} s, max_engaged of the map"
+
+
+def mode_after(plane: ArduPlane, change: Callable[[], object], seconds: float) -> set[str]:
+    """The modes of the autopilot in the seconds after a change."""
+    change()
+    modes, end = set(), time.monotonic() + seconds
+    while time.monotonic() < end:
+        modes.add(plane.state()["mode"])
+        time.sleep(0.2)
+    return modes
+
+
+FAILSAFE = (("FS_GCS_ENABL", 1.0), ("FS_LONG_TIMEOUT", 5.0))
+SILENT = 8.0  # s, longer than the 5 s of FS_LONG_TIMEOUT and of station_silence, and a heartbeat
+
+
+@pytest.fixture
+def failsafe(plane: ArduPlane) -> Iterator[None]:
+    """The autopilot changes to RTL without its ground station."""
+    for parameter, value in FAILSAFE:
+        plane.say("param", parameter, f"{value:g}")
+    yield
+    plane.say("param", "FS_GCS_ENABL", "0")
+
+
+def test_rates_that_a_ground_station_takes_refuse_an_engagement_and_come_back(plane: ArduPlane) -> None:
+    plane.level()
+    with plane.shared_link() as link:
+        flight = plane.fly(SCENARIO.path, plane.shared_map(), 100.0, "--send")
+        try:
+            flight.wait_for("would refuse: the mode is not MANUAL")
+            plane.hand_over()
+            link("take")
+            time.sleep(1.0)  # the count of 2 s has fallen by a third
+            refused = plane.engage()
+            assert refused.end() != 0
+            assert re.search("ATTITUDE (comes|came) at .* Hz, requested are 40 Hz", refused.output)
+            assert "set streamrate -1" in flight.output
+            flight.wait_for("less than 20 s ago")  # the rate has come back
+        finally:
+            flight.interrupt()
+            flight.end()
+            plane.level()
+    assert plane.summary()["engagements"] == []
+
+
+@pytest.mark.parametrize("repeats", [1, 20])
+def test_rates_that_a_ground_station_takes_while_engaged_are_requested_again_or_end_it(plane: ArduPlane, repeats: int) -> None:
+    """Taken once, the rates come back and the flight goes on. Taken without end, they end it."""
+    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+        for _ in range(repeats):
+            link("take")
+            time.sleep(0.3)
+        if repeats > 1:
+            plane.until(lambda state: state["mode"] == "LOITER", timeout=LOITERS)
+        else:
+            time.sleep(5.0)
+        flight.interrupt()
+        flight.end()
+    (engagement,) = plane.summary()["engagements"]
+    if repeats > 1:
+        assert re.search("ATTITUDE comes at .* Hz, requested are 40 Hz.* for 2 s", engagement["reason"])
+    else:
+        assert engagement["stop"] is None, engagement["reason"]
+
+
+def test_cut_cable_leaves_the_last_u_for_the_timeout_of_overrides_alone(plane: ArduPlane) -> None:
+    """The release cannot arrive, and the autopilot stays in MANUAL."""
+    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+        plane.say("stick", "4", "1550")
+        time.sleep(1.0)
+        cut = time.time()
+        modes = mode_after(plane, lambda: link("cut"), 4.0)
+        assert "old (mavlink/ATTITUDE)" in flight.output
+        t, pulses = plane.log("RC_CHANNELS", "chan4_raw")
+        acted = t[(t > cut) & (pulses[:, 0] == 1550.0)][0] - cut
+        assert OVERRIDE_TIME - 0.1 < acted < OVERRIDE_TIME + 0.1 + LATE  # RC_CHANNELS comes each 0.1 s
+        assert modes == {"MANUAL"}
+
+
+def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(plane: ArduPlane, failsafe: None) -> None:
+    """The overrides hide the silence from the autopilot, whose failsafe acts FS_LONG_TIMEOUT after the last of them."""
+    with plane.shared_link() as link, plane.engaged(SCENARIO.path, plane.shared_map(), 100.0) as flight:
+        link("silence")
+        flight.wait_for("is silent for 5 s", SILENT)
+        plane.until(lambda state: state["mode"] == "LOITER", timeout=LOITERS)
+        plane.until(lambda state: state["mode"] == "RTL", timeout=SILENT)
+        link("speak")
+        flight.interrupt()
+        flight.end()
+
+
+@pytest.mark.parametrize("station", ["speaks", "is silent"])
+def test_end_of_a_dry_run_is_no_lost_ground_station_and_a_dry_run_does_not_hide_one(
+    plane: ArduPlane, failsafe: None, station: str
+) -> None:
+    plane.level()
+    with plane.shared_link() as link:
+        flight = plane.fly(SCENARIO.path, plane.shared_map(), 100.0)
+        try:
+            flight.wait_for("would refuse: dry_run is true: nothing is sent; the mode is not MANUAL")
+            plane.hand_over()
+            if station == "speaks":
+                modes = mode_after(plane, flight.interrupt, SILENT)
+            else:
+                modes = mode_after(plane, lambda: link("silence"), SILENT)
+            assert modes == ({"MANUAL"} if station == "speaks" else {"MANUAL", "RTL"})
+        finally:
+            link("speak")
+            flight.interrupt()
+            flight.end()
+            plane.level()
+
+
+@pytest.mark.parametrize(("how", "mode"), [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")])
+def test_mode_after_a_release_is_the_pilots_or_one_that_flies(plane: ArduPlane, how: str, mode: str) -> None:
+    with engaged(plane, 100.0) as flight:
+        if how == "switch":
+            plane.say("stick", "7", "1900")
+        elif how == "Ctrl-C":
+            flight.interrupt()
+        else:
+            plane.engage("--off").succeed()
+        time.sleep(1.0)  # the request goes out for 0.5 s
+        modes = mode_after(plane, lambda: None, 2.0)
+        plane.say("stick", "7", "1500")
+        assert modes == {mode}
+
+
+def test_long_timeout_of_overrides_refuses_an_engagement(plane: ArduPlane) -> None:
+    plane.level()
+    plane.say("param", "RC_OVERRIDE_TIME", "3")
+    flight = plane.fly(SCENARIO.path, plane.mavlink_map(), 60.0, "--send")
+    try:
+        flight.wait_for("would refuse: the mode is not MANUAL")
+        plane.hand_over()
+        refused = plane.engage()
+        assert refused.end() != 0
+        assert "RC_OVERRIDE_TIME is 3, expected 0.2 to 1" in refused.output
+    finally:
+        flight.interrupt()
+        flight.end()
+        plane.say("param", "RC_OVERRIDE_TIME", f"{OVERRIDE_TIME:g}")
+        plane.level()
