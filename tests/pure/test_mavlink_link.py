@@ -371,19 +371,21 @@ def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_m
         for _ in range(round(seconds * hz)):
             clock.now += 1.0 / hz
             made._take(attitude, SENDER, 0)
-            made._to_request |= made._rates.step(clock.now)
+            made._request(clock.now)
 
     come(1.0, 40.0)
     assert made.refusal() == "the rate of ATTITUDE is not known yet"
     come(2.0, 40.0)
     assert (made.refusal(), made.lost()) == ("", "")
-    made._to_request.clear()  # granted
+    made._to_request.clear()
+    made._requested = None  # granted
     come(5.0, 4.0)
     rate = "ATTITUDE comes at 4 Hz, requested are 40 Hz"
     assert made.refusal().startswith(f"{rate}; requested again; a ground station on this link requests rates of its own")
     assert made.refusal().endswith("give the bridge a port of its own")
     assert made.lost() == f"{rate}; for 2 s"
     assert made._to_request == {"ATTITUDE": 40.0}
+    assert made._requested is not None
     come(3.0, 40.0)
     assert made.lost() == ""
     assert made.refusal().startswith("ATTITUDE came at 4 Hz")

@@ -224,7 +224,6 @@ class Link:
             if now - self._beat >= BEAT:
                 self._beat = now
                 self._send(self._connection.mav.heartbeat_encode(ONBOARD, INVALID, 0, 0, 0), self._config.system)
-            self._to_request |= self._rates.step(now)
             self._request(now)
             self._request_parameters(now)
             try:
@@ -313,7 +312,8 @@ class Link:
         return True
 
     def _request(self, now: float) -> None:
-        """Request one rate after another: an answer does not say to which message it belongs."""
+        """Request one rate after another, and slow ones again: an answer does not say to which message it belongs."""
+        self._to_request |= self._rates.step(now)
         if not self._to_request or now - self._alive > SILENCE or (self._requested and now - self._requested[1] < ANSWER):
             return
         name, rate = next(iter(self._to_request.items()))
