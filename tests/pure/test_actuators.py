@@ -140,14 +140,25 @@ def test_surface_stuck_from_start_is_in_trim() -> None:
 
 def test_lost_surface_is_in_trim_from_instant_on_even_if_it_was_stuck() -> None:
     never = math.inf
-    lost = position_history(range(0, 80, 10), 0.2, lost_at=[0.05, 0.06, never, never], stuck_at=[never, 0.03, 0.03, never])
+    lost = position_history(range(0, 80, 10), 0.2, lost_at=[0.05, never, never, 0.06], stuck_at=[never, never, 0.03, 0.03])
     assert lost[:, 0].tolist() == [0.2] * 5 + [0.0] * 3
-    assert lost[:, 1].tolist() == [0.2] * 6 + [0.0] * 2
-    assert lost[:, 2:].tolist() == [[0.2, 0.2]] * 8  # one stuck where it was commanded, one healthy
+    assert lost[:, 3].tolist() == [0.2] * 6 + [0.0] * 2
+    assert lost[:, 1:3].tolist() == [[0.2, 0.2]] * 8  # one healthy, one stuck where it was commanded
+
+
+def test_lost_engine_gives_no_thrust_from_instant_on_even_if_it_was_stuck() -> None:
+    never, trim = math.inf, 0.5  # of the throttle of the osprey
+    for stuck in (never, 0.03):
+        lost = position_history(
+            range(0, 80, 10), 0.2, lost_at=[never, 0.05, never, never], stuck_at=[never, stuck, never, never]
+        )
+        assert (trim + lost[:, 1]).tolist() == [0.7] * 5 + [0.0] * 3
 
 
 def test_fault_within_step_acts_from_next_step_on() -> None:
-    assert position_history(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
+    lost = position_history(range(0, 40, 10), 0.2, lost_at=[0.015] * 4)
+    assert lost[:, 0].tolist() == [0.2, 0.2, 0.0, 0.0]
+    assert lost[:, 1].tolist() == [0.2, 0.2, -0.5, -0.5]
 
 
 def test_lost_aileron_acts_like_zero_column_of_b() -> None:
@@ -165,6 +176,15 @@ def test_weak_aileron_acts_like_half_column_of_b() -> None:
     weak, expected = (advance(0, plant.initial_state(each), u, 500 * MS, each) for each in (params, half))
     assert weak.x == pytest.approx(expected.x, rel=1e-12)
     assert (weak.position == expected.position).all()
+
+
+@pytest.mark.parametrize(("part", "thrust"), [(0.5, 0.35), (0.0, 0.0), (1.0, 0.7), (-1.0, -0.7)])
+def test_weak_engine_gives_a_part_of_its_whole_thrust(part: float, thrust: float) -> None:
+    """0.5 in trim and 0.2 above it; without any effect it is an engine that is lost."""
+    params = osprey(weak_at=[math.inf, 0.0, math.inf, math.inf], weak_effect=[part] * 4).actuators
+    _, mean = move(0.0, np.zeros(4), np.array([0.0, 0.2, 0.0, 0.0]), 0.01, params)
+    assert 0.5 + mean[1] == pytest.approx(thrust, abs=1e-15)
+    assert mean[[0, 2, 3]].tolist() == [0.0] * 3
 
 
 def test_slow_surface_has_lag_of_fault_from_instant_on() -> None:
@@ -311,11 +331,17 @@ def test_mean_position_is_between_both_ends_of_step(commands: list[float], lag: 
 
 
 def test_the_mean_positions_of_faulty_actuators() -> None:
-    # Stuck: the position itself. Lost: trim, from the first step on, although the position was elsewhere.
-    params = Actuators(lag=np.full(3, 0.02), stuck_at=np.array([1.0, np.inf, np.inf]), lost_at=np.array([np.inf, 1.0, np.inf]))
-    new, mean = move(1.0, np.full(3, 0.1), np.full(3, 0.5), 0.005, params)
-    assert new[:2].tolist() == mean[:2].tolist() == [0.1, 0.0]
-    assert 0.1 < mean[2] < new[2]
+    # Stuck: the position itself. Lost: that without thrust, from the first step on, although the position was elsewhere.
+    never, no_thrust = np.inf, np.array([-0.5, 0.0, -0.5, np.nan])
+    params = Actuators(
+        lag=np.full(4, 0.02),
+        stuck_at=np.array([1.0, never, never, never]),
+        lost_at=np.array([never, 1.0, 1.0, never]),
+        no_thrust=no_thrust,
+    )
+    new, mean = move(1.0, np.full(4, 0.1), np.full(4, 0.5), 0.005, params)
+    assert new[:3].tolist() == mean[:3].tolist() == [0.1, 0.0, -0.5]
+    assert 0.1 < mean[3] < new[3]
 
 
 def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:

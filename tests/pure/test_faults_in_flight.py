@@ -46,11 +46,13 @@ def varied(scenario: Scenario, **values: Any) -> AircraftConfig:
         ({"actuators": {"stuck_at": [0.0, NEVER, 0.0, NEVER]}}, {"actuators": {"stuck_at": [BEGIN, NEVER, BEGIN, NEVER]}}),
         ({"actuators": {"lost_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"lost_at": [BEGIN, NEVER, NEVER, NEVER]}}),
         ({"actuators": {"weak_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"weak_at": [BEGIN, NEVER, NEVER, NEVER]}}),
+        ({"actuators": {"lost_at": [NEVER, 0.0, NEVER, NEVER]}}, {"actuators": {"lost_at": [NEVER, BEGIN, NEVER, NEVER]}}),
+        ({"actuators": {"weak_at": [NEVER, 0.0, NEVER, NEVER]}}, {"actuators": {"weak_at": [NEVER, BEGIN, NEVER, NEVER]}}),
         ({"actuators": {"slow_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"slow_at": [BEGIN, NEVER, NEVER, NEVER]}}),
         ({"actuators": {"loose_at": [0.0, NEVER, NEVER, NEVER]}}, {"actuators": {"loose_at": [BEGIN, NEVER, NEVER, NEVER]}}),
         ({"gusts": {"vertical": GUST}}, {"gusts": {"vertical": GUST}}),
     ],
-    ids=["stuck", "lost", "weak", "slow", "loose", "gust"],
+    ids=["stuck", "lost", "weak", "engine lost", "engine weak", "slow", "loose", "gust"],
 )
 def test_fault_that_begins_now_is_one_that_was_scheduled(name: str, now: dict[str, Any], scheduled: dict[str, Any]) -> None:
     scenario = find_scenario(name).vary(aircraft={"gusts": {}, "rate": 500.0, "step": 0.002})

@@ -110,6 +110,14 @@ VARIATIONS: dict[str, dict[str, Any]] = {
         },
         "flight": {"duration": 8.0},
     },
+    "thrust and rudder lost": {
+        "aircraft": {"actuators": {"lag": LAG, "lost_at": [np.inf, 2.0, np.inf, 3.0]}},
+        "flight": {"duration": 8.0},
+    },
+    "thrust weak": {
+        "aircraft": {"actuators": {"lag": LAG, "weak_at": [np.inf, 2.0, np.inf, np.inf], "weak_effect": [0.3] * 4}},
+        "flight": {"duration": 8.0},
+    },
     "bias, sines, thrust stuck": {
         "aircraft": {
             "bias": {"q": {"start": 1.0, "value": 0.5, "rise": 0.5}},

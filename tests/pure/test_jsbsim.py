@@ -23,6 +23,7 @@ from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel, aircraft_names
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero
+from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
@@ -166,6 +167,53 @@ def test_actuators_act_before_the_aircraft() -> None:
     assert np.max(np.abs(fly(stuck, command(aileron=0.1), 0.5)["x.p"])) < 1e-4
     slow = JsbsimModel(CESSNA, Actuators(lag=np.full(4, 0.1)), NO_WIND)
     assert fly(slow, command(aileron=0.1), 0.1)["actuator.aileron"][-1] == pytest.approx(0.1 * (1.0 - math.exp(-1.0)))
+
+
+def with_lost_throttle(lost_at: float) -> AircraftConfig:
+    return aircraft_parameters(**SECTION, actuators={"lost_at": [math.inf, lost_at, math.inf, math.inf]})
+
+
+def thrusts(model: JsbsimModel) -> list[float]:
+    return [model._fdm[jsbsim_trim.thrust_property(engine)] for engine in range(jsbsim_trim.engine_count(model._fdm))]
+
+
+@pytest.mark.parametrize(
+    "condition", [CESSNA, FlightCondition("737", 150.0, 5000.0, STEP_NS)], ids=["a piston with a propeller", "two turbines"]
+)
+def test_lost_engines_give_no_thrust(condition: FlightCondition) -> None:
+    """JSBSim's own thrust. At throttle 0 alone an engine of the 737 idles, with 1.1 kN. A propeller turned by the wind brakes.
+
+    The flight goes on: an engine that stops for another reason ends it.
+    """
+    model = cessna(condition=condition)
+    model.retune(0, with_lost_throttle(0.5))
+    assert fly(model, command(throttle=0.1), 0.5)["actuator.throttle"][-1] == 0.1
+    assert min(thrusts(model)) > 0.0
+    for k in range(100, 500):
+        model.advance(k * STEP_NS, command(throttle=0.1), STEP_NS)
+    lost = dict(zip(model.truth_names, model.truth(0), strict=True))
+    assert lost["actuator.throttle"] == -model.trim.commands[list(INPUTS).index("throttle")]
+    assert max(thrusts(model)) <= 0.0
+
+
+def test_engine_runs_again_after_its_loss() -> None:
+    model = cessna()
+    model.retune(0, with_lost_throttle(0.0))
+    fly(model, command(), 2.0)  # the propeller spins down
+    assert max(thrusts(model)) <= 0.0
+    model.retune(0, with_lost_throttle(math.inf))
+    fly(model, command(), 1.0)
+    assert min(thrusts(model)) > 0.0
+
+
+def test_weak_engine_has_its_part_of_the_whole_throttle() -> None:
+    """JSBSim's own position of the throttle, behind its flight control system."""
+    model = cessna()
+    weak = {"weak_at": [0.0] * 4, "weak_effect": [1.0, 0.25, 1.0, 1.0]}
+    model.retune(0, aircraft_parameters(**SECTION, actuators=weak))
+    fly(model, command(throttle=0.1), 0.1)
+    throttle = model.trim.commands[list(INPUTS).index("throttle")]
+    assert model._fdm["fcs/throttle-pos-norm"] == pytest.approx(0.25 * (throttle + 0.1), rel=1e-6)
 
 
 def test_two_flights_agree_to_the_last_bit() -> None:

@@ -18,7 +18,7 @@ class Actuators(NamedTuple):
     rate: Array | None = None  # (m,) largest rate, units of u / s, inf = none
     dead_zone: Array | None = None  # (m,) half-width, 0 = none
     stuck_at: Array | None = None  # (m,) when it gets stuck, s of flight time, inf = never
-    lost_at: Array | None = None  # (m,) when it loses its effect, s of flight time, inf = never
+    lost_at: Array | None = None  # (m,) when it goes to `no_thrust` for good, s of flight time, inf = never
     weak_at: Array | None = None  # (m,) when its effect becomes `weak_effect` of what it was, s of flight time, inf = never
     weak_effect: Array | None = None  # (m,) factor
     slow_at: Array | None = None  # (m,) when its lag becomes at least `slow_lag`, s of flight time, inf = never
@@ -26,6 +26,7 @@ class Actuators(NamedTuple):
     loose_at: Array | None = None  # (m,) when it gets the backlash `loose_play`, s of flight time, inf = never
     loose_play: Array | None = None  # (m,) half-width of the backlash
     backlash: Array | None = None  # (m,) half-width of the backlash in force, see `in_force`
+    no_thrust: Array | None = None  # (m,) position in which it gives no thrust, deviation from trim, of a surface 0
 
 
 def step(position: Array, command: Array, dt: Any, params: Actuators) -> Array:
@@ -100,10 +101,18 @@ def in_force(t: Any, position: Array, params: Actuators) -> Actuators:
 
 
 def effect(t: Any, position: Array, params: Actuators) -> Array:
-    """The input of the aircraft at these positions, shape (m,): a weak effector has `weak_effect` of it from `weak_at` on."""
+    """The input of the aircraft at these positions, shape (m,).
+
+        t >= weak_at    no_thrust + weak_effect (position - no_thrust)    a part of the thrust, also of that in trim
+        else            position
+
+    Arguments: `position` at t, after `apply_faults`.
+    """
     if params.weak_at is None:
         return position
-    return array_namespace(position).where(t >= params.weak_at, params.weak_effect * position, position)
+    no_thrust = _no_thrust(position, params)
+    weak = no_thrust + params.weak_effect * (position - no_thrust)
+    return array_namespace(position).where(t >= params.weak_at, weak, position)
 
 
 def _input(position: Array, command: Array, params: Actuators) -> Array:
@@ -119,7 +128,7 @@ def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Arra
     """Actuator positions at the end of a step from t on, or means over the step, with faults applied, shape (m,).
 
         t >= stuck_at    position    the actuator keeps the position
-        t >= lost_at     0           the free surface goes to trim at once and stays there, also if stuck before
+        t >= lost_at     no_thrust   an engine or a rotor stops at once, a surface floats at trim; also if stuck before
         else             new
 
     Arguments: `position` at t, `new` without faults. A fault within a step acts from the next step on.
@@ -127,4 +136,8 @@ def apply_faults(t: Any, position: Array, new: Array, params: Actuators) -> Arra
     xp = array_namespace(position)
     if params.stuck_at is not None:
         new = xp.where(t >= params.stuck_at, position, new)
-    return new if params.lost_at is None else xp.where(t >= params.lost_at, 0.0 * new, new)
+    return new if params.lost_at is None else xp.where(t >= params.lost_at, _no_thrust(new, params), new)
+
+
+def _no_thrust(position: Array, params: Actuators) -> Array:
+    return 0.0 * position if params.no_thrust is None else params.no_thrust

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Airframe files: published matrices with their units and signs, converted to SI here and nowhere else."""
 
+import math
 import os
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
@@ -18,7 +19,7 @@ from flight_core.arguments import FilePath
 from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
 from flight_core.parameters import Config, Name, Names, NonNegative, Number, Numbers, require
-from flight_core.units import quantity, si_per_unit
+from flight_core.units import ANGLE, quantity, si_per_unit
 from flight_core.vectors import FloatArray
 
 EXPECTED = "an airframe file"
@@ -30,10 +31,13 @@ Matrix = Annotated[tuple[Numbers, ...], Field(min_length=1)]
 
 
 class Input(Config):
-    """An input: the unit of the column of B, and the effect of a positive value."""
+    """An input: the unit of the column of B, the effect of a positive value, and where an engine or a rotor stands still."""
 
     unit: Unit = Field(description="the unit of this column of B")
     positive: str = Field(description="what a positive value does")
+    no_thrust: Number | None = Field(
+        default=None, description="the value without thrust, deviation from trim; absent: 0 of an angle, else unknown"
+    )
 
 
 class Gravity(Config):
@@ -143,6 +147,14 @@ class Airframe(Config):
         row, column = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
         matrix: FloatArray = np.array(self.B)
         return matrix * row[:, None] / column[None, :]
+
+    def no_thrust(self) -> FloatArray:
+        """The inputs without thrust, deviations from trim, shape (p,), SI: 0 of a surface, nan where the file has none."""
+        units = [quantity(given.unit) for given in self.inputs.values()]
+        unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
+        said = [given.no_thrust for given in self.inputs.values()]
+        pairs = zip(said, units, unsaid, strict=True)
+        return np.array([default if value is None else value * unit.si for value, unit, default in pairs])
 
     def matrix_c(self) -> FloatArray:
         """C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""

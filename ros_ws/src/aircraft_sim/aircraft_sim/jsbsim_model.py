@@ -35,6 +35,8 @@ POSE = (
 SOFT = 7.0 * FOOT
 """Largest sink of a landing, m/s: the least descent velocity that a landing gear is built for, 14 CFR 23.473(d), 7 ft/s."""
 
+THROTTLE = list(INPUTS).index("throttle")
+
 LEAST_FUEL = 1.0
 """lb, of all tanks: an engine that stops with less is out of fuel."""
 
@@ -47,6 +49,8 @@ class JsbsimModel:
         position+ = actuators.apply_faults(t_k, position, actuators.step(position, u, dt))
         wind+     = gusts(t_k + dt) + turbulence.wind(z+), along the heading, to the right and down
         commands  = trim + actuators.effect(t_k, position+), then JSBSim runs
+
+    Engines whose throttle is lost have the throttle at 0 and no fuel or ignition.
 
     JSBSim integrates the forces of the step before, then computes the forces of the new commands and the new wind: commands and
     wind act a step later. JSBSim computes forces at an instant, t_k + dt, so the position at this instant is right: the mean
@@ -71,9 +75,12 @@ class JsbsimModel:
         # the number and the flag of the engines that can stop: an electric engine has no flag
         running = {i + 1: self._node(jsbsim_trim.running_property(i)) for i in range(engines)}
         self._engines = {number: node for number, node in running.items() if node.get_double_value()}
+        self._cut = False
         self._fuel, self._climb = self._node(jsbsim_trim.FUEL), self._node(CLIMB)
         self._structure = [self._node(path) for path in jsbsim_trim.structure_contacts(self._fdm)]
-        self._actuator_model, self._wind_model = actuator_model, wind_model
+        self._no_thrust = np.where([command.each_engine for command in INPUTS.values()], -self.trim.commands, 0.0)
+        self._actuator_model = actuator_model._replace(no_thrust=self._no_thrust)
+        self._wind_model = wind_model
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
         self._apply_wind(self._wind(0))
@@ -106,6 +113,7 @@ class JsbsimModel:
             for nodes, values, deviation in zip(self._commands, self._trim_commands, deviations, strict=True):
                 for node, value in zip(nodes, values, strict=True):
                     node.set_double_value(value + deviation)
+            self._cut_engines(model.lost_at is not None and bool(t >= model.lost_at[THROTTLE]))
             if filters is not None:
                 self._z = turbulence.step(self._z, normals[k], filters)
             after_ns = t_ns + (k + 1) * step_ns
@@ -155,8 +163,16 @@ class JsbsimModel:
 
     def retune(self, t_ns: int, parameters: AircraftConfig) -> None:
         """See `simulator.FlightDynamicsModel`."""
-        self._actuator_model = parameters.actuator_model()
+        self._actuator_model = parameters.actuator_model()._replace(no_thrust=self._no_thrust)
         self._wind_model = self._wind_model._replace(gusts=parameters.gust_arrays(AXES))
+
+    def _cut_engines(self, cut: bool) -> None:
+        """Stop the engines with the begin of their loss, and start them with its end. Whether they run is then no outcome."""
+        if cut == self._cut:
+            return
+        jsbsim_trim.cut_engines(self._fdm, cut)
+        self._cut = cut
+        self._engines = {}  # one that was cut off may need longer than a step to run again
 
     def _deviations(self) -> FloatArray:
         return np.array([node.get_double_value() * si for node, si in self._state_nodes]) - self.trim.states

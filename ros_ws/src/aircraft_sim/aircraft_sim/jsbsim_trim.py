@@ -46,6 +46,7 @@ FROZEN: Mapping[str, float] = {
 """Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems still run."""
 
 MIXTURE = 0.9  # of piston engines: rich
+BOTH_MAGNETOS = 3.0  # ignition of piston engines: 0 off, 1 left, 2 right
 SETTLE, SPIN_UP = 10.0, 30.0  # s of frozen flight: for running engines, and for engines that have just been started
 SLOW_SETTLE, SLOW_SPIN_UP = 80.0, 300.0
 """The same for a propeller that is slow to reach its speed, such as one of an electric engine with a time constant of 10 s."""
@@ -198,6 +199,15 @@ def running_property(engine: int) -> str:
 def thrust_property(engine: int) -> str:
     """The property of the thrust of an engine, lbf."""
     return f"propulsion/engine[{engine}]/thrust-lbs"
+
+
+def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
+    """Cut off the fuel of all turbines and turboprops and the ignition of all pistons, or switch both on again.
+
+    An electric engine and a rocket have no such switch: they stop at throttle 0, where a turbine idles and gives thrust.
+    """
+    fdm["propulsion/cutoff_cmd"] = float(cut)
+    fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
 def command_paths(command: Command, engines: int) -> list[str]:

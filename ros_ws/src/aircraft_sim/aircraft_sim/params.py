@@ -160,7 +160,9 @@ class ActuatorConfig(Config):
     rate: Rates = Field(default=(), description="rate limits, SI per s")
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
     stuck_at: Times = Field(default=(), description="from when on each keeps its position, s; .inf is never")
-    lost_at: Times = Field(default=(), description="from when on each has no effect and is at trim, s; .inf is never")
+    lost_at: Times = Field(
+        default=(), description="from when on each gives no thrust, or floats at trim as a surface, s; .inf is never"
+    )
     weak_at: Times = Field(default=(), description="from when on each has `weak_effect` of its effect, s; .inf is never")
     weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
         default=(), description="factors of the effect from `weak_at` on, below 0 reversed; none: 0.5 each"
@@ -324,6 +326,8 @@ class AircraftConfig(NodeConfig):
         for key, values in self.actuators.model_dump(exclude={"delay"}).items():
             if values:
                 parameters.require_length(f"actuators.{key}", values, list(channels.inputs))
+        if not self.is_jsbsim:
+            self._check_losses()
         for key in ("bias", "drift", "noise", "quantisation"):
             if values := getattr(self.sensors, key):
                 parameters.require_length(f"sensors.{key}", values, list(channels.outputs))
@@ -363,6 +367,17 @@ class AircraftConfig(NodeConfig):
             require(name in airframe.states, "vanes.channels", name, f"none: {has_none} state {name}")
             require(name not in airframe.outputs, "vanes.channels", name, f"none: {name} is an output of {airframe.name}")
             require(airframe.speed > 0.0, "vanes.channels", name, f"none: {has_none} speed")
+
+    def _check_losses(self) -> None:
+        """An effector that loses thrust has a known position without thrust."""
+        airframe = load_airframe(self.airframe)
+        for key in ("lost_at", "weak_at"):
+            begins = getattr(self.actuators, key) or (math.inf,) * len(airframe.inputs)
+            for name, begin, position in zip(airframe.inputs, begins, airframe.no_thrust(), strict=True):
+                required = f".inf, or no_thrust of {name} in the airframe {airframe.name}"
+                meaning = f"its value without thrust, from trim, in {airframe.inputs[name].unit}; 0 for a surface"
+                known = math.isinf(begin) or math.isfinite(position)
+                require(known, f"actuators.{key}", f"{begin:g} s for {name}", f"{required}: {meaning}")
 
     def _check_jsbsim(self) -> None:
         require_aircraft(self.airframe)
@@ -465,7 +480,9 @@ class AircraftConfig(NodeConfig):
                 arrays[key] = None
             elif severity is not None and arrays[severity] is None:
                 arrays[severity] = np.full(len(times), SEVERITIES[severity])
-        return Actuators(**arrays)
+        fails = arrays["lost_at"] is not None or arrays["weak_at"] is not None
+        known = fails and not self.is_jsbsim  # the model of JSBSim has its own trim
+        return Actuators(**arrays, no_thrust=load_airframe(self.airframe).no_thrust() if known else None)
 
     def flight_condition(self) -> FlightCondition:
         """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""
