@@ -51,7 +51,7 @@ test test-fast: export OPENBLAS_NUM_THREADS = 1
 # Those that fly in real time and measure it come last, by themselves.
 test: check
 	@$(if $(ARGS),$(BIN)/python -m pytest $(ARGS),status=0; trap "exit 130" INT; \
-	  $(XDIST) -n $$(($$(nproc) + 1)) --no-loadscope-reorder -m "not alone" tests/ros tests/docs tests/fuzz tests/pure || status=$$?; \
+	  $(XDIST) -n $$(($$(nproc) + 1)) --no-loadscope-reorder -m "not alone" tests/ros tests/nodes tests/docs tests/fuzz tests/pure || status=$$?; \
 	  $(BIN)/python -m pytest -m alone tests/ros || status=$$?; exit $$status)
 
 test-fast: .venv/.all .venv/.workspace

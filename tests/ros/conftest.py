@@ -15,13 +15,15 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
 
 import psutil
 import pytest
+from _pytest.runner import runtestprotocol
 from mcap.records import Channel, Message
 from tests.conftest import REPOSITORY
-from tests.ros.peer import HANG, Peer, peer
+from tests.ros.peer import Peer, peer
+from tests.ros.waiting import HANG, HOST, HostDelays, running, until
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup.processes import end_with_parent
@@ -34,6 +36,7 @@ DEFAULT_SIGHUP = ("env", "--default-signal=HUP")
 
 Start = Callable[..., "Process"]
 Recorder = Callable[..., "Process"]
+T = TypeVar("T")
 
 
 class Process:
@@ -43,19 +46,13 @@ class Process:
         command, pipe = [*DEFAULT_SIGHUP, *within, *end_with_parent(), sys.executable, "-m", *arguments], subprocess.PIPE
         self.popen = subprocess.Popen(command, cwd=cwd, stdin=stdin, stdout=pipe, stderr=subprocess.STDOUT, text=True)
         self.arguments, self.lines = arguments, list[str]()
-        self._changed, self._closed = threading.Condition(), False
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
 
     def _read(self) -> None:
         assert self.popen.stdout is not None
         for line in self.popen.stdout:
-            with self._changed:
-                self.lines.append(line.rstrip())
-                self._changed.notify_all()
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
+            self.lines.append(line.rstrip())
 
     @property
     def output(self) -> str:
@@ -64,16 +61,14 @@ class Process:
 
     def has_logged(self, *parts: str) -> bool:
         """Whether a line contains all parts. A process that has ended without one never will: its output is the error."""
-        with self._changed:
-            logged = any(all(part in line for part in parts) for line in self.lines)
-            assert logged or not self._closed, f"ended without {parts}; output:\n{self.output}"
+        ended = not self._reader.is_alive()
+        logged = any(all(part in line for part in parts) for line in list(self.lines))
+        assert logged or not ended, f"ended without {parts}; output:\n{self.output}"
         return logged
 
     def wait_for(self, text: str, timeout: float = HANG) -> Self:
         """Wait until a line contains the text. The process must not end before."""
-        with self._changed:
-            logged = self._changed.wait_for(lambda: self.has_logged(text), timeout)
-        assert logged, f"{text!r} not logged within {timeout} s; output:\n{self.output}"
+        until(lambda: self.has_logged(text), f"the line {text!r}", timeout=timeout)
         return self
 
     def children(self) -> list[psutil.Process]:
@@ -84,17 +79,19 @@ class Process:
         """Its child process of this module."""
         return next(child for child in self.children() if module in child.cmdline())
 
-    def until(self, condition: Callable[[], bool], timeout: float = HANG) -> None:
-        """Poll until a condition holds. The process must not end before."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, f"not within {timeout} s; output:\n{self.output}"
-            assert self.popen.poll() is None, self.output
-            time.sleep(0.005)
+    def until(self, condition: Callable[[], T], because: str = "", timeout: float = HANG) -> T:
+        """Wait until a condition holds. The process must not end before."""
 
-    def wait_for_log(self, folder: Path, size: int, timeout: float = HANG) -> None:
+        def holds() -> T:
+            value = condition()
+            assert value or self.popen.poll() is None, self.output
+            return value
+
+        return until(holds, because, timeout=timeout)
+
+    def wait_for_log(self, folder: Path, size: int) -> None:
         """Wait until the logs below a folder have this size in bytes."""
-        self.until(lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size, timeout)
+        self.until(lambda: sum(path.stat().st_size for path in folder.rglob("*.mcap")) >= size, f"a log of {size} bytes")
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
@@ -129,39 +126,66 @@ class Process:
         return status
 
 
-class HostDelays(threading.Thread):
-    """Delays of the host, as a thread sees them that is due every 10 ms: all processes of a test have them."""
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self._delays: list[tuple[float, float]] = []
-        self._ended = threading.Event()
-        self.start()
-
-    def run(self) -> None:
-        """Measure until `end`."""
-        period, begin = 0.01, time.time()
-        while not self._ended.wait(period):
-            begin, before = time.time(), begin
-            if (delay := begin - before - period) > period:
-                self._delays.append((begin, delay))
-
-    def since(self, t: float) -> float:
-        """Sum of the delays that ended after an instant of the system clock, s."""
-        return sum(delay for end, delay in self._delays if end > t)
-
-    def end(self) -> None:
-        """End the thread."""
-        self._ended.set()
-        self.join()
-
-
 @pytest.fixture
-def host_delays() -> Iterator[HostDelays]:
-    """The delays of the host during a test, by which it extends its limits of time."""
-    delays = HostDelays()
-    yield delays
-    delays.end()
+def host_delays() -> HostDelays:
+    """The delays of the host, by which a test extends its limits of time."""
+    return HOST
+
+
+LONGEST_PAUSE = 0.1
+"""s. The longest delay of the host that a test in real time bears, unless its mark `longest_pause` has another: the age limit
+of y and y_m in the shipped scenarios."""
+
+IN_REAL_TIME = Path(__file__).parent  # the folder of the tests that may be run again
+ATTEMPTS = 3
+INCONCLUSIVE = "inconclusive"  # key of the property of a report
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Run a test again where it failed beside a delay of the host beyond what it bears; a failure without one is a failure.
+
+    Where the host delayed each of three attempts, the test is skipped as inconclusive. The summary names the test either way.
+    """
+    if not item.path.is_relative_to(IN_REAL_TIME):
+        return None
+    if not HOST.is_alive():
+        HOST.start()
+    mark = item.get_closest_marker("longest_pause")
+    bears = float(mark.args[0]) if mark else LONGEST_PAUSE
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for attempt in range(1, ATTEMPTS + 1):
+        begin = time.time()
+        reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        pause = HOST.longest(begin)
+        if pause <= bears or not any(report.failed for report in reports):
+            break
+        sentence = f"the host paused for {pause:.2f} s, the test bears {bears:g} s, in attempt {attempt} of {ATTEMPTS}"
+        item.user_properties.append((INCONCLUSIVE, sentence))
+    else:
+        for report in reports:
+            if report.failed:
+                report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"inconclusive: {sentence}")
+    for report in reports:
+        report.user_properties = list(item.user_properties)
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Name each attempt that the host made inconclusive."""
+    lines = [
+        f"{report.nodeid}: {sentence}"
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if getattr(report, "when", "") == "teardown"
+        for key, sentence in report.user_properties
+        if key == INCONCLUSIVE
+    ]
+    if lines:
+        terminalreporter.section("inconclusive attempts")
+        terminalreporter.write_line("\n".join(lines))
 
 
 def settable_clock(folder: Path) -> Path:
@@ -209,8 +233,10 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     def begin(*arguments: str, within: Sequence[str] = ()) -> Process:
         started.append(Process(*arguments, cwd=tmp_path, within=within))
+        running.append(started[-1])
         return started[-1]
 
+    running[:] = []
     yield begin
     for process in started:
         if process.popen.poll() is None:

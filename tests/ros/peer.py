@@ -5,7 +5,7 @@
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import rclpy
@@ -17,13 +17,14 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
+from tests.ros.waiting import HANG, LOOK, until
 
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_ros import transport
 from flight_ros.messages import to_message
 from flight_ros.topics import PUBLISH
 
-HANG = 150.0  # s, until a test ends that makes no progress: a guard and no limit, which a busy host must not reach
+T = TypeVar("T")
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
 
 
@@ -45,14 +46,26 @@ class Peer:
             self.node.create_subscription(kind, topic, messages.append, qos)
         self._publishers: dict[str, Any] = {}
 
-    def until(self, condition: Callable[[], object], timeout: float = HANG, each: Callable[[], None] | None = None) -> None:
-        """Spin until the condition holds; `each` is called every 5 ms."""
-        deadline = time.monotonic() + timeout
-        while not condition():
-            assert time.monotonic() < deadline, f"not within {timeout} s"
-            self._executor.spin_once(timeout_sec=0.005)
+    def until(
+        self,
+        condition: Callable[[], T],
+        because: str = "",
+        *,
+        each: Callable[[], object] | None = None,
+        timeout: float = HANG,
+    ) -> T:
+        """Spin until a condition is true; what it returned. `each` is called every 5 ms."""
+
+        def spin() -> None:
+            self._executor.spin_once(timeout_sec=LOOK)
             if each is not None:
                 each()
+
+        return until(condition, because, spin, timeout)
+
+    def last(self, topic: str) -> Any:
+        """The newest message of a topic; None before the first."""
+        return self.received[topic][-1] if self.received[topic] else None
 
     def spin(self, duration: float, each: Callable[[], None] | None = None) -> None:
         """Spin for a duration in s."""

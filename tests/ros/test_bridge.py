@@ -31,8 +31,9 @@ from std_msgs.msg import UInt8
 from std_srvs.srv import SetBool
 from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
-from tests.ros.conftest import HostDelays, Process, Start, settable_clock
+from tests.ros.conftest import Process, Start, settable_clock
 from tests.ros.peer import Peer, peer, stamp_ns
+from tests.ros.waiting import HostDelays
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe

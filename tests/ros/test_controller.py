@@ -19,8 +19,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
-from tests.ros.conftest import HostDelays, Process, Start
+from tests.ros.conftest import Process, Start
 from tests.ros.peer import OUTPUTS, Peer, peer, stamp_ns
+from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.modes import Mode

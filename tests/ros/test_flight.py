@@ -15,7 +15,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import DEFAULT_SIGHUP, Process, Start
-from tests.ros.peer import HANG
+from tests.ros.waiting import HANG
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.tape_reader import read_run

@@ -8,7 +8,7 @@ import sys
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Start
-from tests.ros.peer import HANG
+from tests.ros.waiting import HANG
 
 pytestmark = pytest.mark.package("flight_ros")
 

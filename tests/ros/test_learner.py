@@ -11,9 +11,10 @@ import numpy as np
 import psutil
 import pytest
 from rcl_interfaces.srv import GetParameters
-from tests.ros.conftest import HostDelays, Start
+from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer, stamp_ns
 from tests.ros.test_controller import PERIOD_NS, HostDelay, missed
+from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.replay import replay

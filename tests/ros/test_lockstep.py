@@ -17,8 +17,9 @@ import pytest
 from mcap.reader import make_reader
 from std_msgs.msg import String
 from tests import recordings
-from tests.ros.conftest import HostDelays, Process, Start
+from tests.ros.conftest import Process, Start
 from tests.ros.peer import INPUTS, Peer
+from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.scenario import load_scenario
 from flight_analysis.closed_loop.simulate import simulate

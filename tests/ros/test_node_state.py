@@ -11,7 +11,8 @@ import pytest
 from diagnostic_msgs.msg import KeyValue
 from sensor_msgs.msg import JointState
 from tests.ros.conftest import Start
-from tests.ros.peer import HANG, Peer, peer, stamp_ns
+from tests.ros.peer import Peer, peer, stamp_ns
+from tests.ros.waiting import HANG
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes

@@ -10,8 +10,9 @@ import pytest
 from mcap.writer import Writer
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
-from tests.ros.conftest import HostDelays, Start
-from tests.ros.peer import HANG, Peer, peer
+from tests.ros.conftest import Start
+from tests.ros.peer import Peer, peer
+from tests.ros.waiting import HANG, HostDelays
 
 from flight_core.rates import NANOSECONDS
 from flight_log.message_definitions import definition

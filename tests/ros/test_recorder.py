@@ -18,8 +18,9 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
 from tests.recordings import count_messages, messages
-from tests.ros.conftest import HostDelays, Process, Recorder
+from tests.ros.conftest import Process, Recorder
 from tests.ros.peer import OUTPUTS, Peer
+from tests.ros.waiting import HostDelays
 from tests.small_disk import small_disk
 
 from flight_core.rates import period_ns

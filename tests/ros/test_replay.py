@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 from lifecycle_msgs.msg import Transition
 from tests import recordings
-from tests.ros.conftest import HostDelays, Start
+from tests.ros.conftest import Start
 from tests.ros.peer import Peer
 from tests.ros.test_controller import set_parameters
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 from tests.ros.test_recorder import recorded
+from tests.ros.waiting import HostDelays
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario

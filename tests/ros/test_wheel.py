@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from tests.conftest import REPOSITORY
-from tests.ros.peer import HANG
+from tests.ros.waiting import HANG
 
 PACKAGES = sorted(path.parent.name for path in (REPOSITORY / "ros_ws" / "src").glob("*/package.xml"))
 DECOY = "raise RuntimeError(f'{__name__} of a foreign package')\n"

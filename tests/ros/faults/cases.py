@@ -637,7 +637,7 @@ def parameters(flight: Flight, random: Generator) -> None:
                 futures.append(request(*(lower if valid[len(futures)] else invalid_change(random))))
 
         feed()
-        peer_node.until(lambda: done == CHANGES, 100.0, each=feed)
+        peer_node.until(lambda: done == CHANGES, "an answer to each request", each=feed)
         flight.end_fault()
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()

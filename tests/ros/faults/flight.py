@@ -31,6 +31,7 @@ from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES
 from tests.ros.conftest import Process, logged
 from tests.ros.peer import peer
+from tests.ros.waiting import until
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
 from flight_bringup.graph import AIRCRAFT, BRIDGE, CONTROLLER, GUIDANCE, LEARNER, RECORDER, REFERENCE_MODEL
@@ -173,12 +174,12 @@ class Probe:
 
     def until(self, condition: Callable[[], Any], timeout: float, what: str) -> Any:
         """Wait until the condition holds of the received messages; its value."""
-        deadline = time.monotonic() + timeout
-        while not (value := condition()):
-            assert time.monotonic() < deadline, f"not within {timeout:g} s: {what}"
+
+        def change() -> None:
             with self._changed:
                 self._changed.wait(0.05)
-        return value
+
+        return until(condition, what, change, timeout)
 
     def target(self, **values: float) -> None:
         """Command guidance, by channel."""

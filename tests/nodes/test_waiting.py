@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A test in real time that fails beside a pause of the host is run again; one that fails without a pause fails."""
+
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from tests.conftest import REPOSITORY
+from tests.ros import waiting
+from tests.ros.waiting import until
+
+pytestmark = pytest.mark.package("flight_ros")
+
+PLUGIN = """
+import sys
+from pathlib import Path
+import pytest
+from tests.ros import conftest
+
+class Host:
+    def is_alive(self): return True
+    def longest(self, t): return {pause}
+
+conftest.HOST, conftest.IN_REAL_TIME = Host(), Path({folder!r})
+sys.exit(pytest.main(["-q", "-rs", "-c", "pytest.ini", {folder!r}], plugins=[conftest]))
+"""
+TESTS = """
+import pytest
+attempts = []
+def test_passes_at_attempt():
+    attempts.append(1)
+    assert len(attempts) == {passes_at}
+@pytest.mark.longest_pause(5.0)
+def test_bears_more(): assert {bears}
+"""
+
+
+def outcome(folder: Path, pause: float, passes_at: int, *, bears: bool = True) -> str:
+    """What pytest prints of two tests of which one fails before an attempt, and one fails where it does not bear the pause."""
+    (folder / "test_it.py").write_text(TESTS.format(passes_at=passes_at, bears=bears), encoding="utf-8")
+    (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n", encoding="utf-8")
+    program = PLUGIN.format(pause=pause, folder=str(folder))
+    options = {"cwd": folder, "env": {"PYTHONPATH": str(REPOSITORY)}}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
+    return str(done.stdout) + str(done.stderr)
+
+
+@pytest.mark.parametrize(
+    ("pause", "passes_at", "bears", "summary", "attempts"),
+    [
+        (0.3, 1, True, "2 passed", 0),
+        (0.3, 2, True, "2 passed", 1),
+        (0.3, 3, True, "2 passed", 2),
+        (0.3, 4, True, "1 passed, 1 skipped", 3),
+        (0.05, 2, True, "1 failed, 1 passed", 0),
+        (0.3, 1, False, "1 failed, 1 passed", 0),
+    ],
+)
+def test_failure_beside_a_pause_is_run_again_at_most_twice(
+    pause: float, passes_at: int, bears: bool, summary: str, attempts: int, tmp_path: Path
+) -> None:
+    printed = outcome(tmp_path, pause, passes_at, bears=bears)
+    assert summary in printed
+    sentence = "test_it.py::test_passes_at_attempt: the host paused for 0.30 s, the test bears 0.1 s, in attempt"
+    assert printed.count(sentence) == attempts
+    assert ("inconclusive: the host paused for 0.30 s" in printed) is (attempts == 3)
+
+
+def test_until_returns_what_it_waited_for() -> None:
+    looks: list[int] = []
+    assert until(lambda: looks[2:], "three looks", lambda: looks.append(len(looks))) == [2]
+
+
+def test_wait_without_its_condition_fails_with_output_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    node = SimpleNamespace(arguments=("a.main",), output="waiting for /u")
+    monkeypatch.setattr(waiting, "running", [node])
+    with pytest.raises(AssertionError, match=r"not within 0 s: a u\na.main:\nwaiting for /u"):
+        until(lambda: False, "a u", timeout=0.0)
+
+
+def test_wait_is_longer_by_the_delays_of_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[int] = []
+    monkeypatch.setattr(waiting, "HOST", SimpleNamespace(since=lambda t: 1000.0 if len(looks) < 3 else 0.0))
+    with pytest.raises(AssertionError):
+        until(lambda: False, "nothing", lambda: looks.append(1), timeout=0.0)
+    assert len(looks) == 3
