@@ -3,7 +3,7 @@
 """Channel maps: each row of each map against hand-worked values, the conversion, and the refusals of invalid maps.
 
 Plain objects with the published fields (tests/published_messages.py) replace the messages, because px4_msgs, mavros_msgs,
-rosflight_msgs and rosplane_msgs may not be installed. Tests with real messages are in tests/ros: test_bridge.py and
+rosflight_msgs and rosplane_msgs may not be installed. Tests with real messages: tests/nodes/test_bridge.py and
 test_published_messages.py.
 """
 

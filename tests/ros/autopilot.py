@@ -14,8 +14,10 @@ Float64 of each effector.
 import math
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -41,10 +43,12 @@ ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([
 class Autopilot:
     """The simulated aircraft, its publishers and its subscription."""
 
-    def __init__(self, scenario: Path, release_after: float) -> None:
+    def __init__(
+        self, scenario: Path, release_after: float, node: Any, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
         self._simulator = Simulator(load_scenario(scenario).aircraft)
-        self._release_after = release_after
-        self.node = Node("ap")
+        self._release_after, self._monotonic = release_after, monotonic
+        self.node = node
         self._twist = self.node.create_publisher(TwistStamped, "/ap/twist/filtered", QOS)
         self._airspeed = self.node.create_publisher(Vector3Stamped, "/ap/airspeed", QOS)
         self.node.create_subscription(Joy, "/ap/joy", self._on_joy, QOS)
@@ -53,32 +57,44 @@ class Autopilot:
 
     def _on_joy(self, message: Joy) -> None:
         if len(message.axes) >= 4:  # messages with fewer axes are ignored
-            self._axes, self._received = [float(axis) for axis in message.axes[:4]], time.monotonic()
+            self._axes, self._received = [float(axis) for axis in message.axes[:4]], self._monotonic()
 
     def _u(self) -> list[float]:
         """Elevator, thrust, aileron, rudder from trim, in rad and as a fraction of full thrust; half throttle is trim."""
-        if any(math.isfinite(axis) for axis in self._axes) and time.monotonic() - self._received > self._release_after:
+        if any(math.isfinite(axis) for axis in self._axes) and self._monotonic() - self._received > self._release_after:
             self._axes = [math.nan] * 4
             print("timeout", flush=True)
         roll, pitch, throttle, yaw = self._axes
         u = [pitch * FULL, (throttle + 1.0) / 2.0 - 0.5, roll * FULL, yaw * FULL]
         return [value if math.isfinite(value) else 0.0 for value in u]
 
+    @property
+    def period(self) -> float:
+        """Between two samples of y, s."""
+        return self._simulator.period_ns / 1e9
+
+    def step(self, number: int) -> None:
+        """Simulate to a sample and publish it."""
+        (sample,) = self._simulator.sample(number, np.array(self._u()))
+        self._publish(*sample.value.tolist())
+
+    def truth(self) -> list[float]:
+        """q, V, p, r of the last sample without noise."""
+        places = [self._simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
+        truth: list[float] = self._simulator.truth()[places].tolist()
+        return truth
+
     def fly(self) -> None:
         """Simulate and publish until the process ends."""
-        period = self._simulator.period_ns / 1e9
         begin = time.monotonic()
-        places = [self._simulator.truth_names.index(f"x.{name}") for name in ("q", "V", "p", "r")]
         number = 0
         while True:
-            while (rest := begin + number * period - time.monotonic()) > 0.0:
+            while (rest := begin + number * self.period - time.monotonic()) > 0.0:
                 rclpy.spin_once(self.node, timeout_sec=rest)
-            (sample,) = self._simulator.sample(number, np.array(self._u()))
-            self._publish(*sample.value.tolist())
-            truth = self._simulator.truth()[places]
-            print("y", time.time_ns(), *truth.tolist(), flush=True)
+            self.step(number)
+            print("y", time.time_ns(), *self.truth(), flush=True)
             # Samples are skipped after a stop of the process.
-            number = max(number + 1, int((time.monotonic() - begin) / period))
+            number = max(number + 1, int((time.monotonic() - begin) / self.period))
 
     def _publish(self, q: float, V: float, p: float, r: float) -> None:
         twist, airspeed = TwistStamped(), Vector3Stamped()
@@ -96,8 +112,8 @@ class Autopilot:
 class Odometer(Autopilot):
     """A simulator that publishes Imu and Odometry and takes commands of joints and of the thrust."""
 
-    def __init__(self, scenario: Path, release_after: float) -> None:
-        super().__init__(scenario, release_after)
+    def __init__(self, scenario: Path, release_after: float, node: Any) -> None:
+        super().__init__(scenario, release_after, node)
         self._imu = self.node.create_publisher(Imu, "sim/imu", 10)
         self._odometry = self.node.create_publisher(Odometry, "sim/odom", 10)
         self._held = {"elevator": 0.0, "thrust": FULL_THRUST / 2.0, "aileron": 0.0, "rudder": 0.0}
@@ -131,4 +147,4 @@ if __name__ == "__main__":
     transport.prepare()
     rclpy.init()
     kind = Odometer if "odometry" in sys.argv[3:] else Autopilot
-    kind(Path(sys.argv[1]), float(sys.argv[2])).fly()
+    kind(Path(sys.argv[1]), float(sys.argv[2]), Node("ap")).fly()

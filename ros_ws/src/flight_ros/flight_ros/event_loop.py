@@ -169,7 +169,7 @@ def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: boo
         raise FlightEnded(f"timed out waiting for {awaited}: no message in {seconds(PEER_TIMEOUT_NS):g} s")
 
 
-class _RealTime:
+class RealTime:
     """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
 
     def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
@@ -228,7 +228,7 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     """Run nodes in one thread, a tick at a time: of several that are due the first node's, by the order of the nodes."""
     executor = _start(nodes)
     starts = _start_instants(nodes, executor, stop)
-    running = [_RealTime(node, start_ns, spin=len(nodes) == 1) for node, start_ns in zip(nodes, starts, strict=False)]
+    running = [RealTime(node, start_ns, spin=len(nodes) == 1) for node, start_ns in zip(nodes, starts, strict=False)]
     serve_ns = time.monotonic_ns()
     period_ns = nanoseconds(IDLE_POLL_PERIOD if len(nodes) == 1 else SERVICE_POLL_PERIOD)
     disable_timer_slack()

@@ -1,0 +1,425 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes in the process of a test: their time is moved by the test, and their topics are queues. Nothing else differs.
+
+A node is its class of the stack on a node of rclpy, with its parameters, its services and its ticks. Three things are replaced:
+the functions that make publishers, subscriptions and clients; the module `time`, as the modules of the stack see it; and the
+logger. A message is serialised where it is published, and waits in the queue of each subscription until the node takes it.
+"""
+
+import sys
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, Self, TypeVar, cast
+
+import numpy as np
+import pytest
+import rclpy
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.task import Future
+from rclpy.topic_endpoint_info import TopicEndpointTypeEnum
+from sensor_msgs.msg import JointState
+
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_ros.endpoints import type_name
+from flight_ros.event_loop import RealTime
+from flight_ros.flight_node import FlightNode
+from flight_ros.messages import Encoder, NamedDecoder, NamedSample
+from flight_ros.topics import PUBLISH
+
+T = TypeVar("T")
+AnyNode = FlightNode[Any]
+
+OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "thrust", "aileron", "rudder")
+EPOCH_NS = 1_700_000_000 * NANOSECONDS  # of the system clock where the monotonic clock is 0
+STEP = 0.005  # s, between two calls of what the test does meanwhile
+LIMIT = 60.0  # s of the time of the test, until a wait fails
+
+
+class Clock:
+    """The time of the host, in place of the module `time`; other functions of the module are unchanged."""
+
+    def __init__(self) -> None:
+        self.now_ns = 1000 * NANOSECONDS
+        self.step_ns = 0  # by which the system clock was set
+        self.suspended_ns = 0  # of the host, in which the monotonic clock stands still
+
+    def monotonic_ns(self) -> int:
+        """The monotonic clock."""
+        return self.now_ns
+
+    def time_ns(self) -> int:
+        """The system clock."""
+        return EPOCH_NS + self.now_ns + self.step_ns
+
+    def monotonic(self) -> float:
+        """The monotonic clock, s."""
+        return self.now_ns / NANOSECONDS
+
+    def time(self) -> float:
+        """The system clock, s."""
+        return self.time_ns() / NANOSECONDS
+
+    def clock_gettime_ns(self, clock: int) -> int:
+        """CLOCK_BOOTTIME."""
+        return self.now_ns + self.suspended_ns
+
+    def sleep(self, duration: float) -> None:
+        """Move the time."""
+        self.now_ns += nanoseconds(duration)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(time, name)
+
+
+class Endpoint(NamedTuple):
+    """A publisher or subscription in the graph, as rclpy tells of it."""
+
+    topic: str
+    topic_type: str
+    qos_profile: QoSProfile
+    node_name: str
+    node_namespace: str
+    endpoint_type: TopicEndpointTypeEnum
+
+
+class Publisher:
+    """A publisher of a node, or of the test."""
+
+    def __init__(self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str) -> None:
+        self.topic_name, self.kind, self.sequence = topic, kind, 0
+        self._world = world
+        self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.PUBLISHER)
+
+    def publish(self, message: Any) -> None:
+        """Put a message, or its bytes, into the queue of each subscription."""
+        self.sequence += 1
+        raw = message if isinstance(message, bytes) else serialize_message(message)
+        self._world.deliver(self.topic_name, self.kind, raw, self.sequence)
+
+    def lose(self, count: int) -> None:
+        """Messages that no subscription receives."""
+        self.sequence += count
+
+    def leave(self) -> None:
+        """Leave the graph."""
+        self._world.graph.remove(self.endpoint)
+
+    def wait_for_all_acked(self, timeout: object) -> bool:
+        """Nothing waits."""
+        return True
+
+
+class Subscription:
+    """A subscription of a node; `handle`, as rclpy has it, is itself."""
+
+    def __init__(self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool) -> None:
+        self.topic_name, self.msg_type, self.raw = topic, kind, raw
+        self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.SUBSCRIPTION)
+        self.queue: deque[tuple[bytes, dict[str, int]]] = deque(maxlen=self.endpoint.qos_profile.depth)
+        self._world = world
+
+    @property
+    def handle(self) -> Self:
+        """What takes messages."""
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def take_message(self, kind: type, raw: bool) -> tuple[Any, dict[str, int]] | None:
+        """The oldest message with its metadata; None without one."""
+        if not self.queue:
+            return None
+        message, information = self.queue.popleft()
+        return message if raw else deserialize_message(message, kind), information
+
+    def get_publisher_count(self) -> int:
+        """Publishers of the topic."""
+        return len(self._world.publishers(self.topic_name))
+
+
+class Client:
+    """A client of a service of another node of the world, or of one that the test answers."""
+
+    def __init__(self, world: "World", service: str) -> None:
+        self._world, self._service = world, service
+
+    def service_is_ready(self) -> bool:
+        """Whether anyone answers."""
+        return self._service in self._world.services()
+
+    def call_async(self, request: Any) -> Future:
+        """The response, at once; a service that returns None never answers."""
+        future = Future()
+        if (response := self._world.services()[self._service](request)) is not None:
+            future.set_result(response)
+        return future
+
+
+class Log:
+    """The logger of a node: keeps the lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []  # "[SEVERITY] text"
+
+    def _keep(self, severity: str, line: str) -> None:
+        self.lines.append(f"[{severity}] {line}")
+
+    def __getattr__(self, severity: str) -> Callable[..., None]:
+        return lambda line, **_: self._keep(severity.upper(), line)
+
+
+class InWorld:
+    """Of a node before its class: publishers, subscriptions, clients and logger are those of the world."""
+
+    world: "World"
+    log: Log
+
+    def get_logger(self) -> Log:
+        """The lines."""
+        return self.log
+
+    def create_publisher(self: Any, kind: type, topic: str, qos: QoSProfile | int, **_: object) -> Publisher:
+        """A publisher of the world."""
+        return Publisher(self.world, kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name())
+
+    def create_subscription(
+        self: Any, kind: type, topic: str, callback: object, qos: QoSProfile | int, *, raw: bool = False, **_: object
+    ) -> Subscription:
+        """A subscription of the world."""
+        return self.world.subscribe(kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name(), raw=raw)
+
+    def destroy_subscription(self, subscription: Subscription) -> None:
+        """End it."""
+        self.world.subscriptions.remove(subscription)
+        self.world.graph.remove(subscription.endpoint)
+
+    def create_client(self: Any, kind: type, service: str, **_: object) -> Client:
+        """A client of the world."""
+        return Client(self.world, self.resolve_service_name(service))
+
+    def count_publishers(self, topic: str) -> int:
+        """Publishers of a topic by its full name."""
+        return len(self.world.publishers(topic))
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[Endpoint]:
+        """Of a topic by its full name."""
+        return self.world.publishers(topic)
+
+    def get_subscriptions_info_by_topic(self, topic: str) -> list[Endpoint]:
+        """Of a topic by its full name."""
+        kind = TopicEndpointTypeEnum.SUBSCRIPTION
+        return [each for each in self.world.graph if each.topic == topic and each.endpoint_type is kind]
+
+
+class World:
+    """The nodes of a test, the graph between them, their time, and the messages that they have published."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self.graph: list[Endpoint] = []
+        self.subscriptions: list[Subscription] = []
+        self.sent: dict[str, list[tuple[type, bytes]]] = defaultdict(list)  # by the full name of the topic
+        self.answers: dict[str, Callable[[Any], Any]] = {}  # services of the test, by their full names
+        self.loops: dict[AnyNode, RealTime] = {}
+        self.nodes: list[AnyNode] = []
+        self.listeners: dict[str, list[Callable[[Any], object]]] = defaultdict(list)  # of the test, by full topic
+        self._own: dict[tuple[str, type], Publisher] = {}  # publishers of the test
+
+    # Nodes
+
+    def make(self, node: type[AnyNode]) -> Any:
+        """A node that does not run."""
+        made = cast(Any, type(node.__name__, (InWorld, node), {"world": self, "log": Log()}))()
+        self.nodes.append(made)
+        return made
+
+    def start(self, node: type[AnyNode]) -> Any:
+        """A node that runs as the event loop runs it."""
+        made = self.make(node)
+        self.loops[made] = RealTime(made, made.start_ns(), spin=False)
+        return made
+
+    @contextmanager
+    def stopped(self, node: AnyNode) -> Iterator[None]:
+        """SIGSTOP until the block is left."""
+        loop = self.loops.pop(node)
+        yield
+        self.loops[node] = loop
+
+    def end(self, node: AnyNode) -> None:
+        """End a node, as SIGINT does."""
+        self.loops.pop(node, None)
+        node.finish()
+
+    def kill(self, node: AnyNode) -> None:
+        """SIGKILL. The node stays in the graph for the lease of its participant; `forget` ends it."""
+        self.loops.pop(node, None)
+        self.nodes.remove(node)
+        node.destroy_node()
+
+    # Time
+
+    def run(self, duration: float, each: Callable[[], object] | None = None) -> None:
+        """Run the nodes for a duration, s. `each` is called every STEP."""
+        end_ns = self.clock.now_ns + nanoseconds(duration)
+        self._run(lambda: self.clock.now_ns >= end_ns, each, end_ns)
+
+    def until(self, condition: Callable[[], T], because: str, each: Callable[[], object] | None = None) -> T:
+        """Run the nodes until a condition is true; what it returned."""
+        end_ns = self.clock.now_ns + nanoseconds(LIMIT)
+        value = self._run(condition, each, end_ns)
+        lines = [f"{node.get_name()}: {line}" for node in self.nodes for line in node.get_logger().lines[-20:]]
+        assert value, "\n".join([f"not within {LIMIT:g} s: {because}", *lines])
+        return value
+
+    def _run(self, condition: Callable[[], T], each: Callable[[], object] | None, end_ns: int) -> T:
+        call_ns = self.clock.now_ns
+        while not (value := condition()) and self.clock.now_ns < end_ns:
+            if each is not None and self.clock.now_ns >= call_ns:
+                call_ns = self.clock.now_ns + nanoseconds(STEP)
+                each()
+            for loop in list(self.loops.values()):
+                while loop.run_due_tick():
+                    loop.report()
+            deadlines = [self.clock.now_ns + nanoseconds(loop.ticker.remaining()) for loop in self.loops.values()]
+            self.clock.now_ns = max(min([*deadlines, end_ns, call_ns if each is not None else end_ns]), self.clock.now_ns + 1)
+        return value
+
+    # Messages
+
+    def endpoint(self, topic: str, kind: type, qos: QoSProfile | int, node: str, role: TopicEndpointTypeEnum) -> Endpoint:
+        """Add an endpoint to the graph."""
+        namespace, _, name = node.rpartition("/")
+        profile = QoSProfile(depth=qos) if isinstance(qos, int) else qos
+        self.graph.append(Endpoint(topic, type_name(kind), profile, name, namespace or "/", role))
+        return self.graph[-1]
+
+    def publishers(self, topic: str) -> list[Endpoint]:
+        """The publishers of a topic by its full name."""
+        kind = TopicEndpointTypeEnum.PUBLISHER
+        return [each for each in self.graph if each.topic == topic and each.endpoint_type is kind]
+
+    def subscribe(self, kind: type, topic: str, qos: QoSProfile | int, node: str, *, raw: bool) -> Subscription:
+        """Add a subscription."""
+        self.subscriptions.append(Subscription(self, kind, topic, qos, node, raw=raw))
+        return self.subscriptions[-1]
+
+    def deliver(self, topic: str, kind: type, raw: bytes, sequence: int) -> None:
+        """Put a message into the queue of each subscription of its topic and type."""
+        self.sent[topic].append((kind, raw))
+        now_ns = self.clock.time_ns()
+        information = {"source_timestamp": now_ns, "received_timestamp": now_ns, "publication_sequence_number": sequence}
+        for subscription in self.subscriptions:
+            if subscription.topic_name == topic and subscription.msg_type is kind:
+                subscription.queue.append((raw, information))
+        for listener in self.listeners[topic]:
+            listener(deserialize_message(raw, kind))
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile | int = PUBLISH, node: str = "/peer") -> Publisher:
+        """A publisher of the test."""
+        return Publisher(self, kind, topic, qos, node)
+
+    # As a node of rclpy has them, for what the test simulates
+
+    def create_publisher(self, kind: type, topic: str, qos: QoSProfile | int) -> Publisher:
+        """A publisher of the test."""
+        return self.publisher(kind, topic, qos)
+
+    def create_subscription(self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile | int) -> None:
+        """Call back with each message of a topic."""
+        self.listeners[topic].append(callback)
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish a message of the test."""
+        key = topic, type(message)
+        if key not in self._own:
+            self._own[key] = self.publisher(type(message), topic)
+        self._own[key].publish(message)
+
+    def send(self, topic: str, channels: Mapping[str, float], sender: str = "/peer#1", age: float = 0.0) -> None:
+        """Publish a named vector of the test, with a stamp of `age` s ago."""
+        stamp_ns = self.clock.time_ns() - nanoseconds(age)
+        raw = Encoder([*channels], sender).encode(stamp_ns, np.array([*channels.values()], dtype=np.float64))
+        key = topic, JointState
+        if key not in self._own:
+            self._own[key] = self.publisher(JointState, topic)
+        self._own[key].publish(raw)
+
+    def vectors(self, topic: str) -> list[NamedSample]:
+        """The named vectors that were published on a topic."""
+        return [NamedDecoder().decode(raw) for _, raw in self.sent[topic]]
+
+    def last(self, topic: str) -> dict[str, float]:
+        """The channels of the last named vector of a topic; empty before the first."""
+        return NamedDecoder().decode(self.sent[topic][-1][1]).channels if self.sent[topic] else {}
+
+    def messages(self, topic: str) -> list[Any]:
+        """The messages that were published on a topic."""
+        return [deserialize_message(raw, kind) for kind, raw in self.sent[topic]]
+
+    # Services
+
+    def services(self) -> dict[str, Callable[[Any], Any]]:
+        """What answers a request, by the full name of the service."""
+        found = dict(self.answers)
+        for node in self.nodes:
+            for service in node.services:
+                found[node.resolve_service_name(service.srv_name)] = partial(_answer, service)
+        return found
+
+    def call(self, service: str, request: Any) -> Any:
+        """The response of a service by its full name."""
+        return self.services()[service](request)
+
+
+def _answer(service: Any, request: Any) -> Any:
+    return service.callback(request, service.srv_type.Response())
+
+
+def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
+    """Sentence and figures of the newest diagnostics of a node by its full name."""
+    reports = [status for message in world.messages("/diagnostics") for status in message.status if status.name == node]
+    return (reports[-1].message, {value.key: value.value for value in reports[-1].values}) if reports else ("", {})
+
+
+@contextmanager
+def world_of(*arguments: str) -> Iterator[World]:
+    """A world whose nodes have these arguments of ROS. Its time is that of the modules of the stack."""
+    clock = Clock()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+        for module in modules_of_stack():
+            if vars(module).get("time") is time:
+                patch.setattr(module, "time", clock)
+        rclpy.init(args=["--ros-args", *arguments])
+        made = World(clock)
+        try:
+            yield made
+        finally:
+            for node in made.nodes:
+                node.destroy_node()
+            rclpy.try_shutdown()
+
+
+SOURCES = Path(__file__).resolve().parents[2] / "ros_ws" / "src"
+PACKAGES = {path.parent.name for path in SOURCES.glob("*/package.xml")}
+
+
+def modules_of_stack() -> Iterable[Any]:
+    """The loaded modules of the packages."""
+    return [module for name, module in list(sys.modules.items()) if name.partition(".")[0] in PACKAGES]
+
+
+def parameters(values: Mapping[str, object]) -> Sequence[str]:
+    """Arguments that set parameters of nodes, by "NODE.NAME"."""
+    return [word for key, value in values.items() for word in ("-p", f"{key.replace('.', ':', 1)}:={value}")]
