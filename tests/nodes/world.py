@@ -386,6 +386,11 @@ def _answer(service: Any, request: Any) -> Any:
     return service.callback(request, service.srv_type.Response())
 
 
+def stamp_ns(message: Any) -> int:
+    """The stamp of a message with a header."""
+    return int(message.header.stamp.sec) * NANOSECONDS + int(message.header.stamp.nanosec)
+
+
 def diagnostics(world: World, node: str) -> tuple[str, dict[str, str]]:
     """Sentence and figures of the newest diagnostics of a node by its full name."""
     reports = [status for message in world.messages("/diagnostics") for status in message.status if status.name == node]

@@ -12,9 +12,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from tests.ros.waiting import HANG, LOOK, until
@@ -100,6 +102,12 @@ class Peer:
         """Request a transition of the controller; whether it succeeded."""
         request = ChangeState.Request(transition=Transition(id=number))
         return bool(self.call(ChangeState, "controller/change_state", request).success)
+
+    def set_parameters(self, **values: object) -> bool:
+        """Set parameters of the controller at once; whether it took them."""
+        messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=messages)
+        return bool(self.call(SetParametersAtomically, "controller/set_parameters_atomically", request).result.successful)
 
     def counted(self, key: str, more_than: int = 0) -> bool:
         """Whether a counter in the received diagnostics has been above a number."""

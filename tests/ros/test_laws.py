@@ -14,8 +14,6 @@ import pytest
 import yaml
 from tests.other_laws import EXAMPLE, SECTIONS
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer
-from tests.ros.test_controller import channel, engage, set_parameters
 from tests.ros.test_lockstep import TOPICS, payloads
 from typer.testing import CliRunner
 
@@ -98,36 +96,3 @@ def test_law_flies_in_lockstep_as_without_ros_and_replayed(law: str, options: li
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
     replay = CliRunner().invoke(application([*COMMANDS]), ["replay", str(runs[0])])
     assert (replay.exit_code, replay.stdout) == (0, "201 ticks, every bit equal\n")
-
-
-@pytest.mark.parametrize(
-    ("law", "sentence"),
-    [
-        ("pid", "found 'pid', expected a registered law: excitation, indi, l1, lqg, lqi, pi, rise_di"),
-        (
-            "lqi",
-            "found 'lqi', which needs the full state, expected a law of y and y_m: the topics have no more",
-        ),
-    ],
-)
-def test_controller_under_law_that_it_cannot_fly_ends_with_one_sentence(
-    law: str, sentence: str, start: Start, tmp_path: Path
-) -> None:
-    scenario = scenario_file(tmp_path / "other.yaml", SECTIONS["pid"] | {"law": law})
-    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario))
-    assert node.end() == 2
-    assert node.lines == [f"error: controller.law: {sentence}"]
-
-
-@pytest.mark.usefixtures("_example")
-def test_node_names_law_and_takes_new_gains_of_it_in_flight(start: Start, peer_node: Peer, tmp_path: Path) -> None:
-    scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
-    node = start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario), "-p", "max_age:=5.0")
-    engage(peer_node)
-    assert "law pid" in node.output
-    internals, before = peer_node.received["internals"], len(peer_node.received["internals"])
-    assert set_parameters(peer_node, lead=[0.0, 0.0, 0.0, 0.0]) == (True, "")
-    peer_node.until(lambda: len(internals) > before + 20, each=lambda: peer_node.send(0.01))
-    assert channel(internals[-1], "parameters") != channel(internals[0], "parameters")
-    assert channel(internals[-1], "integral_e.q") > channel(internals[0], "integral_e.q") >= 0.0  # the law's own state
-    assert not set_parameters(peer_node, law="pi")[0]  # at a restart only

@@ -12,10 +12,12 @@ import psutil
 import pytest
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from tests.conftest import REPOSITORY, with_policy
 from tests.ros.conftest import Start
-from tests.ros.peer import Peer
+from tests.ros.peer import Peer, peer
 
 pytestmark = pytest.mark.package("flight_bringup")
 
@@ -155,6 +157,16 @@ def test_node_of_longer_period_has_lower_real_time_priority(package: str, priori
     node = start_node(package, within=with_policy("--fifo", "50")).wait_for("ready")
     assert {os.sched_getparam(thread.id).sched_priority for thread in psutil.Process(node.popen.pid).threads()} == {priority}
     node.interrupt().succeed()
+
+
+def test_incompatible_type_and_quality_of_service_reported_with_peer(start_node: Start) -> None:
+    with peer(topics=()) as peer_node:
+        process = start_node("aircraft_sim")
+        peer_node.node.create_publisher(Float64MultiArray, "u", QoSProfile(depth=1))
+        process.wait_for("/u: /peer publishes std_msgs/msg/Float64MultiArray, expected sensor_msgs/msg/JointState")
+        recorder = start_node("flight_recorder")
+        peer_node.node.create_publisher(JointState, "truth", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+        recorder.wait_for("/truth: /peer publishes with incompatible quality of service")
 
 
 @pytest.mark.parametrize(("package", "executable"), NODES.items())

@@ -12,7 +12,6 @@ from lifecycle_msgs.msg import Transition
 from tests import recordings
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer
-from tests.ros.test_controller import set_parameters
 from tests.ros.test_lockstep import ROUGH, both_cores_busy, scenario_file
 from tests.ros.test_recorder import recorded
 from tests.ros.waiting import HostDelays
@@ -81,9 +80,9 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
         return peer_node.modes()[-1:]
 
     peer_node.until(lambda: modes() == [Mode.ENGAGED])
-    assert set_parameters(peer_node, k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])[0]
+    assert peer_node.set_parameters(k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])
     receive_more(peer_node, 50)
-    assert set_parameters(peer_node, upper=[0.01] * 4)[0]
+    assert peer_node.set_parameters(upper=[0.01] * 4)
     with both_cores_busy():  # ticks are late, and some are missed
         receive_more(peer_node, 50)
     assert peer_node.transition(Transition.TRANSITION_DEACTIVATE)
