@@ -384,18 +384,14 @@ def test_stale_u_sends_neutral_then_release_values_then_nothing_each_for_its_tim
     setup.until_logged("RELEASE -> DISENGAGED: u is")
     setup.run(1.0)
     since = [sent for sent in setup.joys if sent.t > stale]
-    last_of = {
-        name: [sent.t - stale for sent in since if is_of(sent)]
-        for name, is_of in {
-            "u": lambda sent: sent.axes[1] == pytest.approx(commanded / FULL, abs=1e-6),
-            "neutral": lambda sent: sent.axes == [0.0] * 4,
-            "release": lambda sent: sent.released,
-        }.items()
-    }
-    assert sum(map(len, last_of.values())) == len(since)  # nothing else is sent
+    u = [sent.t for sent in since if sent.axes[1] == pytest.approx(commanded / FULL, abs=1e-6)]
+    neutral_values = [sent.t for sent in since if sent.axes == [0.0] * 4]
+    released = [sent.t for sent in since if sent.released]
+    assert len(u) + len(neutral_values) + len(released) == len(since)  # nothing else is sent
     late = JOY + 2 * TICK
-    for name, end in (("u", MAX_AGE), ("neutral", MAX_AGE + neutral), ("release", MAX_AGE + neutral + RELEASE)):
-        assert end - late <= last_of[name][-1] <= end + late, name
+    assert max(u) - stale == pytest.approx(MAX_AGE, abs=late)
+    assert max(neutral_values) - stale == pytest.approx(MAX_AGE + neutral, abs=late)
+    assert max(released) - stale == pytest.approx(MAX_AGE + neutral + RELEASE, abs=late)
     setup.joys.clear()
     setup.u = (commanded, 0.0, 0.0, 0.0)
     setup.run(0.5)

@@ -196,7 +196,8 @@ class InWorld:
         self: Any, kind: type, topic: str, callback: object, qos: QoSProfile | int, *, raw: bool = False, **_: object
     ) -> Subscription:
         """A subscription of the world."""
-        return self.world.subscribe(kind, self.resolve_topic_name(topic), qos, self.get_fully_qualified_name(), raw=raw)
+        name, node = self.resolve_topic_name(topic), self.get_fully_qualified_name()
+        return cast("World", self.world).subscribe(kind, name, qos, node, raw=raw)
 
     def destroy_subscription(self, subscription: Subscription) -> None:
         """End it."""
@@ -259,7 +260,9 @@ class World:
     def end(self, node: AnyNode) -> None:
         """End a node, as SIGINT does."""
         self.loops.pop(node, None)
+        self.nodes.remove(node)
         node.finish()
+        node.destroy_node()
 
     def kill(self, node: AnyNode) -> None:
         """SIGKILL. The node stays in the graph for the lease of its participant; `forget` ends it."""
@@ -355,6 +358,11 @@ class World:
             self._own[key] = self.publisher(JointState, topic)
         self._own[key].publish(raw)
 
+    def leave(self, topic: str) -> None:
+        """End what the test publishes on a topic."""
+        for key in [key for key in self._own if key[0] == topic]:
+            self._own.pop(key).leave()
+
     def vectors(self, topic: str) -> list[NamedSample]:
         """The named vectors that were published on a topic."""
         return [NamedDecoder().decode(raw) for _, raw in self.sent[topic]]
@@ -411,8 +419,8 @@ def world_of(*arguments: str) -> Iterator[World]:
         try:
             yield made
         finally:
-            for node in made.nodes:
-                node.destroy_node()
+            for node in list(made.nodes):
+                made.end(node)
             rclpy.try_shutdown()
 
 
@@ -422,7 +430,7 @@ PACKAGES = {path.parent.name for path in SOURCES.glob("*/package.xml")}
 
 def modules_of_stack() -> Iterable[Any]:
     """The loaded modules of the packages."""
-    return [module for name, module in list(sys.modules.items()) if name.partition(".")[0] in PACKAGES]
+    return [module for name, module in sys.modules.copy().items() if name.partition(".")[0] in PACKAGES]
 
 
 def parameters(values: Mapping[str, object]) -> Sequence[str]:

@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder: recorded topics, QoS, missing topics, lost messages, a full disk."""
+"""The recorder over DDS: topics of ROS 2 itself, any offered quality of service, lost messages, and a forged packet.
+
+tests/nodes/test_recorder.py has what it does with its messages.
+"""
 
 import re
 import socket
 import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
-from lifecycle_msgs.msg import State
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
@@ -21,12 +21,10 @@ from tests.recordings import count_messages, messages
 from tests.ros.conftest import Process, Recorder
 from tests.ros.peer import OUTPUTS, Peer
 from tests.ros.waiting import HostDelays
-from tests.small_disk import small_disk
 
-from flight_core.rates import period_ns
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
-from flight_ros.topics import PUBLISH, RECORDED, publisher_qos
+from flight_ros.topics import PUBLISH
 
 pytestmark = pytest.mark.package("flight_recorder")
 
@@ -106,78 +104,6 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recorder, peer_node:
     assert sum(b"weak" in text for text in texts) > 2
 
 
-def test_a_topic_without_a_publisher_is_named(recorder: Recorder, peer_node: Peer) -> None:
-    process = recorder("run", "topics:=[/never]")
-    process.wait_for("no publisher of /never; recording starts with the first publisher")
-    peer_node.until(lambda: diagnostics(peer_node)[2].get("missing /never") == "no publisher")
-    process.interrupt().succeed()
-    assert "[WARN]" in next(line for line in process.lines if "/never is not in the log: it had no publisher" in line)
-
-
-def test_flight_of_which_part_recorded_is_no_silent_failure(recorder: Recorder, peer_node: Peer) -> None:
-    process = recorder("run").wait_for("ready")
-
-    def send() -> None:
-        peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.zeros(4), "/aircraft#1"))
-
-    peer_node.until(lambda: all(process.has_logged(f"waiting for /{topic}: no publisher") for topic in ("y_m", "u")), each=send)
-    assert "waiting for /y:" not in process.output
-
-
-def test_log_reaches_as_far_as_oldest_of_y_y_m_and_u(recorder: Recorder, peer_node: Peer) -> None:
-    spans: list[Time] = []
-    peer_node.node.create_subscription(RECORDED.type, RECORDED.name, spans.append, PUBLISH)
-    recorder("run").wait_for("ready")
-
-    def send() -> None:
-        peer_node.send()
-        peer_node.command(0.0, 0.0, 0.0, 0.0, age=5.0)
-
-    peer_node.until(lambda: spans, each=send)
-    assert time.time() - spans[0].sec - spans[0].nanosec / 1e9 > 5.0
-
-
-def test_flight_that_falls_silent_named_each_time(recorder: Recorder, peer_node: Peer) -> None:
-    process = recorder("run").wait_for("ready")
-
-    def silences() -> int:
-        return sum("no y, y_m or u for 3 s" in line for line in process.lines)
-
-    def send() -> None:
-        peer_node.publish("y", to_message(time.time_ns(), OUTPUTS, np.zeros(4), "/aircraft#1"))
-
-    def pause(count: int) -> None:
-        before = recorded(peer_node, "/y")
-        peer_node.until(lambda: recorded(peer_node, "/y") > before, each=send)
-        assert silences() == count - 1
-        peer_node.until(lambda: silences() == count)
-
-    pause(1)
-    pause(2)
-
-
-def test_topic_that_stops_while_others_go_on_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
-    """A WARN, an entry of the log, and in a record of the log; the outcome that the flight left is in the log, too."""
-    process = recorder("run").wait_for("ready")
-
-    def send(*topics: str) -> None:
-        for topic in topics:
-            peer_node.publish(topic, to_message(time.time_ns(), OUTPUTS, np.zeros(4), f"/{topic}#1"))
-
-    peer_node.until(lambda: recorded(peer_node, "/y") > 100, each=lambda: send("y", "y_m", "truth"))
-    named = "/y: no message for 1 s while others go on"
-    peer_node.until(lambda: process.has_logged(named), each=lambda: send("y_m", "truth"))
-    assert "no message for 1 s" not in process.output.replace(named, "")
-    peer_node.until(lambda: process.has_logged("/y: received again after"), each=lambda: send("y", "y_m", "truth"))
-    (tmp_path / "run" / "outcome").write_text("interrupted", encoding="utf-8")
-    process.interrupt().succeed()
-    log = read_run(tmp_path / "run")
-    assert log.tape.outcome == "interrupted"
-    assert re.fullmatch(r"/y: the recorder received nothing for [\d.]+ s", log.tape.notes[-1])
-    texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/rosout"]
-    assert any(named.encode() in text for text in texts)
-
-
 def forge_gap(domain: int, writer: bytes) -> None:
     """Send a GAP of a writer to all participants of this host: its readers take 100,000 samples as irrelevant.
 
@@ -212,30 +138,6 @@ def test_forged_end_of_topic_named(
     assert any(re.fullmatch(r"/truth: the recorder received nothing for [\d.]+ s, to the end", note) for note in notes)
 
 
-def test_topic_whose_type_is_not_installed_named(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
-    # The recorder runs in this folder. Its packages precede the installed ones, and its lifecycle_msgs has no messages.
-    (tmp_path / "lifecycle_msgs").mkdir()
-    (tmp_path / "lifecycle_msgs" / "__init__.py").touch()
-    peer_node.node.create_publisher(State, "/strange", LATCHED)
-    process = recorder("run", "topics:=[/strange]")
-    process.wait_for("/strange is not recorded: its type lifecycle_msgs/msg/State is not installed")
-    process.interrupt().succeed()
-
-
-def test_a_publisher_of_another_type_is_named(recorder: Recorder, peer_node: Peer) -> None:
-    peer_node.node.create_publisher(String, "/u_m", LATCHED)
-    process = recorder("run")
-    process.wait_for("/u_m: /peer publishes std_msgs/msg/String, expected sensor_msgs/msg/JointState")
-    process.interrupt().succeed()
-
-
-def test_an_invalid_topic_name_is_rejected(recorder: Recorder, tmp_path: Path) -> None:
-    process = recorder("run", "topics:=[a topic]")
-    assert process.end() == 2
-    assert errors(process) == ["error: recorder.topics: found 'a topic', expected the name of a topic"]
-    assert not (tmp_path / "run").exists()
-
-
 def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     process = recorder("run")
     process.wait_for("ready")
@@ -263,67 +165,3 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
     assert lost > 0
     assert len(run.tape["truth"].stamp_ns) + lost == sent
     assert f"/truth: the recorder lost {lost} messages" in run.tape.notes
-
-
-def test_second_publisher_of_topic_is_no_loss(recorder: Recorder, peer_node: Peer) -> None:
-    process = recorder("run")
-    process.wait_for("ready")
-    publishers = [peer_node.node.create_publisher(JointState, "y", PUBLISH) for _ in range(2)]
-    peer_node.until(lambda: all(publisher.get_subscription_count() == 1 for publisher in publishers))
-    for number in range(50):  # their sequences begin apart
-        publishers[0].publish(to_message(number, OUTPUTS, np.zeros(4), "/aircraft#0"))
-    for number in range(50, 100):
-        for sender, publisher in enumerate(publishers):
-            publisher.publish(to_message(number, OUTPUTS, np.zeros(4), f"/aircraft#{sender}"))
-    for number in range(100, 125):  # now under one name, taken at two ticks of the recorder or more
-        for publisher in publishers:
-            publisher.publish(to_message(number, OUTPUTS, np.zeros(4), "/aircraft#0"))
-        if number in {112, 124}:
-            peer_node.until(lambda count=2 * number - 48: recorded(peer_node, "/y") == count)  # type: ignore[misc]
-    assert "lost /y" not in diagnostics(peer_node)[2]
-
-
-# A full disk
-
-
-@pytest.fixture
-def disk(tmp_path: Path) -> Iterator[Path]:
-    with small_disk(tmp_path / "disk", 3_000_000) as folder:
-        yield folder
-
-
-@pytest.mark.usefixtures("publisher")
-@pytest.mark.parametrize(
-    ("least", "reason"),
-    [("0.0", "no space left for "), ("1.2", r"min_free: found \d\.\d MB free in .*, expected at least 1.2 MB")],
-)
-def test_full_disk_ends_recording_with_one_error_and_not_flight(
-    least: str, reason: str, recorder: Recorder, peer_node: Peer, disk: Path
-) -> None:
-    process = recorder(disk / "run", f"min_free:={least}", "lockstep:=true")
-    process.wait_for("recording ended")
-    peer_node.until(lambda: diagnostics(peer_node)[0] == 2)
-    _, sentence, figures = diagnostics(peer_node)
-    assert re.match(f"recording ended: {reason}", sentence)
-    # The node goes on: in lockstep the aircraft waits for the topic `recorded`.
-    received: list[object] = []
-    peer_node.node.create_subscription(Time, "recorded", received.append, QoSProfile(depth=10))
-    peer_node.until(lambda: len(received) > 5)
-    process.interrupt().succeed()
-    (error,) = errors(process)
-    assert "recording ended" in error
-    counts = {f"messages {topic}": str(count) for topic, count in count_messages(disk / "run").items()}
-    assert counts == {key: value for key, value in figures.items() if key.startswith("messages ") and value != "0"}
-    assert read_run(disk / "run").tape.notes == ()
-
-
-def test_too_little_space_at_start_rejected(recorder: Recorder, disk: Path) -> None:
-    process = recorder(disk / "run")
-    assert process.end() == 2
-    sentence = r"error: recorder.min_free: found 3.0 MB free in .*/disk/run, expected at least 100 MB"
-    assert re.fullmatch(sentence, process.lines[-1])
-
-
-@pytest.mark.parametrize(("rate", "depth"), [(0.1, 1), (100.0, 200), (500.0, 1000), (1000.0, 2000), (5000.0, 2000)])
-def test_publisher_keeps_history_of_two_seconds_for_recorder(rate: float, depth: int) -> None:
-    assert publisher_qos(period_ns(rate, "rate")).depth == depth

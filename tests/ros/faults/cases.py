@@ -84,7 +84,6 @@ class Case(NamedTuple):
     response: Response = Response.UNCHANGED
     recovery: float = 0.0  # s, from the end of the fault until the law is engaged
     kind: Kind = Kind.PLAIN  # of the flight
-    in_suite: bool = True  # else the benchmark alone injects it
     victim: str = ""  # the role that is killed or stopped
     needs: tuple[str, ...] = ()  # the roles that detect the fault, or that the injection needs
     alone: bool = False  # beside no other fault: it concerns every node, or the log of what it left
@@ -411,7 +410,6 @@ def wrong_stamp(sign: float, names: Names, random: Generator) -> BadSample:
     return sign * 10.0 ** random.uniform(0.0, 8.0), names, random.uniform(-1.0, 1.0, len(names))
 
 
-LONG = "long messages"
 BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # sample, key of the counter, log line
     "NaN": (partial(not_finite, (math.nan,)), "finite", "is not finite"),
     "wrong names": (wrong_names, "name", "expected once among"),
@@ -419,10 +417,9 @@ BAD: dict[str, tuple[Callable[[Names, Generator], BadSample], str, str]] = {  # 
     "past stamps": (partial(wrong_stamp, -1.0), "old", "stamp [^ ]+ s old"),
     "future stamps": (partial(wrong_stamp, 1.0), "future", "ahead of the clock"),
     "Inf": (partial(not_finite, (-math.inf, math.inf)), "finite", "is not finite"),
-    LONG: (too_long, "size", "a message of"),
+    "long messages": (too_long, "size", "a message of"),
 }
 BAD_COUNT = 20
-EVERYWHERE = ("NaN", "past stamps")  # injected on each topic in the suite, the others on y alone: nodes share the check
 
 
 def malformed(topic: str, kind: str) -> Injection:
@@ -672,8 +669,8 @@ REFERENCE_MODEL: dict[str, Any] = {"victim": "reference_model", "needs": ("contr
 CONTROLLER: dict[str, Any] = {"victim": "controller", "needs": ("aircraft",)}
 GUIDANCE: dict[str, Any] = {"victim": "guidance", "needs": ("reference_model", "aircraft")}
 RECORDER: dict[str, Any] = {"victim": "recorder"}
-GUIDED: dict[str, Any] = {"kind": Kind.GUIDED, "in_suite": False}
-LEARNING: dict[str, Any] = {"kind": Kind.LEARNING, "in_suite": False}
+GUIDED: dict[str, Any] = {"kind": Kind.GUIDED}
+LEARNING: dict[str, Any] = {"kind": Kind.LEARNING}
 POSE_GATE: dict[str, Any] = {"victim": "gate", "needs": ("guidance",)}
 POSE_BENCHMARK = GUIDED | POSE_GATE
 
@@ -683,26 +680,36 @@ def ends_of(topic: str) -> tuple[str, str]:
     return PUBLISHERS[topic], CONSUMERS[topic]
 
 
+IN_SUITE = {
+    "aircraft killed",
+    "reference model killed",
+    "controller killed",
+    "recorder killed",
+    "controller stopped",
+    "storm on u",
+    "storm of parameters",
+    "CPU starved",
+    "guidance killed in a roll-in",
+}
+"""The cases of each test run: what processes, the middleware and the host do to a flight. The benchmark injects the others too,
+whose checks tests/nodes makes on the nodes alone."""
+
 CASES = (
     Case("aircraft killed", kill("aircraft"), *STALE_INPUT, RESTART, **AIRCRAFT),
     Case("reference model killed", kill("reference_model"), *STALE_INPUT, RESTART, **REFERENCE_MODEL),
     Case("controller killed", kill("controller"), *STALE_U, RESTART, **CONTROLLER),
     Case("recorder killed", kill("recorder"), None, **RECORDER),
     Case("aircraft stopped", stop("aircraft"), *STALE_INPUT, **AIRCRAFT),
-    Case("reference model stopped", stop("reference_model"), *STALE_INPUT, **REFERENCE_MODEL, in_suite=False),
+    Case("reference model stopped", stop("reference_model"), *STALE_INPUT, **REFERENCE_MODEL),
     Case("controller stopped", stop("controller"), *STALE_U, **CONTROLLER),
     Case("recorder stopped", stop("recorder"), None, **RECORDER),
-    *(
-        Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign"), needs=ends_of(topic), in_suite=topic != "y_m")
-        for topic in NAMES
-    ),
+    *(Case(f"storm on {topic}", storm(topic), conflicting(topic, "foreign"), needs=ends_of(topic)) for topic in NAMES),
     *(
         Case(
             f"{kind} on {topic}",
             malformed(topic, kind),
             logs(CONSUMERS[topic], refusal(topic, BAD[kind][2])),
             needs=ends_of(topic),
-            in_suite=kind in EVERYWHERE or (topic == "y" and kind != LONG),
         )
         for topic in NAMES
         for kind in BAD
@@ -737,8 +744,8 @@ CASES = (
         kind=Kind.OWN_CLOCK,
         alone=True,
     ),
-    Case("storm on the live page", storm_on_the_page, None, in_suite=False, needs=("recorder",)),
-    Case("recorder killed under a live page", recorder_killed_under_the_page, None, in_suite=False, victim="recorder"),
+    Case("storm on the live page", storm_on_the_page, None, needs=("recorder",)),
+    Case("recorder killed under a live page", recorder_killed_under_the_page, None, victim="recorder"),
     Case("guidance killed in a roll-in", kill_in_a_roll_in, *STALE_U_M, Response.WINGS_LEVELLED, kind=Kind.GUIDED, **GUIDANCE),
     Case("guidance stopped", stop("guidance"), *STALE_U_M, kind=Kind.GUIDED, **GUIDANCE),
     Case("second guidance", second("guidance", "u_m"), conflicting("u_m", "guidance"), **GUIDED, needs=ends_of("u_m")),
@@ -752,5 +759,5 @@ CASES = (
     Case("learner stopped", stop("learner"), None, **LEARNING, victim="learner"),
     Case("second learner", second_learner, conflicting("proposal", "learner"), 0.02, **LEARNING, needs=ends_of("proposal")),
     Case("storm on proposal", storm("proposal"), conflicting("proposal", "foreign"), **LEARNING, needs=ends_of("proposal")),
-    Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED, in_suite=False),
+    Case("autopilot rebooted", reboot, RELEASE, MAP_MAX_AGE, Response.RELEASED, RESTART, Kind.BRIDGED),
 )

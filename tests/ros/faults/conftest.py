@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from tests.ros.conftest import reserved_domain, settable_clock
+from tests.ros.faults.cases import CASES, IN_SUITE
 from tests.ros.faults.draws import Draw, draw, found
 from tests.ros.faults.flight import Flight, Kind
 
@@ -69,10 +70,12 @@ def lockstep_seeds(pytestconfig: pytest.Config) -> range:
     return range(first, first + count)
 
 
-@pytest.fixture(scope="session")
-def benchmark(pytestconfig: pytest.Config) -> bool:
-    """Whether benchmarks/faults.py runs these tests: all cases, with a table."""
-    return pytestconfig.getoption("--faults-table", None) is not None
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """The cases of the suite; all of them where benchmarks/faults.py runs the tests, with a table."""
+    if "case" in metafunc.fixturenames:
+        every = metafunc.config.getoption("--faults-table", None) is not None
+        chosen = [case for case in CASES if every or case.name in IN_SUITE]
+        metafunc.parametrize("case", chosen, ids=[case.name for case in chosen])
 
 
 @pytest.fixture(scope="session")

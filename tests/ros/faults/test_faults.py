@@ -14,7 +14,7 @@ import pytest
 from rcl_interfaces.msg import Log
 from rclpy.serialization import deserialize_message
 from tests.ros.conftest import logged
-from tests.ros.faults.cases import CASES, LEVEL, RESTART, SLACK, Case, Response
+from tests.ros.faults.cases import LEVEL, RESTART, SLACK, Case, Response
 from tests.ros.faults.conftest import Flights, Row, described
 from tests.ros.faults.draws import Draw, inject
 from tests.ros.faults.flight import HOLD, MAX_AGE, RAMP, TICK, U_MAX_AGE, Flight
@@ -42,12 +42,9 @@ CONTINUING = ("y", "y_m", "u", "truth", "internals")  # topics through a fault t
 SETTLING = 0.2  # s, until the effect of a fault on u shows
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_fault_is_detected_contained_and_recovered_from(
-    case: Case, flights: Flights, seeds: range, benchmark: bool, record: Callable[[Row], None]
+    case: Case, flights: Flights, seeds: range, record: Callable[[Row], None]
 ) -> None:
-    if not (case.in_suite or benchmark):
-        pytest.skip("the benchmark injects it")
     for seed in seeds:
         row: Row = {"case": case.name, "seed": seed, "does": case.response.value}
         try:

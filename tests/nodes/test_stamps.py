@@ -3,15 +3,14 @@
 """Each input of each node refuses a stamp that is behind or ahead of the clock by more than the age limit of the input."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from tests.conftest import REPOSITORY
+from tests.nodes.world import world_of
 
 from aircraft_sim.node import AircraftNode
 from autopilot_bridge.node import BridgeNode
@@ -22,7 +21,6 @@ from flight_core.channels import POSE
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_guidance.node import GuidanceNode
 from flight_guidance.reach import AUTHORITY
-from flight_ros import transport
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Encoder
 from reference_model.node import ReferenceModelNode
@@ -32,7 +30,7 @@ pytestmark = pytest.mark.package("flight_ros")
 
 SCENARIO = find_scenario("osprey_route")
 MAP = REPOSITORY / "examples" / "maps" / "ardupilot_2024.yaml"
-NODES: Mapping[NodeSpec, Callable[[], FlightNode[Any]]] = {
+NODES: Mapping[NodeSpec, type[FlightNode[Any]]] = {
     CONTROLLER: ControllerNode,
     AIRCRAFT: AircraftNode,
     REFERENCE_MODEL: ReferenceModelNode,
@@ -63,19 +61,6 @@ NAMES = {
 }
 
 
-@contextmanager
-def node(make: Callable[[], FlightNode[Any]], *arguments: str) -> Iterator[FlightNode[Any]]:
-    """A node of this process that does not run."""
-    transport.prepare()
-    rclpy.init(args=["--ros-args", *arguments])
-    made = make()
-    try:
-        yield made
-    finally:
-        made.destroy_node()
-        rclpy.shutdown()
-
-
 def require_bounds(made: FlightNode[Any], limits: Mapping[str, float]) -> None:
     """Assert that each receiver takes the stamps within the limit of the topic alone, behind and ahead of the clock."""
     receivers = {receiver.subscription.topic.name: receiver for receiver in made.receivers}
@@ -94,7 +79,8 @@ def test_each_input_is_bounded_both_ways(spec: NodeSpec, lockstep: bool, tmp_pat
     overrides = parameter_overrides(spec, SCENARIO, tmp_path, 0.0, lockstep=lockstep)
     overrides = {**overrides, "sensors.delay": DELAY} if spec is AIRCRAFT else overrides
     parameters = (word for name, value in overrides.items() for word in ("-p", f"{name}:={json.dumps(value)}"))
-    with node(NODES[spec], "--params-file", str(SCENARIO.path), *parameters) as made:
+    with world_of("--params-file", str(SCENARIO.path), *parameters) as world:
+        made = world.make(NODES[spec])
         topics = {subscription.topic.name for subscription in made.polled_subscriptions}
         bounded = topics - WITHOUT_STAMP - (LOCKSTEP_UNBOUNDED if lockstep else set())
         limits = LIMITS[made.get_name()]
@@ -107,6 +93,7 @@ def test_u_of_the_bridge_is_bounded_both_ways() -> None:
     """The topics of the autopilot have the same test in tests/pure/test_bridge.py."""
     channel_map = load_map(str(MAP))
     limit = channel_map.silence.max_age + max(row.max_age for row in channel_map.outputs.values())
-    with node(BridgeNode, "-p", f"map:={MAP}") as made:
+    with world_of("-p", f"map:={MAP}") as world:
+        made = world.make(BridgeNode)
         require_bounds(made, {"u": limit})
         assert {subscription.topic.name for subscription in made.polled_subscriptions} - {"u"} <= channel_map.topics.keys()
