@@ -96,7 +96,7 @@ setup-all: .venv/.all .venv/.workspace
 	  || { echo "error: $$($(PYTHON) --version) found, but the ROS 2 wheels are for 3.11 to 3.13; say make PYTHON=python3.12" >&2; exit 2; }
 	@$(if $(MOVED),echo "this checkout was made in $(MADE_IN): everything is made again in $(CURDIR)" >&2)
 	$(PYTHON) -m venv --clear .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv==$(UV_VERSION)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement .ci/uv.txt
 	@touch $@
 
 .venv/.fly: requirements.lock | .venv/.uv

@@ -4,7 +4,9 @@
 
 import re
 import tomllib
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from tests.conftest import REPOSITORY
@@ -20,9 +22,47 @@ def test_a_checkout_names_the_target_of_make() -> None:
     assert missing("jax") == "found no Python package jax, expected it: make setup-all"
 
 
-def test_the_wheel_names_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+class Installed(NamedTuple):
+    """An installed distribution."""
+
+    origin: str | None
+
+    def read_text(self, name: str) -> str | None:
+        assert name == "direct_url.json"
+        return self.origin
+
+
+@pytest.mark.parametrize(
+    ("origin", "command"),
+    [  # PEP 610
+        ('{"url": "file:///home/user/rise-di", "dir_info": {}}', 'pip install "rise-di[campaign] @ file:///home/user/rise-di"'),
+        ('{"url": "file:///a/rise_di-0.4.0-py3-none-any.whl", "archive_info": {}}',
+         'pip install "rise-di[campaign] @ file:///a/rise_di-0.4.0-py3-none-any.whl"'),
+        ('{"url": "https://example.org/rise-di.git", "vcs_info": {"vcs": "git", "commit_id": "a"}}',
+         'pip install "rise-di[campaign] @ git+https://example.org/rise-di.git"'),
+        (None, 'pip install "rise-di[campaign]"'),
+    ],
+)  # fmt: skip
+def test_installed_stack_names_what_it_came_from(
+    origin: str | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Not a package of its name on an index from which it did not come: a stranger may own that name."""
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
-    assert missing("jax") == 'found no Python package jax, expected it: pip install "rise-di[campaign]"'
+    monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))
+    assert missing("jax") == f"found no Python package jax, expected it: {command}"
+
+
+def test_workspace_names_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def absent(name: str) -> Installed:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
+    monkeypatch.setattr(installation, "distribution", absent)
+    assert missing("jax").endswith(': pip install ".[campaign]" in a checkout of the stack')
+
+
+def test_messages_come_with_a_full_ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     expected = (
         "found no Python package px4_msgs, expected it: on a full ROS 2 install ros-jazzy-px4-msgs, or source a workspace"
     )
@@ -44,3 +84,11 @@ def test_targets_and_extras_exist() -> None:
     assert {target.removeprefix("make ") for target in TARGETS.values()} <= {word for line in targets for word in line.split()}
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert {*TARGETS} == {*EXTRAS.values()} == extras.keys() - {"all"}
+
+
+@pytest.mark.parametrize(
+    "path", [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))], ids=lambda path: path.stem
+)
+def test_page_names_no_package_of_an_index(path: Path) -> None:
+    """The stack is installed from its checkout: nobody has published `rise-di`."""
+    assert not re.search(r"pip install[^\n`]*rise-di(\[| |$)|\"rise-di\[", path.read_text(encoding="utf-8"))

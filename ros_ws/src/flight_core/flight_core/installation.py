@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What installs a missing Python package: make in a checkout, elsewhere pip with an extra of the wheel `rise-di`."""
+"""What installs a missing Python package: make in a checkout, elsewhere pip with an extra of what `rise-di` came from."""
 
+import json
+from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -48,8 +50,25 @@ def missing(package: str) -> str:
     extra = "ros" if of_messages and find_spec("rclpy") is None else EXTRAS.get(package)
     ways = ""
     if extra is not None:
-        ways = f": {TARGETS[extra]}" if in_checkout else f': pip install "rise-di[{extra}]"'
+        ways = f": {TARGETS[extra] if in_checkout else _pip_command(extra)}"
     elif of_messages:
         build = f"make messages PACKAGE={package} SOURCE=FOLDER builds it from its sources; " if in_checkout else ""
         ways = f": {build}on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or source a workspace with it"
     return f"found no Python package {package}, expected it{ways}"
+
+
+def _pip_command(extra: str) -> str:
+    """The command that installs an extra of the stack from where the stack came: a checkout, a wheel, a repository, an index.
+
+    A checkout that is not released must not send its user to a package of this name that somebody else may have published.
+    Source: PEP 610, direct_url.json, which an installation from an index does not have.
+    """
+    try:
+        origin = distribution("rise-di").read_text("direct_url.json")
+    except PackageNotFoundError:  # a workspace of ROS 2
+        return f'pip install ".[{extra}]" in a checkout of the stack'
+    if origin is None:
+        return f'pip install "rise-di[{extra}]"'
+    place = json.loads(origin)
+    vcs = f"{place['vcs_info']['vcs']}+" if "vcs_info" in place else ""
+    return f'pip install "rise-di[{extra}] @ {vcs}{place["url"]}"'
