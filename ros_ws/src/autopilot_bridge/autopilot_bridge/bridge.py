@@ -468,7 +468,7 @@ class Bridge:
     def _is_contradicted(self) -> bool:
         """Whether a condition does not hold by its last value: the pilot or the autopilot chose another mode, or has landed.
 
-        One that tells the loss of the transmitter does not count: then nobody flies.
+        One that tells the loss of the transmitter does not count: the pilot cannot take over then.
         """
         rows = self.channel_map.conditions.items()
         readings = ((row, self._conditions.get(name)) for name, row in rows if not row.transmitter)
