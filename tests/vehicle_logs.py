@@ -10,13 +10,18 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 Rows = Sequence[tuple[int, Any]]  # stamp, us, and the values of the fields
+Changes = Sequence[tuple[int, str, float]]  # of parameters: stamp, us, name and value
 
 FMT = struct.Struct("<3sBB4s16s64s")  # ArduPilot, AP_Logger/LogStructure.h, log_Format
 HEAD = b"\xa3\x95"
 
 
 def write_dataflash(
-    path: Path, messages: Mapping[str, tuple[Sequence[str], Rows]], parameters: Mapping[str, float], firmware: str
+    path: Path,
+    messages: Mapping[str, tuple[Sequence[str], Rows]],
+    parameters: Mapping[str, float],
+    firmware: str,
+    changes: Changes = (),
 ) -> None:
     """A DataFlash log: every field a float. Messages are in the order of their stamps, firmware and parameters before them."""
     packets: list[tuple[int, bytes]] = [
@@ -27,7 +32,8 @@ def write_dataflash(
     packets.append((0, text.pack(HEAD + b"\x7f", 0, firmware.encode())))
     row = struct.Struct("<3sQ16sf")
     packets.append((-1, FMT.pack(HEAD + b"\x80", 0x81, row.size, b"PARM", b"QNf", b"TimeUS,Name,Value")))
-    packets += [(0, row.pack(HEAD + b"\x81", 0, name.encode(), value)) for name, value in parameters.items()]
+    records = [*((0, name, value) for name, value in parameters.items()), *changes]
+    packets += [(stamp, row.pack(HEAD + b"\x81", stamp, name.encode(), value)) for stamp, name, value in records]
     for identity, (name, (fields, rows)) in enumerate(messages.items(), start=0x82):
         packet = struct.Struct(f"<3sQ{len(fields)}f")
         labels = ",".join(("TimeUS", *fields)).encode()
@@ -36,7 +42,9 @@ def write_dataflash(
     path.write_bytes(b"".join(packet for _, packet in sorted(packets, key=lambda pair: pair[0])))
 
 
-def write_ulog(path: Path, topics: Mapping[str, tuple[str, Rows]], parameters: Mapping[str, float]) -> None:
+def write_ulog(
+    path: Path, topics: Mapping[str, tuple[str, Rows]], parameters: Mapping[str, float], changes: Changes = ()
+) -> None:
     """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file format)."""
 
     def message(kind: bytes, content: bytes) -> bytes:
@@ -47,11 +55,19 @@ def write_ulog(path: Path, topics: Mapping[str, tuple[str, Rows]], parameters: M
 
     parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), message(b"B", bytes(40))]
     parts += [message(b"F", f"{name}:uint64_t timestamp;{fields}".encode()) for name, (fields, _) in topics.items()]
-    parts += [message(b"P", key_value(f"float {name}", struct.pack("<f", value))) for name, value in parameters.items()]
+
+    def parameter(name: str, value: float) -> bytes:
+        return message(b"P", key_value(f"float {name}", struct.pack("<f", value)))
+
+    parts += [parameter(name, value) for name, value in parameters.items()]
     parts += [message(b"A", bytes([0]) + struct.pack("<H", k) + name.encode()) for k, name in enumerate(topics)]
-    samples = [(stamp, k, values) for k, (_, rows) in enumerate(topics.values()) for stamp, values in rows]
-    parts += [message(b"D", struct.pack(f"<HQ{len(v)}f", k, stamp, *v)) for stamp, k, v in sorted(samples, key=lambda s: s[:2])]
-    path.write_bytes(b"".join(parts))
+    samples = [
+        (stamp, k, message(b"D", struct.pack(f"<HQ{len(values)}f", k, stamp, *values)))
+        for k, (_, rows) in enumerate(topics.values())
+        for stamp, values in rows
+    ]
+    samples += [(stamp, len(topics), parameter(name, value)) for stamp, name, value in changes]  # after samples of its stamp
+    path.write_bytes(b"".join([*parts, *(packet for _, _, packet in sorted(samples, key=lambda sample: sample[:2]))]))
 
 
 def write_tlog(path: Path, messages: Sequence[tuple[int, Any]], system: int = 1) -> None:

@@ -6,20 +6,27 @@ import gc
 import json
 import re
 import struct
+from collections.abc import Callable, Mapping
+from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import yaml
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.conftest import REPOSITORY
-from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
+from tests.maps import named_map
+from tests.vehicle_logs import Changes, write_dataflash, write_tlog, write_ulog
 from typer.testing import CliRunner
 
+from autopilot_bridge.params import ChannelMap
+from flight_analysis.design.log_import import require_map_of_import
 from flight_analysis.design.response_identification import MIN_RATIO
 from flight_analysis.design.sign_check import recorded_response
 from flight_cli.cli import COMMANDS, application
+from flight_cli.log_options import warn_of_lacks_in
 from flight_core import installation
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
@@ -77,12 +84,27 @@ def on_ground(flight: Flight) -> Flight:
     return Flight([round(1e6 * (1.0 + k / RATE)) for k in range(count)], still, np.zeros((count, 4)))
 
 
-def dataflash(path: Path, flight: Flight, mode: int = 0) -> Path:
+ENDS = {"MIN": 1000.0, "TRIM": 1500.0, "MAX": 2000.0, "REVERSED": 0.0}  # us, those of the map ardupilot
+AXES = ("ROLL", "PITCH", "THROTTLE", "YAW")
+PARAMETERS = {
+    **{f"RCMAP_{axis}": float(number) for number, axis in enumerate(AXES, start=1)},
+    **{f"SERVO{number}_FUNCTION": function for number, function in enumerate((4.0, 19.0, 70.0, 21.0), start=1)},
+    **{f"{kind}{number}_{end}": value for kind in ("RC", "SERVO") for number in range(1, 5) for end, value in ENDS.items()},
+    "SERVO2_REVERSED": 1.0,
+}
+
+
+def dataflash(
+    path: Path, flight: Flight, mode: int = 0, parameters: Mapping[str, float] = PARAMETERS, changes: Changes = ()
+) -> Path:
+    """A log of ArduPlane. The servos follow the sticks as RCn_REVERSED and SERVOn_REVERSED of the first parameters say."""
     parts = (on_ground(flight), flight)
     stamps = [stamp for part in parts for stamp in part.stamp_us]
     y, pulses = np.concatenate([part.y for part in parts]), np.concatenate([sticks(part.u) for part in parts])
     servos = pulses.copy()
-    servos[:, 1] = 3000.0 - servos[:, 1]  # a reversed servo moves the other way
+    for column, number in enumerate(range(1, 5)):
+        if parameters.get(f"RC{number}_REVERSED", 0.0) != parameters.get(f"SERVO{number}_REVERSED", 0.0):
+            servos[:, column] = 3000.0 - servos[:, column]
     speed = y[:, [1]] + SPEED
     messages = {
         "MODE": (("Mode", "ModeNum"), [(1, (mode, mode))]),
@@ -92,14 +114,7 @@ def dataflash(path: Path, flight: Flight, mode: int = 0) -> Path:
         "RCIN": (("C1", "C2", "C3", "C4"), list(zip(stamps, pulses, strict=True))),
         "RCOU": (("C1", "C2", "C3", "C4"), list(zip(stamps, servos, strict=True))),
     }
-    parameters = {f"SERVO{n}_FUNCTION": function for n, function in enumerate((4, 19, 70, 21), start=1)}
-    ends = {
-        f"{kind}{n}_{end}": value
-        for kind in ("RC", "SERVO")
-        for n in range(1, 5)
-        for end, value in (("MIN", 1000.0), ("MAX", 2000.0))
-    }
-    write_dataflash(path, messages, parameters | ends | {"SERVO2_REVERSED": 1.0}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    write_dataflash(path, messages, parameters, "ArduPlane V4.6.0 (1f2e3d4c)", changes)
     return path
 
 
@@ -122,8 +137,11 @@ def multicopter(path: Path, flight: Flight, firmware: str = "ArduCopter V4.5.7 (
     return path
 
 
-def tlog(path: Path, flight: Flight) -> Path:
-    messages = [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))]
+def tlog(path: Path, flight: Flight, parameters: Mapping[str, float] = MappingProxyType({}), system: int = 1) -> Path:
+    messages: list[tuple[int, Any]] = [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))]
+    count = len(parameters)
+    for index, (name, value) in enumerate(parameters.items()):
+        messages.append((EPOCH, mavlink.MAVLink_param_value_message(name.encode(), value, 9, count, index)))
     for part in (on_ground(flight), flight):
         for stamp, y, pulses in zip(part.stamp_us, part.y, np.rint(sticks(part.u)).astype(int).tolist(), strict=True):
             ms, at = stamp // 1000, EPOCH + stamp
@@ -131,11 +149,11 @@ def tlog(path: Path, flight: Flight) -> Path:
             messages.append((at, mavlink.MAVLink_vfr_hud_message(y[1] + SPEED, 0.0, 0, 50, 0.0, 0.0)))
             channels = [*pulses, *[0] * 14]
             messages.append((at, mavlink.MAVLink_rc_channels_message(ms, 16, *channels, 0)))
-    write_tlog(path, messages)
+    write_tlog(path, messages, system)
     return path
 
 
-def ulog(path: Path, flight: Flight) -> Path:
+def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float) -> Path:
     def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
         return list(zip(flight.stamp_us, values, strict=True))
 
@@ -149,8 +167,18 @@ def ulog(path: Path, flight: Flight) -> Path:
         "vehicle_torque_setpoint": ("float[3] xyz;", rows(np.column_stack([aileron, elevator, rudder]) / FULL)),
         "vehicle_thrust_setpoint": ("float[3] xyz;", rows(np.column_stack([THROTTLE + thrust, still, still]))),
     }
-    write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0})
+    write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0} | parameters, changes)
     return path
+
+
+def in_order(content: bytes) -> bytes:
+    """The packets of a tlog in the order of their stamps: MAVLink 2, 12 bytes beside the payload, after a stamp of 8."""
+    packets, start = [], 0
+    while start < len(content):
+        end = start + 8 + 12 + int(content[start + 9])
+        packets.append(content[start:end])
+        start = end
+    return b"".join(sorted(packets, key=itemgetter(slice(8))))
 
 
 def ulog_of_2020(path: Path, flight: Flight) -> Path:
@@ -170,7 +198,7 @@ def ulog_of_2020(path: Path, flight: Flight) -> Path:
     return path
 
 
-WRITERS = {
+WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
     "flight.bin": (dataflash, "ardupilot"),
     "flight.tlog": (tlog, "ardupilot"),
     "flight.ulg": (ulog, "px4"),
@@ -213,6 +241,136 @@ def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: P
     assert not bag.exists()
     assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
+
+
+@pytest.mark.parametrize("servo_reversed", [0.0, 1.0])
+@pytest.mark.parametrize("stick_reversed", [0.0, 1.0])
+def test_servos_give_u_of_the_stick_that_moved_them(
+    stick_reversed: float, servo_reversed: float, flight: Flight, tmp_path: Path
+) -> None:
+    """With RC2_REVERSED a larger pulse is nose down, and so it is in the map of such an aircraft. u follows the pulse."""
+    content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
+    content["inputs"]["elevator"]["positive"] = "nose down" if stick_reversed else "nose up"
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+    parameters = {**PARAMETERS, "RC2_REVERSED": stick_reversed, "SERVO2_REVERSED": servo_reversed}
+    path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters), tmp_path / "bag"
+    command = ["import", str(path), "--map", str(tmp_path / "map.yaml"), "--servos", "--output", str(bag)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    tape = read_run(bag).tape
+    assert tape["u"].names == INPUTS
+    assert np.abs(tape["u"].values - flight.u).max() <= 1e-6
+
+
+@pytest.mark.parametrize("option", [[], ["--servos"]], ids=["sticks", "servos"])
+def test_log_whose_parameters_differ_from_the_map_is_refused(option: list[str], flight: Flight, tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"RC2_REVERSED": 1.0, "RC1_MIN": 1100.0})
+    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag"), *option]
+    sentence = "the log: found RC2_REVERSED 1, RC1_MIN 1100, expected RC2_REVERSED 0, RC1_MIN 1000 as in the map ardupilot:"
+    assert str(CliRunner().invoke(app, command).exception).startswith(sentence)
+    assert not (tmp_path / "bag").exists()
+
+
+def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(flight: Flight, tmp_path: Path) -> None:
+    command = ["--map", "ardupilot_mavlink", "--output", str(tmp_path / "bag")]
+    reversed_ = tlog(tmp_path / "reversed.tlog", flight, {"RC2_REVERSED": 1.0})
+    refused = CliRunner().invoke(app, ["import", str(reversed_), *command])
+    assert "found RC2_REVERSED 1, expected RC2_REVERSED 0 as in the map ardupilot_mavlink" in str(refused.exception)
+    path = tlog(tmp_path / "flight.tlog", flight, {name: value for name, value in PARAMETERS.items() if name != "RC4_TRIM"})
+    result = CliRunner().invoke(app, ["import", str(path), *command])
+    assert result.exit_code == 0
+    assert "warning: the log has no RC4_TRIM before the samples: compare the map with them yourself" in result.stderr
+
+
+def test_parameters_of_the_samples_count_and_not_the_last_ones(
+    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A servo that was reversed in flight and is not after it, as on an aircraft that is built otherwise on the ground."""
+    bag, end = tmp_path / "bag", flight.stamp_us[-1]
+    changes = [(end + 20_000_000, "SERVO2_REVERSED", 0.0), (end + 20_000_000, "RC2_MIN", 1100.0)]
+    path = dataflash(tmp_path / "flight.bin", flight, mode=11, changes=changes)
+    result = CliRunner().invoke(app, ["import", str(path), "--map", "ardupilot", "--servos", "--output", str(bag)])
+    assert result.exit_code == 0, result.output
+    assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
+    sentence = "SERVO2_REVERSED changes from 1 to 0 at 70.0 s of the log, after the samples: signs and effects are those of 1"
+    assert f"warning: {sentence}" in result.stderr
+    assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
+    warn_of_lacks_in(bag, None)  # of check-signs and identify
+    assert sentence in capsys.readouterr().err
+
+
+def test_change_between_the_samples_is_refused_and_left_out_by_the_window(flight: Flight, tmp_path: Path) -> None:
+    bag, half = tmp_path / "bag", flight.stamp_us[len(flight.stamp_us) // 2]
+    path = dataflash(tmp_path / "flight.bin", flight, changes=[(half, "SERVO2_REVERSED", 0.0)])
+    command = ["import", str(path), "--map", "ardupilot", "--output", str(bag)]
+    assert str(CliRunner().invoke(app, command).exception) == (
+        "the log: found SERVO2_REVERSED changes from 1 to 0 at 30.0 s of the log, expected no change between the samples: leave"
+        " it out by --from and --until"
+    )
+    assert CliRunner().invoke(app, [*command, "--from", "11", "--until", "29"]).exit_code == 0
+    with_servos = ["import", str(path), "--map", "ardupilot", "--servos", "--from", "31", "--output", str(tmp_path / "later")]
+    assert CliRunner().invoke(app, with_servos).exit_code == 0
+    u = read_run(tmp_path / "later").tape["u"]["elevator"]
+    assert np.abs(u + flight.u[-len(u) :, 0]).max() <= 1e-6  # the pulses have not changed, their meaning has
+
+
+def test_servo_without_its_parameters_is_refused(flight: Flight, tmp_path: Path) -> None:
+    parameters = {name: value for name, value in PARAMETERS.items() if name not in {"SERVO2_REVERSED", "SERVO2_TRIM"}}
+    path = dataflash(tmp_path / "flight.bin", flight, parameters=parameters)
+    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag")]
+    refused = str(CliRunner().invoke(app, [*command, "--servos"]).exception)
+    assert refused.startswith("inputs.elevator: found no SERVO2_TRIM, SERVO2_REVERSED in the log before the samples")
+    assert CliRunner().invoke(app, command).exit_code == 0  # the sticks need none of them
+
+
+def test_parameters_are_those_of_the_longest_part(flight: Flight, tmp_path: Path) -> None:
+    """Before the flight the autopilot started once more, with RC2 reversed: with a clock of its own."""
+    short = dataflash(
+        tmp_path / "short.bin",
+        Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200]),
+        parameters={**PARAMETERS, "RC2_REVERSED": 1.0},
+    )
+    whole = dataflash(tmp_path / "whole.bin", flight)
+    (tmp_path / "both.bin").write_bytes(short.read_bytes() + whole.read_bytes())
+    assert read_vehicle_log(tmp_path / "both.bin").parameters == read_vehicle_log(whole).parameters
+
+
+def test_change_of_a_parameter_in_a_ulog_is_told(flight: Flight, tmp_path: Path) -> None:
+    after = [(flight.stamp_us[-1], "PWM_MAIN_REV", 0.0)]
+    half = [(flight.stamp_us[len(flight.stamp_us) // 2], "PWM_MAIN_REV", 0.0)]
+    command = ["--map", "px4", "--until", "39", "--output", str(tmp_path / "bag")]
+    refused = CliRunner().invoke(app, ["import", str(ulog(tmp_path / "half.ulg", flight, half, PWM_MAIN_REV=2.0)), *command])
+    assert "found PWM_MAIN_REV changes from 2 to 0 at 20.0 s of the log" in str(refused.exception)
+    result = CliRunner().invoke(app, ["import", str(ulog(tmp_path / "after.ulg", flight, after, PWM_MAIN_REV=2.0)), *command])
+    assert "PWM_MAIN_REV changes from 2 to 0 at 40.0 s of the log, after the samples" in result.stderr
+    parameters = yaml.safe_load((tmp_path / "bag" / "vehicle_parameters.yaml").read_text(encoding="utf-8"))
+    assert parameters == {"FW_AIRSPD_TRIM": 25.0, "PWM_MAIN_REV": 2.0}
+
+
+def test_log_without_the_mode_is_not_taken_for_manual(flight: Flight, tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight)
+    path.write_bytes(path.read_bytes().replace(b"MODE", b"XODE", 1))
+    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag")]
+    assert "the log: found no message with the mode, expected" in str(CliRunner().invoke(app, command).exception)
+    assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
+
+
+def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, tmp_path: Path) -> None:
+    """The bag has the u of the map of the import: signs and effects by another map would be those of another u."""
+    bag = tmp_path / "bag"
+    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
+    content["inputs"]["elevator"]["trim"] = 0.01  # measured at each engagement
+    require_map_of_import(ChannelMap.validate_mapping(content, "map"), read_run(bag))
+    identify = ["--log", str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
+    for key, value in (("sign", -1), ("scale", 0.4), ("positive", "nose down")):
+        path, inputs = tmp_path / f"{key}.yaml", content["inputs"]
+        inputs_by_another = inputs | {"elevator": inputs["elevator"] | {key: value}}
+        path.write_text(yaml.safe_dump(content | {"inputs": inputs_by_another}, sort_keys=False), encoding="utf-8")
+        for arguments in (["check-signs", str(path), "--bag", str(bag)], ["identify", "--bridge", str(path), *identify]):
+            refused = str(CliRunner().invoke(app, arguments).exception)
+            assert f"found inputs.elevator.{key} " in refused
+            assert refused.endswith(f"expected {value}, that of the map ardupilot: import the log again, with --map")
 
 
 def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(flight: Flight, tmp_path: Path) -> None:
@@ -310,12 +468,18 @@ def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path)
 
 
 def test_tlog_of_two_autopilots_is_that_of_the_first_and_says_so(flight: Flight, tmp_path: Path) -> None:
-    first = tlog(tmp_path / "one.tlog", flight).read_bytes()
-    write_tlog(tmp_path / "other.tlog", [(EPOCH, mavlink.MAVLink_heartbeat_message(1, 3, 128, 0, 4, 3))], system=7)
-    (tmp_path / "both.tlog").write_bytes(first + (tmp_path / "other.tlog").read_bytes())
+    """The second one flies too: its rates are the opposite, half a sample later, and its RC2 is reversed."""
+    later = Flight([stamp + 10_000 for stamp in flight.stamp_us], -flight.y, -flight.u)
+    first = tlog(tmp_path / "one.tlog", flight, {"RC2_REVERSED": 0.0}).read_bytes()
+    second = tlog(tmp_path / "other.tlog", later, {"RC2_REVERSED": 1.0}, system=7).read_bytes()
+    (tmp_path / "both.tlog").write_bytes(in_order(first + second))
     both, one = (read_vehicle_log(tmp_path / name) for name in ("both.tlog", "one.tlog"))
     assert both.kind == "a tlog of MAVLink, system 1 alone; it also has 7"
-    np.testing.assert_array_equal(both.tables["ATTITUDE"].stamp_ns, one.tables["ATTITUDE"].stamp_ns)
+    for name, table in one.tables.items():
+        np.testing.assert_array_equal(both.tables[name].stamp_ns, table.stamp_ns)
+        for field, values in table.fields.items():
+            np.testing.assert_array_equal(both.tables[name].fields[field], values)
+    assert both.parameters == one.parameters
 
 
 def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path: Path) -> None:

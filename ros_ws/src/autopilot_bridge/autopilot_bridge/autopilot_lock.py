@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lock of a MAVLink link to one autopilot, by the address of its packets and by the time since boot in its messages."""
+"""Lock of a MAVLink link to the first autopilot, by the address of the packets and the time since boot in the messages."""
 
 from flight_core.publisher_lock import SENDER, PublisherLock
 from flight_core.rates import NANOSECONDS
@@ -10,11 +10,11 @@ CLOCK_TOLERANCE_NS = NANOSECONDS  # autopilots that were switched on within it a
 
 
 class AutopilotLock:
-    """Locks to the autopilot that is heard first, until it is silent; then to the next one, as a topic to its publisher.
+    """Locks to the first autopilot until silence, then to the next autopilot, as a topic to a publisher.
 
-    Two autopilots behind one address differ by the time since boot in their messages. The time of one autopilot never goes back
-    and does not advance by more than the time that passes here; a message may come late. An autopilot that has started again
-    is another one until messages of the start before have been missing for the same silence.
+    Two autopilots behind the same address differ by the time since boot in their messages. The time since boot of an autopilot
+    never goes back, and advances by the time that passes here at most. A message may come late. An autopilot after a new start
+    is a second sender until messages of the start before have been missing for the same silence.
     """
 
     def __init__(self, silence_ns: int) -> None:
@@ -28,16 +28,16 @@ class AutopilotLock:
 
     @property
     def address(self) -> str | None:
-        """The address of the autopilot; None where none has been heard."""
+        """The address of the autopilot; None before the first message."""
         return self._addresses.publisher
 
     def overran(self, duration_ns: int) -> None:
-        """Leave a time out of the silences: the receiver itself did not run."""
+        """Leave a time out of the silences: the receiver did not run."""
         self._addresses.overran(duration_ns)
         self._starts.overran(duration_ns)
 
     def check(self, address: str, since_boot_ns: int | None, now_ns: int) -> None:
-        """Raise ChannelError, reason "sender", for a message of a second autopilot before the first one is silent.
+        """Raise ChannelError, reason "sender", for a message of a second sender before the silence of the first.
 
         `since_boot_ns` is None for a message without the time since boot.
         """
@@ -55,7 +55,7 @@ class AutopilotLock:
             raise ChannelError(SENDER, sentence) from None
 
     def refresh(self, address: str, since_boot_ns: int | None, now_ns: int) -> bool:
-        """Lock to the sender of a message that `check` let pass. Returns whether it is another one, or has started again."""
+        """Lock to the sender of a message after `check`. Returns whether the sender is new, or has started again."""
         changed = self._addresses.refresh(address, now_ns)
         if changed:
             self._starts = self._new_lock()
@@ -70,7 +70,7 @@ class AutopilotLock:
         return changed
 
     def _start(self, since_boot_ns: int, now_ns: int) -> str:
-        """The start of a time since boot, by its instant: the locked start where the time continues that one's."""
+        """The name of the start to which a time since boot belongs: the locked start, or a new name by the instant of boot."""
         boot_ns = now_ns - since_boot_ns
         advances = since_boot_ns >= self._newest_ns - CLOCK_TOLERANCE_NS and boot_ns >= self._boot_ns - CLOCK_TOLERANCE_NS
         return self._starts.publisher if self._starts.publisher is not None and advances else str(boot_ns)

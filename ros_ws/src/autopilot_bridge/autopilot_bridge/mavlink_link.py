@@ -90,7 +90,7 @@ def _zero(kind: str) -> Any:
 class Link:
     """A connection. `start` begins to receive; `problem` and `conflict` are sentences, empty where there is none.
 
-    The autopilot is the sender that `AutopilotLock` holds. Its messages alone are taken, and over UDP it alone gets messages.
+    Messages of the sender in `AutopilotLock` alone are taken, and over UDP no other address gets messages.
     `parameters` are names of parameters of the autopilot that are read.
 
     With a passphrase each message is signed, and messages without a valid signature are refused. Source: MAVLink guide, message
@@ -146,7 +146,7 @@ class Link:
 
     @property
     def conflict(self) -> str:
-        """Who else sends as the autopilot or as the bridge, or a setting that excludes an engagement."""
+        """Who else sends as the autopilot or as the bridge, or a setting without which no engagement works."""
         second = self._second if time.monotonic() - self._second_at <= SILENCE else ""
         return "; ".join(filter(None, (self._clash, second)))
 
@@ -236,7 +236,7 @@ class Link:
                 self._take(message, address, received_ns)
 
     def _packet(self) -> tuple[bytes, Address]:
-        """The next bytes, empty where none come within POLL, and their sender: of TCP and of a serial line there is one."""
+        """The next bytes, empty after a silence of POLL, and their sender: over TCP and a serial line the URL."""
         if not self._connection.select(POLL):
             return b"", ()
         if self._is_udp:
@@ -245,7 +245,7 @@ class Link:
         return self._connection.recv(self._parser.bytes_needed()), (self._config.url,)
 
     def _parsed(self, data: bytes, address: Address) -> Sequence[Any]:
-        """The messages of a packet. A message that goes on in the next packet is read from the autopilot alone."""
+        """The messages of a packet. Messages in several packets are read from the locked sender alone."""
         if not self._is_udp or _text(address) == self._lock.address:
             return self._parser.parse_buffer(data) or ()
         # A copy: a forged signature with a late time would make each later one of the autopilot count as replayed.
@@ -288,7 +288,7 @@ class Link:
             queue.append(ReceivedMessage(message, received_ns))
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
-        """Whether a message with the number of the autopilot is from the locked sender; rates are requested from a new one."""
+        """Whether a message of the autopilot is from the locked sender. Rates are requested from a new sender."""
         sender, before, now_ns = _text(address), self._lock.address, nanoseconds(now)
         milliseconds = getattr(message, "time_boot_ms", None) if message.get_type() in self._queues else None
         since_boot_ns = None if milliseconds is None else 1_000_000 * milliseconds

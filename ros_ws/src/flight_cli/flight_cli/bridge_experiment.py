@@ -30,7 +30,7 @@ from flight_analysis.design.bridge_identification import (
     require_envelope,
     within_range,
 )
-from flight_analysis.design.log_import import COMMANDS, median_trims
+from flight_analysis.design.log_import import COMMANDS, median_trims, require_map_of_import
 from flight_analysis.design.open_loop_fit import FASTEST_ZERO, ChannelModel
 from flight_analysis.design.requirement import Requirement
 from flight_analysis.design.response_identification import Response, identify_response
@@ -67,7 +67,7 @@ def identify_behind_bridge(
     if log is None:
         require_envelope(channel_map)
     run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
-    tape, spans, ended = _engaged(run)
+    tape, spans, ended = _engaged(run, channel_map)
     try:
         trims, response, found = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
@@ -159,7 +159,7 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
     )
 
 
-def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]], str]:
+def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
     """The tape of an experiment, its engaged spans, ns, and a sentence on how the bridge cut it short, empty for a whole one.
 
     The span of a flight that `rise-di import` took from another log is all of it.
@@ -169,6 +169,7 @@ def _engaged(run: Path) -> tuple[Tape, list[tuple[int, int]], str]:
     warn_of_lacks(recorded)
     tape, flown = recorded.tape, recorded.engagements
     if COMMANDS in tape:
+        require_map_of_import(channel_map, recorded)
         recorded.require("y", "u")
         return tape, [(int(tape["u"].stamp_ns[0]), int(tape["u"].stamp_ns[-1]))], ""
     parameters = None if recorded.scenario is None else recorded_parameters(recorded.scenario)

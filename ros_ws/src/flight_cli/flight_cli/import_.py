@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a bag of y, u and pose from the log of an autopilot."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -10,18 +11,16 @@ import typer
 from rich.console import Console
 
 from autopilot_bridge.params import UNITS, find_map, load_map
-from flight_analysis.design.log_import import Window, imported
+from flight_analysis.design.log_import import PARAMETERS, Window, imported
 from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table, options
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
-from flight_log.bag import CHANNEL_UNITS, IMPORTED, LogAttachments
+from flight_log.bag import CHANNEL_UNITS, COMPARED, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
 from flight_log.tape_writer import write_run
 from flight_log.vehicle_log import read_foreign_log
-
-PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
 
 
 def import_(
@@ -46,18 +45,20 @@ def import_(
             require(value is None or value >= 0.0, name, value, "0 s or more")
     channel_map = load_map(map_name)
     read = read_foreign_log(log)
-    tape = imported(channel_map, read, Window(start, stop), servos=servos)
+    tape, parameters, notes = imported(channel_map, read, Window(start, stop), servos=servos)
     folder = output or Path("runs") / log.stem
     require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
     with writing("--output", folder, "a folder that can"):
         folder.mkdir(parents=True)
-        write_file(folder / PARAMETERS, dump_yaml(dict(sorted(read.parameters.items())), flow=False))
+        write_file(folder / PARAMETERS, dump_yaml(dict(sorted(parameters.items())), flow=False))
         records = {
-            IMPORTED: {"log": log.name, "kind": read.kind, "map": channel_map.name},
+            IMPORTED: {"log": log.name, "kind": read.kind, "map": channel_map.name, COMPARED: "; ".join(notes)},
             CHANNEL_UNITS: {name: UNITS[row.motion[0]] for name, row in channel_map.outputs.items()},
         }
         write_file(folder / PROVENANCE, dump_yaml(provenance() | records, flow=False))
     bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE))
+    for sentence in notes:
+        print(f"warning: {sentence}", file=sys.stderr)
     table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left=("topic",))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS

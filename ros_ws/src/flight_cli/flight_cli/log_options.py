@@ -12,6 +12,7 @@ import typer
 from flight_analysis.report.run_folder import log_account
 from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
+from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
 
 LogNamespace = Annotated[str | None, typer.Option("--namespace", help="Namespace of the aircraft, if the log holds several.")]
@@ -28,7 +29,8 @@ def scenario_file(name: str | None) -> Path | None:
 def warn_of_lacks(recorded: RecordedRun) -> None:
     """Print what a log lacks, a warning each on standard error, so that no result stands for more than was recorded."""
     of = log_account(recorded)
-    for sentence in (*recorded.tape.notes, *(() if of is None else of.notes())):
+    imported = recorded.metadata.get(IMPORTED, {}).get(COMPARED, "")
+    for sentence in (*recorded.tape.notes, *(() if of is None else of.notes()), *filter(None, [imported])):
         print(f"warning: {sentence}", file=sys.stderr)
 
 

@@ -45,6 +45,19 @@ class Table(NamedTuple):
         return np.where(places < 0, np.nan, self.fields[field][places])
 
 
+class ParameterRecord(NamedTuple):
+    """A value of a parameter of the autopilot, and the instant of the record, ns."""
+
+    stamp_ns: int
+    value: float
+
+
+Parameters = Mapping[str, tuple[ParameterRecord, ...]]
+"""The records of the parameters by name, in the order of the log."""
+
+PARAMETER = "PARM"  # a message of DataFlash; the samples of each format have their parameters by this name
+
+
 class Source(NamedTuple):
     """Where a log has a quantity: value = scale field."""
 
@@ -169,7 +182,7 @@ class VehicleLog(NamedTuple):
 
     kind: str
     tables: Mapping[str, Table]
-    parameters: Mapping[str, float]
+    parameters: Parameters
     format: Format | None
     vehicle: str = PLANE
     manual: int = 0  # the number of the mode in which the sticks of a plane are the commands: 0 of ArduPlane (mode.h)
@@ -183,6 +196,13 @@ class VehicleLog(NamedTuple):
         """The first stamp of a quantity that the log has."""
         source = self.source(quantity)
         return 0 if source is None else int(self.tables[source.message].stamp_ns[0])
+
+    def parameters_at(self, stamp_ns: int) -> dict[str, float]:
+        """The values of the parameters at an instant, without parameters whose first record comes later."""
+        known = {
+            name: [record for record in records if record.stamp_ns <= stamp_ns] for name, records in self.parameters.items()
+        }
+        return {name: records[-1].value for name, records in known.items() if records}
 
     def has(self, at: Source) -> bool:
         """Whether the log has samples of a field."""
@@ -239,25 +259,23 @@ def _read_dataflash(path: Path, kind: str) -> VehicleLog:
 
     wanted = _wanted(DATAFLASH)
     wanted.setdefault("CTUN", set()).add("E2T")
-    parameters: dict[str, float] = {}
     firmwares: dict[str, None] = {}
 
-    def samples() -> Iterator[tuple[str, int, Any]]:
+    def samples() -> Iterator[Sample]:
         stamp_us = 0.0
         reader = DFReader.DFReader_text(str(path)) if "text" in kind else DFReader.DFReader_binary(str(path))
         with closing(reader):
-            while (message := reader.recv_match(type=[*wanted, "PARM", "MSG"])) is not None:
+            while (message := reader.recv_match(type=[*wanted, PARAMETER, "MSG"])) is not None:
                 name = message.get_type()
-                if name == "PARM":
-                    parameters[message.Name] = float(message.Value)
-                elif name == "MSG":
+                if name == "MSG":
                     firmwares.update(dict.fromkeys(FIRMWARE.findall(str(message.Message))))
                 elif not (getattr(message, "I", 0) or getattr(message, "C", 0)):  # of the first sensor and of the first core
                     # Logs of 2014 and before have ms, and MODE has no time: that of the message before.
                     stamp_us = getattr(message, "TimeUS", 1e3 * getattr(message, "TimeMS", 1e-3 * stamp_us))
-                    yield name, min(round(1e3 * stamp_us), LARGEST), message
+                    content = (message.Name, float(message.Value)) if name == PARAMETER else message
+                    yield name, min(round(1e3 * stamp_us), LARGEST), content
 
-    tables, parts = _tables(samples(), wanted)
+    tables, parameters, parts = _tables(samples(), wanted)
     _true_airspeed(tables)
     vehicle = FIRMWARES[next(iter(firmwares), "Plane")]
     if (attitude := tables.get("ATT")) is not None:
@@ -281,10 +299,9 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
     from pymavlink import mavutil  # noqa: PLC0415 - an extra
 
     wanted = _wanted(TLOG)
-    parameters: dict[str, float] = {}
     autopilots: dict[int, tuple[int, int]] = {}  # MAV_AUTOPILOT and MAV_TYPE of systems in the order of their heartbeats
 
-    def samples() -> Iterator[tuple[str, int, Any]]:
+    def samples() -> Iterator[Sample]:
         mavutil.set_dialect("ardupilotmega")
         with closing(mavutil.mavlogfile(str(path))) as reader:  # by its content, not by its name
             while (message := reader.recv_match(type=[*wanted, "PARAM_VALUE"])) is not None:
@@ -295,12 +312,13 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
                     autopilots.setdefault(message.get_srcSystem(), (message.autopilot, message.type))
                 if message.get_srcSystem() != next(iter(autopilots), None):
                     continue
+                stamp_ns = min(round(NANOSECONDS * message._timestamp), LARGEST)
                 if name == "PARAM_VALUE":
-                    parameters[message.param_id] = float(message.param_value)
+                    yield PARAMETER, stamp_ns, (message.param_id, float(message.param_value))
                 else:
-                    yield name, min(round(NANOSECONDS * message._timestamp), LARGEST), message
+                    yield name, stamp_ns, message
 
-    tables, parts = _tables(samples(), wanted)
+    tables, parameters, parts = _tables(samples(), wanted)
     first, *others = map(str, autopilots) if autopilots else ("none",)
     left_out = f", system {first} alone; it also has {', '.join(others)}" if others else ""
     autopilot, mav_type = next(iter(autopilots.values()), (0, 1))
@@ -338,10 +356,13 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
             "psi": np.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z),
         }
         tables["vehicle_attitude"] = Table(attitude.stamp_ns, {**attitude.fields, **angles})
-    parameters = {
-        name: float(value) for name, value in log.initial_parameters.items() if _is_number(value)
-    }  # else it is damaged
-    return VehicleLog(kind, tables, parameters, None)
+    initial = [(0, name, value) for name, value in log.initial_parameters.items()]
+    records = [
+        (PARAMETER, 1000 * stamp_us, (name, float(value)))
+        for stamp_us, name, value in (*initial, *log.changed_parameters)
+        if _is_number(value)  # else it is damaged
+    ]
+    return VehicleLog(kind, tables, _parameters(records), None)
 
 
 def _wanted(of: Format) -> dict[str, set[str]]:
@@ -355,31 +376,54 @@ def _wanted(of: Format) -> dict[str, set[str]]:
     return wanted
 
 
-def _tables(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> tuple[dict[str, Table], str]:
-    """Tables of messages: name, stamp in ns, message; and a note. A field that its first message lacks is absent.
+Sample = tuple[str, int, Any]
+"""Name, stamp in ns and content of a message; the content of a PARAMETER is a name and a value."""
+
+
+def _tables(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tuple[dict[str, Table], Parameters, str]:
+    """Tables of messages, parameters, and a note. A field that its first message lacks is absent.
 
     Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the longest part counts alone. A
-    stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it.
+    stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it. A parameter belongs
+    to the part of the next sample: an autopilot that starts writes its parameters first.
     """
-    parts, newest_ns = [list[tuple[str, int, Any]]()], 0
-    apart: list[tuple[str, int, Any]] = []  # the samples before, near each other and not near those of the part
+    parts, newest_ns = [list[Sample]()], 0
+    apart: list[Sample] = []  # the samples before, near each other and not near those of the part
+    settings = [list[Sample]()]  # by part
+    next_settings: list[Sample] = []
     for sample in samples:
+        if sample[0] == PARAMETER:
+            next_settings.append(sample)
+            continue
         if parts[-1] and abs(sample[1] - newest_ns) <= STEP_NS:
             parts[-1].append(sample)
             newest_ns, apart = max(newest_ns, sample[1]), []
-            continue
-        apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
-        if len(apart) == AGREEING:
+        else:
+            apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
+            if len(apart) < AGREEING:
+                continue
             if parts[-1] and apart[0][1] < newest_ns:
                 parts.append([])
+                settings.append([])
             parts[-1] += apart
             newest_ns, apart = max(stamp_ns for _, stamp_ns, _ in apart), []
+        settings[-1] += next_settings
+        next_settings = []
+    settings[-1] += next_settings
     note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
-    longest = max(parts, key=len) or apart
-    return _columns(longest, wanted), note
+    longest = max(range(len(parts)), key=lambda number: len(parts[number]))
+    return _columns(parts[longest] or apart, wanted), _parameters(settings[longest]), note
 
 
-def _columns(samples: Iterable[tuple[str, int, Any]], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
+def _parameters(records: Iterable[Sample]) -> Parameters:
+    """The records of each parameter, in their order."""
+    parameters: dict[str, list[ParameterRecord]] = {}
+    for _, stamp_ns, (name, value) in records:
+        parameters.setdefault(name, []).append(ParameterRecord(stamp_ns, value))
+    return {name: tuple(values) for name, values in parameters.items()}
+
+
+def _columns(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> dict[str, Table]:
     stamps: dict[str, list[int]] = {}
     columns: dict[str, dict[str, list[float]]] = {}
     for name, stamp_ns, message in samples:

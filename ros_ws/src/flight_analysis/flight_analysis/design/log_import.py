@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """y, u and pose of a channel map, from the log of an autopilot that the stack did not fly."""
 
-import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,19 +10,30 @@ from numpy.typing import NDArray
 
 from autopilot_bridge.channel_map import Line, to_channel
 from autopilot_bridge.params import ChannelMap, InputRow
+from flight_analysis.design.parameter_agreement import (
+    SAME_LINE,
+    Servo,
+    Stick,
+    changes,
+    require_agreement,
+    servo_of,
+    stick_of,
+)
+from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_log.vehicle_log import COPTER, PLANE, SERVOS, ULOG_TORQUES, Source, VehicleLog
+from flight_log.bag import COMPARED, IMPORTED
+from flight_log.tape_reader import RecordedRun
+from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
 
 COMMANDS = "commands"  # the topic with trim + u, by input
 AIRBORNE = 0.5  # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
 TYPICAL = 90.0  # percentile of either in a log, which may have more time on the ground than in the air
-CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")  # of a transmitter: Rc.msg from 0, MAVLink from 1
-FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}  # SERVOn_FUNCTION by RCMAP: aileron, elevator, throttle, rudder
 LEAST = 2.0  # s of flight that are worth a bag
-PWM = {"MIN": 1100.0, "MAX": 1900.0, "REVERSED": 0.0}  # us, defaults of ArduPilot's RCn_ and SERVOn_
+
+PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
 
 Stamps = NDArray[np.int64]
 
@@ -34,26 +45,41 @@ class Window(NamedTuple):
     stop: float | None
 
 
-def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos: bool) -> Tape:
+class Imported(NamedTuple):
+    """The tape of a log, the parameters of the autopilot at the first sample, and sentences on what stays unknown."""
+
+    tape: Tape
+    parameters: Mapping[str, float]
+    notes: tuple[str, ...]
+
+
+def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos: bool) -> Imported:
     """y, u, `commands` and the pose of a log, as the bridge would have published them.
 
     y and the pose hold the newest values at the stamps of the map's `instant` and of the first channel of the pose. u is the
     command less its median: the setpoint of the map (PX4) or of the rate controllers (ArduCopter), else the stick in MANUAL, or
     with `servos` the servo's position, scaled as the stick. Without a window the longest stretch in the air is taken, for
-    sticks in MANUAL. Raises ParameterError for a channel that the log does not have, for another vehicle, and without such a
-    stretch.
+    sticks in MANUAL. Raises ParameterError for a channel that the log does not have, for another vehicle, without such a
+    stretch, and for parameters of the log that differ from the map or change between the samples.
     """
     require(log.vehicle in {PLANE, COPTER}, "the log", f"one of a {log.vehicle}", "one of a plane or a multicopter")
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
-    readers = {name: _commands(channel_map, log, name, servos) for name in channel_map.inputs}
     speed = next((log.at(sources[name], stamps) for name, row in rows.items() if row.motion[0] == "V"), None)
     if speed is None:  # a multicopter: its thrust
         lifts = {name: row.motion[1] for name, row in channel_map.inputs.items() if row.motion[0] == "climb"}
-        speed = next((sign * readers[name].at(stamps) for name, sign in lifts.items()), None)
-    needs_manual = log.format is not None and not servos and log.vehicle == PLANE
-    first, last = _flight(log, stamps, speed, window, needs_manual=needs_manual)
+        speed = next((sign * _commands(channel_map, log, name, servos, {}).at(stamps) for name, sign in lifts.items()), None)
+    has_sticks = log.format is not None and log.vehicle == PLANE
+    first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
+    parameters = log.parameters_at(first)
+    notes = changes(log.parameters, int(stamps[0]), first, last)
+    try:
+        readers = {name: _commands(channel_map, log, name, servos, parameters) for name in channel_map.inputs}
+        sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
+        notes.append(require_agreement(channel_map.name, sticks, log.parameters, parameters))
+    except ParameterError as error:
+        raise ParameterError("; ".join([str(error), *notes])) from None
     y_stamps = stamps[(stamps >= first) & (stamps <= last)]
     y = np.column_stack([row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()])
     y_stamps, y = _complete(y_stamps, y)
@@ -71,7 +97,7 @@ def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos
     }
     if (pose := _pose(channel_map, log, first, last)) is not None:
         signals["pose"] = pose
-    return Tape(signals, int(y_stamps[0]))
+    return Imported(Tape(signals, int(y_stamps[0])), parameters, tuple(filter(None, notes)))
 
 
 def median_trims(commands: Signal) -> dict[str, float]:
@@ -95,25 +121,28 @@ def _messages(log: VehicleLog, quantity: str) -> str:
 
 
 class _Reader(NamedTuple):
-    """The command of an input: SI = line(before(scale field))."""
+    """The command of an input: SI = line(raw). The raw value of the map's field comes from the pulse of a stick or a servo."""
 
     log: VehicleLog
     source: Source
-    before: Line  # from the log's value to that of the field of the map
     line: Line
+    stick: Stick | None = None
+    servo: Servo | None = None
 
     @property
     def stamp_ns(self) -> Stamps:
         return self.log.tables[self.source.message].stamp_ns
 
     def at(self, stamp_ns: Stamps) -> FloatArray:
-        raw = self.log.at(self.source, stamp_ns)
-        return np.array([to_channel(to_channel(value, self.before), self.line) for value in raw.tolist()])
+        values = self.log.at(self.source, stamp_ns)
+        if self.stick is not None and self.servo is not None:
+            values = self.stick.raw(self.servo.deflection(values, self.stick))
+        before = self.stick.trim_line if self.stick is not None and self.servo is None else SAME_LINE
+        return np.array([to_channel(to_channel(value, before), self.line) for value in values.tolist()])
 
 
-def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool) -> _Reader:
+def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool, parameters: Mapping[str, float]) -> _Reader:
     row = channel_map.inputs[name]
-    same = Line(1, 1.0, 0.0)
     if log.format is None:
         topic = channel_map.messages[row.message].topic.rpartition("/")[2]
         source = Source(topic, row.field)
@@ -121,26 +150,20 @@ def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool)
         source = source if log.has(source) or not log.has(before_1_14) else before_1_14
         require(log.has(source), f"inputs.{name}", f"no {topic}.{row.field} in the log", "it: the map and the log fit together")
         require(not servos, "--servos", "a ULog", "none: its setpoints of torque and thrust are the commands")
-        return _Reader(log, source, same, row.line)
+        return _Reader(log, source, row.line)
     if log.vehicle == COPTER:
         return _torque(log, name, row, servos)
-    trim = channel_map.trims.get(name)
-    match = CHANNEL.fullmatch(row.field if trim is None else trim.field)
-    if match is None:
-        raise ParameterError(
-            f"trims.{name}: found none with a channel of the transmitter, expected a field such as channels[1]"
-        )
-    number = int(match[1]) + 1 if match[1] else int(match[2])
-    before = same if trim is None else trim.line
-    if servos:
-        source, scaled = _servo(log, number, name)
-        # sign scale (us of the servo) + offset are us of the stick
-        before = Line(before.sign * scaled.sign, before.scale * scaled.scale, to_channel(scaled.offset, before))
-        return _Reader(log, source, before, row.line)
-    source = Source(log.format.sticks.message, log.format.sticks.field.format(number))
-    expected = "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
+    stick = stick_of(channel_map, name)
+    servo = servo_of(stick, name, parameters) if servos else None
+    place, number = (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
+    source = Source(place.message, place.field.format(number))
+    expected = (
+        "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
+        if servo is None
+        else "its pulses"
+    )
     require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", expected)
-    return _Reader(log, source, before, row.line)
+    return _Reader(log, source, row.line, stick, servo)
 
 
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
@@ -151,31 +174,7 @@ def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
         expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
         raise ParameterError(f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected {expected}")
     require(not servos, "--servos", "a multicopter", "none: the outputs of its rate controllers are the commands")
-    return _Reader(log, source, Line(1, 1.0, 0.0), Line(1 if sign > 0 else -1, row.scale, 0.0))
-
-
-def _servo(log: VehicleLog, number: int, name: str) -> tuple[Source, Line]:
-    """The servo that a channel of the transmitter moves, and the stick's pulse by the servo's: both from end to end."""
-    parameters = log.parameters
-    by_number = {round(parameters.get(f"RCMAP_{key}", default)): key for default, key in enumerate(FUNCTIONS, start=1)}
-    require(number in by_number, f"inputs.{name}", f"channel {number}", "one of RCMAP_ROLL, PITCH, THROTTLE and YAW")
-    function = FUNCTIONS[by_number[number]]
-    servos = [n for n in range(1, SERVOS + 1) if parameters.get(f"SERVO{n}_FUNCTION") == function]
-    if log.format is None or not servos:
-        raise ParameterError(
-            f"inputs.{name}: found no servo with SERVOn_FUNCTION {function} in the log, expected one, or the sticks in MANUAL"
-        )
-    source = Source(log.format.servos.message, log.format.servos.field.format(servos[0]))
-    require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", "the servo's pulses")
-    ends = {
-        at: [parameters.get(f"{at}_{key}", PWM[key]) for key in ("MIN", "MAX")] for at in (f"SERVO{servos[0]}", f"RC{number}")
-    }
-    (low, high), (stick_low, stick_high) = ends.values()
-    require(low < high, f"SERVO{servos[0]}_MIN", low, f"less than its MAX, {high:g}")
-    reversed_ = [parameters.get(f"{at}_REVERSED", 0.0) == 1.0 for at in ends]
-    sign = -1 if reversed_[0] != reversed_[1] else 1
-    scale = (stick_high - stick_low) / (high - low)
-    return source, Line(sign, scale, (stick_high + stick_low) / 2 - sign * scale * (high + low) / 2)
+    return _Reader(log, source, Line(1 if sign > 0 else -1, row.scale, 0.0))
 
 
 def _flight(
@@ -196,10 +195,11 @@ def _flight(
         require(bool(np.isfinite(speed).any()), "the log", "no airspeed or thrust at the samples of y", "a flight")
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if needs_manual:
-        mode = next((at for at in log.format.mode if log.has(at)), None) if log.format is not None else None
-        if mode is not None:
-            keep &= log.at(mode, stamps) == log.manual
         expected = "it, for only there the sticks are the commands, or --servos"
+        mode = next((at for at in log.format.mode if log.has(at)), None) if log.format is not None else None
+        if mode is None:
+            raise ParameterError(f"the log: found no message with the mode, expected MANUAL in {expected}")
+        keep &= log.at(mode, stamps) == log.manual
         require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
     require(bool(keep.any()), "the log", f"no time in the air {where}", "a flight, or --from and --until")
     edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
@@ -225,3 +225,33 @@ def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Si
     stamps = stamps[(stamps >= first) & (stamps <= last)]
     values = [log.at(source, stamps) for source in sources.values()]
     return Signal(stamps, tuple(sources), np.column_stack(values)) if len(stamps) else None
+
+
+def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
+    """Raise ParameterError for an imported log whose u is not by the map, but by rows of another map or an earlier version."""
+    source = recorded.metadata.get(IMPORTED)
+    if source is None:
+        return
+    key, again = str(recorded.path or "the log"), f"that of the map {channel_map.name}: import the log again, with --map"
+    require(COMPARED in source, key, "a log of an earlier version, which did not compare its parameters with the map", again)
+    maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
+    require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")
+    content = parse_yaml(maps[0], key, "a channel map")
+    before = _rows_of_import(ChannelMap.validate_mapping(content, key))
+    for name, value in _rows_of_import(channel_map).items():
+        require(before.get(name) == value, key, f"{name} {before.get(name)} of the map of the import", f"{value}, {again}")
+
+
+def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
+    """What an import takes of a map, by key."""
+    keys = {
+        "outputs": {"positive", "sign"},
+        "inputs": {"field", "positive", "sign", "scale", "offset", "range"},
+        "trims": {"field", "sign", "scale", "offset"},
+    }
+    return {
+        f"{kind}.{name}.{key}": getattr(row, key)
+        for kind, fields in keys.items()
+        for name, row in getattr(channel_map, kind).items()
+        for key in sorted(fields)
+    }

@@ -12,6 +12,7 @@ from aircraft_sim.airframe import Airframe, load_airframe
 from autopilot_bridge.params import MOTIONS, UNITS, ChannelMap, InputRow, OutputRow
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.design.log_import import require_map_of_import
 from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
 from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.tape import Signal
@@ -72,20 +73,28 @@ def check_scenario(
         require(bag is None, "bag", f"{bag} beside an allocation", "none: a flight does not show the effectors one by one")
         effect = np.reshape(controller.allocation.effect, (len(outputs), -1))
         return check_effectors(channel_map, in_map, outputs, inputs, effect)
-    measured = None if bag is None else recorded_response(bag, outputs, inputs, namespace)
+    measured = None if bag is None else recorded_response(bag, outputs, inputs, namespace, channel_map)
     return check(channel_map, in_map, outputs, inputs, controller.D, measured)
 
 
-def recorded_response(bag: Path, outputs: tuple[str, ...], inputs: tuple[str, ...], namespace: str | None = None) -> Response:
+def recorded_response(
+    bag: Path,
+    outputs: tuple[str, ...],
+    inputs: tuple[str, ...],
+    namespace: str | None = None,
+    channel_map: ChannelMap | None = None,
+) -> Response:
     """Response of the aircraft in a log, from the time of an acting u: the whole flight, or the engagements of a bridge.
 
     y_m excites the loop of a flight under a law. Without y_m, and under the law `excitation`, u itself is the excitation.
-    Raises ParameterError for a log without y and u, for a bridge without engagement, and for a flight under guidance, whose
-    y_m follows y.
+    Raises ParameterError for a log without y and u, for a bridge without engagement, for a flight under guidance, whose
+    y_m follows y, and for a log whose import had other rows than `channel_map`.
     """
     recorded = read_run(bag, namespace)
     tape = recorded.tape
     recorded.require("y", "u")
+    if channel_map is not None:
+        require_map_of_import(channel_map, recorded)
     flown = recorded.engagements
     if flown is None:
         require("bridge/would_send" not in tape, str(bag), "no engagement of its bridge", "a flight with an engaged bridge")

@@ -40,6 +40,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape, as_tape
 from flight_core.units import si_per_unit
+from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
 from rise_di_controller.linear_loop import delay_margin
 
@@ -194,7 +195,7 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
         for key, topic in (("outputs", "y"), ("inputs", "u"))
     }
     summary = empty_summary(None, IMPORT) | deviations | {"duration": of.end, "account": of.as_json()}
-    summary |= {"source": dict(source), "notes": [*of.notes(), *tape.notes]}
+    summary |= {"source": dict(source), "notes": [*filter(None, [source.get(COMPARED)]), *of.notes(), *tape.notes]}
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 

@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The parameters of ArduPilot in a log, against what a channel map says of the transmitter.
+
+Sources: ArduPilot, RC_Channel.cpp and SRV_Channel.cpp (ends, trim, reversal), RCMapper.cpp, SRV_Channel.h (functions of
+servos); ArduPlane, mode_fbwa.cpp (high is roll right, nose up, more thrust, nose right where RCn_REVERSED is 0).
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from autopilot_bridge.channel_map import Line, to_raw
+from autopilot_bridge.params import MOTIONS, ChannelMap
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import seconds
+from flight_core.vectors import FloatArray
+from flight_log.vehicle_log import SERVOS, Parameters
+
+CHANNEL = re.compile(r"channels\[(\d+)\]|chan(\d+)_raw")  # of a transmitter: Rc.msg from 0, MAVLink from 1
+AXES: Mapping[str, str] = {"p": "ROLL", "q": "PITCH", "V": "THROTTLE", "r": "YAW"}  # of RCMAP, by what responds
+FUNCTIONS = {"ROLL": 4, "PITCH": 19, "THROTTLE": 70, "YAW": 21}  # SERVOn_FUNCTION: aileron, elevator, throttle, rudder
+SAME_LINE = Line(1, 1.0, 0.0)
+
+END_TOLERANCE = 0.01  # of half the range: the effect differs by as much, below the standard errors of `identify`
+TRIM_TOLERANCE = 0.05  # of half the range: the effects on the two sides of the trim differ from their mean by as much
+
+DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
+"""Parameters of ArduPilot and PX4 between a command and the surface: where one changes, so does the sign or the effect."""
+
+MENDS = {  # in the map, by a part of the name of the parameter
+    "REVERSED": "change `positive` of the row of `inputs`",
+    "MIN": "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`",
+    "MAX": "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`",
+    "RCMAP": "change `field` of the rows of `inputs` and `trims`",
+}
+
+
+class Stick(NamedTuple):
+    """What a map says of an input and of the transmitter's channel. `trim_line` turns the pulse, us, into the raw value."""
+
+    axis: str  # ROLL, PITCH, THROTTLE or YAW
+    channel: int  # from 1
+    trim_line: Line
+    raw_range: tuple[float, float]
+    raw_sign: int  # +1 where an increasing raw value is roll right, nose up, more thrust, nose right
+
+    @property
+    def is_centred(self) -> bool:
+        """Whether ArduPilot measures the channel from the trim, and not from the lower end."""
+        return self.axis != "THROTTLE"
+
+    def parameters(self) -> dict[str, tuple[float, float]]:
+        """The parameters with which ArduPilot agrees with the map: value and tolerance by name."""
+        low, high = sorted(to_raw(raw, self.trim_line) for raw in self.raw_range)
+        half = (high - low) / 2.0
+        name = f"RC{self.channel}"
+        ends = {f"{name}_MIN": (low, END_TOLERANCE * half), f"{name}_MAX": (high, END_TOLERANCE * half)}
+        trim = {f"{name}_TRIM": (low + half, TRIM_TOLERANCE * half)} if self.is_centred else {}
+        is_reversed = self.raw_sign * self.trim_line.sign < 0
+        return (
+            {f"RCMAP_{self.axis}": (float(self.channel), 0.0)} | ends | trim | {f"{name}_REVERSED": (float(is_reversed), 0.0)}
+        )
+
+    def raw(self, deflection: FloatArray) -> FloatArray:
+        """The raw value of a part of full deflection: -1 to 1 about the middle, for a throttle 0 to 1 from the lower end."""
+        low, high = self.raw_range
+        part = (1.0 + self.raw_sign * deflection) / 2.0 if self.is_centred else deflection
+        return low + (high - low) * (part if self.is_centred or self.raw_sign > 0 else 1.0 - part)
+
+
+def stick_of(channel_map: ChannelMap, name: str) -> Stick:
+    """What a map says of the channel of an input. Raises ParameterError for an input without a channel."""
+    row, trim = channel_map.inputs[name], channel_map.trims.get(name)
+    match = CHANNEL.fullmatch(row.field if trim is None else trim.field)
+    if match is None:
+        expected = "a field such as channels[1]"
+        raise ParameterError(f"trims.{name}: found none with a channel of the transmitter, expected {expected}")
+    responds, raw_sign = MOTIONS[row.positive]
+    motions = "a motion of roll, pitch, yaw or thrust: the log is of a plane"
+    require(responds in AXES, f"inputs.{name}.positive", f"{row.positive!r}", motions)
+    channel = int(match[1]) + 1 if match[1] else int(match[2])
+    return Stick(AXES[responds], channel, SAME_LINE if trim is None else trim.line, row.range, raw_sign)
+
+
+class Servo(NamedTuple):
+    """A servo of ArduPilot: output from 1, ends and trim, us."""
+
+    output: int
+    low: float
+    trim: float
+    high: float
+    is_reversed: bool
+
+    def deflection(self, pulse: FloatArray, stick: Stick) -> FloatArray:
+        """The part of full deflection at a pulse, us: -1 to 1, for a throttle 0 to 1."""
+        if not stick.is_centred:
+            part = (pulse - self.low) / (self.high - self.low)
+            return 1.0 - part if self.is_reversed else part
+        side = np.where(pulse > self.trim, self.high - self.trim, self.trim - self.low)
+        return (-1.0 if self.is_reversed else 1.0) * (pulse - self.trim) / side
+
+
+def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
+    """The first servo with the function of an input. `values`: the parameters at the samples. Raises ParameterError."""
+    function = FUNCTIONS[stick.axis]
+    outputs = [number for number in range(1, SERVOS + 1) if values.get(f"SERVO{number}_FUNCTION") == function]
+    sticks_instead = "or the sticks in MANUAL, without --servos"
+    if not outputs:
+        found = f"found no servo with SERVOn_FUNCTION {function} in the log"
+        raise ParameterError(f"inputs.{name}: {found}, expected one, {sticks_instead}")
+    keys = ["MIN", *(["TRIM"] if stick.is_centred else []), "MAX", "REVERSED"]
+    names = [f"SERVO{outputs[0]}_{key}" for key in keys]
+    absent = [key for key in names if key not in values]
+    require(not absent, f"inputs.{name}", f"no {', '.join(absent)} in the log before the samples", f"it, {sticks_instead}")
+    low, *trim, high, is_reversed = (values[key] for key in names)
+    ends = [low, *trim, high]
+    ascending = all(before < after for before, after in pairwise(ends))
+    require(ascending, f"SERVO{outputs[0]}_MIN, TRIM, MAX", ends, f"ascending values, {sticks_instead}")
+    require(is_reversed in {0.0, 1.0}, f"SERVO{outputs[0]}_REVERSED", f"{is_reversed:g}", "0 or 1")
+    return Servo(outputs[0], low, trim[0] if trim else low, high, is_reversed == 1.0)
+
+
+def require_agreement(name_of_map: str, sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]) -> str:
+    """The sentence on parameters without a value at the samples, empty where there is none: no default stands in.
+
+    `values` are the parameters at the samples. Raises ParameterError for parameters unlike the map's, also for values that come
+    after the samples.
+    """
+    parameters: dict[str, tuple[float, float]] = {}
+    for stick in sticks:
+        parameters |= stick.parameters()
+    known = {name: records[0].value for name, records in recorded.items()} | dict(values)
+    differing = {
+        name: value
+        for name, (value, tolerance) in parameters.items()
+        if name in known and not abs(known[name] - value) <= tolerance
+    }
+    if differing:
+        found, expected = (", ".join(f"{name} {side[name]:g}" for name in differing) for side in (known, differing))
+        mends = dict.fromkeys(mend for name in differing for end, mend in MENDS.items() if end in name.split("_"))
+        mend = ", or ".join([*mends, "set the parameter and fly again"])
+        raise ParameterError(f"the log: found {found}, expected {expected} as in the map {name_of_map}: {mend}")
+    absent = [name for name in parameters if name not in values]
+    return f"the log has no {', '.join(absent)} before the samples: compare the map with them yourself" if absent else ""
+
+
+def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:
+    """Sentences on the decisive parameters that change before or after the samples from `first_ns` to `last_ns`.
+
+    `start_ns` is the begin of the log. Raises ParameterError for a change between the samples.
+    """
+    within, outside = [], []
+    for name, records in sorted(recorded.items()):
+        for before, after in pairwise(records if DECISIVE.fullmatch(name) else ()):
+            if before.value == after.value:
+                continue
+            at = seconds(after.stamp_ns - start_ns)
+            change = f"{name} changes from {before.value:g} to {after.value:g} at {at:.1f} s of the log"
+            if first_ns < after.stamp_ns <= last_ns:
+                within.append(change)
+            else:
+                side, value = ("before", after.value) if after.stamp_ns <= first_ns else ("after", before.value)
+                outside.append(f"{change}, {side} the samples: signs and effects are those of {value:g}")
+    require(not within, "the log", "; ".join(within), "no change between the samples: leave it out by --from and --until")
+    return outside
