@@ -7,7 +7,6 @@ import json
 import re
 import struct
 from collections.abc import Callable, Mapping
-from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -173,12 +172,14 @@ def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float)
 
 def in_order(content: bytes) -> bytes:
     """The packets of a tlog in the order of their stamps: MAVLink 2, 12 bytes beside the payload, after a stamp of 8."""
-    packets, start = [], 0
+    packets: list[bytes] = []
+    start = 0
     while start < len(content):
         end = start + 8 + 12 + int(content[start + 9])
         packets.append(content[start:end])
         start = end
-    return b"".join(sorted(packets, key=itemgetter(slice(8))))
+    packets.sort(key=lambda packet: packet[:8])
+    return b"".join(packets)
 
 
 def ulog_of_2020(path: Path, flight: Flight) -> Path:
