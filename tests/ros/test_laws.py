@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Other control laws over real DDS: lockstep equal to the loop in one process and replayed, and a law that is not installed."""
+"""A control law of another package over real DDS: lockstep equal to the loop in one process, and replayed."""
 
 import os
 import shutil
@@ -26,7 +26,6 @@ from rise_di_controller import laws
 
 pytestmark = pytest.mark.package("control_laws")
 
-PEER_TOPICS = ("u", "internals")
 OPTIONS = ["--lockstep", "--one-process"]
 PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}
 
@@ -52,36 +51,25 @@ def _example(installed: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     laws._registered.cache_clear()
 
 
-def scenario_file(path: Path, controller: dict[str, Any] | None, name: str = "osprey_servo") -> Path:
-    """Two seconds of a scenario with commands and lost samples, under another controller if there is one."""
-    tree = yaml.safe_load(find_scenario(name).path.read_text(encoding="utf-8"))
+def scenario_file(path: Path, controller: dict[str, Any]) -> Path:
+    """Two seconds of a scenario with commands and lost samples, under another controller."""
+    tree = yaml.safe_load(find_scenario("osprey_servo").path.read_text(encoding="utf-8"))
     sections = {name.removeprefix("/**/"): section["ros__parameters"] for name, section in tree.items()}
     sections["flight"]["duration"] = 2.0
     sections["reference_model"]["pulses"] = PULSES
     sections["aircraft"]["sensors"]["dropout"] = 0.2
-    if controller is not None:
-        sections["controller"].clear()
-        sections["controller"].update(controller)
+    sections["controller"].clear()
+    sections["controller"].update(controller)
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return path
 
 
 @pytest.mark.usefixtures("_example")
-@pytest.mark.parametrize(
-    ("law", "options"),
-    [
-        ("pi", ["--one-process"]),
-        ("l1", ["--one-process"]),
-        ("pid", OPTIONS),
-        ("osprey_observer", ["--one-process"]),
-        ("osprey_turbulence", ["--lockstep"]),
-    ],
-)
-def test_law_flies_in_lockstep_as_without_ros_and_replayed(law: str, options: list[str], start: Start, tmp_path: Path) -> None:
-    name = "osprey_servo" if law in SECTIONS else law
-    scenario = scenario_file(tmp_path / f"{law}.yaml", SECTIONS.get(law), name)
+def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(start: Start, tmp_path: Path) -> None:
+    """In four processes and in one. tests/nodes/test_lockstep.py flies the other laws."""
+    scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     runs = []
-    for option in options:
+    for option in OPTIONS:
         start("flight_cli.cli", "fly", str(scenario), option, "--runs", option.strip("-")).succeed()
         runs.append(tmp_path / option.strip("-") / "latest")
     first = payloads(runs[0])

@@ -151,10 +151,10 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
                 for check in node.graph_checks():
                     check()
             if now_ns - advance_ns > PEER_TIMEOUT_NS:
-                _require_input(nodes, advance_ns, began)
+                require_input(nodes, advance_ns, began)
 
 
-def _require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
+def require_input(nodes: Sequence[FlightNode[Any]], advance_ns: int, began: bool) -> None:
     """Raise FlightEnded where a lockstep flight waits for ever: for a sample that was refused, or for its first one.
 
     `advance_ns`: when it last advanced. A flight that began waits for a peer that is stopped, for instance in a debugger.
