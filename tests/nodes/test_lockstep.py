@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 from tests.nodes.world import INPUTS, World, world_of
 from tests.other_laws import SECTIONS, example_installed
 from tests.recordings import scenario_file
@@ -28,6 +29,7 @@ from flight_guidance.node import GuidanceNode
 from flight_ros.event_loop import require_input
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Encoder
+from flight_ros.topics import LIVELINESS
 from reference_model.node import ReferenceModelNode
 from rise_di_controller.node import ControllerNode
 
@@ -118,3 +120,17 @@ def test_flight_that_waits_for_a_refused_sample_ends_with_the_reason(osprey_gust
         require_input([aircraft], advance_ns + 1, True)  # one that was refused before is no cause
         with pytest.raises(FlightEnded, match="timed out waiting for /u: no message in 30 s"):
             require_input([aircraft], advance_ns + 1, False)
+
+
+def test_node_names_and_passes_on_the_role_that_a_peer_reports(osprey_gust: Scenario, tmp_path: Path) -> None:
+    """A reference model reports the loss of the controller; a report of the node itself, and of no role, has no effect."""
+    with lockstep(osprey_gust, tmp_path) as (world, nodes):
+        aircraft = nodes[-1]
+        peer = world.publisher(String, "/alive/reference_model", LIVELINESS)
+        for role in ("aircraft", "autopilot"):
+            peer.publish(String(data=role))
+            aircraft.require_peers()
+        peer.publish(String(data="controller"))
+        with pytest.raises(FlightEnded, match="lost contact with controller"):
+            aircraft.require_peers()
+        assert [message.data for message in world.messages("/alive/aircraft")] == ["controller"]

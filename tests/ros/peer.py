@@ -58,21 +58,16 @@ class Peer:
     ) -> T:
         """Spin until a condition is true; what it returned. `each` is called every 5 ms."""
 
-        def spin() -> None:
+        def serve() -> None:
             self._executor.spin_once(timeout_sec=LOOK)
             if each is not None:
                 each()
 
-        return until(condition, because, spin, timeout)
+        return until(condition, because, serve, timeout)
 
     def last(self, topic: str) -> Any:
         """The newest message of a topic; None before the first."""
-        return self.received[topic][-1] if self.received[topic] else None
-
-    def spin(self, duration: float, each: Callable[[], None] | None = None) -> None:
-        """Spin for a duration in s."""
-        end = time.monotonic() + duration
-        self.until(lambda: time.monotonic() > end, timeout=duration + 5.0, each=each)
+        return next(reversed(self.received[topic]), None)
 
     def send(self, y: float = 0.0, y_m: float = 0.0) -> None:
         """Publish one sample of y and one of y_m, with equal channels, stamped now."""

@@ -7,7 +7,6 @@ import pty
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import psutil
@@ -15,7 +14,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import DEFAULT_SIGHUP, Process, Start
-from tests.ros.waiting import HANG
+from tests.ros.waiting import HANG, until
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.tape_reader import read_run
@@ -76,10 +75,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
     flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
     os.close(of_flight)
     try:
-        deadline = time.monotonic() + HANG
-        while not is_engaged(tmp_path):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        until(lambda: is_engaged(tmp_path), "a flight that has engaged")
         os.close(terminal)
         assert flight.wait(HANG) == 130
     finally:
@@ -148,8 +144,6 @@ def test_process_under_test_ends_with_process_that_runs_tests() -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True) as tests:
         assert tests.stdout is not None
         process = psutil.Process(int(tests.stdout.readline()))
-        while "timeit" not in process.cmdline()[:3]:  # until then it is setpriv
-            assert process.is_running()
-            time.sleep(0.005)
+        until(lambda: "timeit" in process.cmdline()[:3], "the program: until then it is setpriv")
         tests.kill()
         process.wait(ENDED)

@@ -14,10 +14,8 @@ from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from std_msgs.msg import String
 from tests import recordings
 from tests.ros.conftest import Process, Start
-from tests.ros.peer import Peer
 from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.scenario import load_scenario
@@ -25,7 +23,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
-from flight_ros.topics import LIVELINESS
 
 pytestmark = pytest.mark.package("flight_bringup")
 
@@ -130,25 +127,6 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
             assert time.time() - killed < 3.0 + host_delays.since(killed), role
             assert f"lost contact with {victim}" in process.output, role
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) > 100
-
-
-def test_node_names_and_passes_on_reported_role(start_node: Start, peer_node: Peer) -> None:
-    """A reference model reports the loss of the controller; a report of the aircraft itself, and of no role, has no effect."""
-    reports: list[str] = []
-    subscription = peer_node.node.create_subscription(
-        String, "alive/aircraft", lambda message: reports.append(message.data), LIVELINESS
-    )
-    publisher = peer_node.node.create_publisher(String, "alive/reference_model", LIVELINESS)
-    aircraft = start_node("aircraft_sim", "-p", "lockstep:=true", "-p", "control_rate:=100.0").wait_for("ready")
-    # an unmatched reader misses the only message of the aircraft
-    peer_node.until(lambda: publisher.get_subscription_count() == subscription.get_publisher_count() == 1)
-    for role in ("aircraft", "autopilot", "controller"):  # the QoS is reliable, and keeps the last report
-        publisher.publish(String(data=role))
-        peer_node.spin(0.3)
-    peer_node.until(lambda: reports)
-    assert aircraft.end() == 3, aircraft.output
-    assert "lost contact with controller" in aircraft.output
-    assert reports == ["controller"]
 
 
 def test_killed_node_ends_flight_with_name_in_summary(start: Start, tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
         node.until(lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"), each=command)
         engage(on=False)
         node.until(lambda: autopilot.lines[-1] == TRIM, each=command)
-        (y, attitude) = (node.received[topic][-1] for topic in ("y", "mavlink/ATTITUDE"))
+        (y, attitude) = (node.last(topic) for topic in ("y", "mavlink/ATTITUDE"))
         assert list(y.name) == ["q", "V", "p", "r"]
         assert list(attitude.name) == ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"]
 

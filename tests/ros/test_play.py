@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from tests.ros.conftest import Start
 from tests.ros.peer import Peer, peer
-from tests.ros.waiting import HANG, HostDelays
+from tests.ros.waiting import HostDelays, until
 
 from flight_core.rates import NANOSECONDS
 from flight_log.message_definitions import definition
@@ -35,16 +35,22 @@ class Receiver:
         self.received: dict[str, list[bytes]] = {topic.name: [] for topic in topics}
         self.sent: dict[str, list[int]] = {topic.name: [] for topic in topics}
 
-    def until(self, topic: Topic, count: int, timeout: float = HANG) -> None:
+    def take(self) -> None:
+        """Take the messages that have arrived."""
+        for subscription in self._polled_subscriptions:
+            for received in subscription.take():
+                self.received[subscription.topic.name].append(bytes(received.message))
+                self.sent[subscription.topic.name].append(received.sent_ns)
+
+    def until(self, topic: Topic, count: int) -> None:
         """Wait for a number of messages of a topic."""
-        deadline = time.monotonic() + timeout
-        while (number := len(self.received[topic.name])) < count:
-            assert time.monotonic() < deadline, f"{number} of {count} on {topic.name} within {timeout} s"
-            for subscription in self._polled_subscriptions:
-                for received in subscription.take():
-                    self.received[subscription.topic.name].append(bytes(received.message))
-                    self.sent[subscription.topic.name].append(received.sent_ns)
-            time.sleep(0.002)
+        messages = self.received[topic.name]
+
+        def enough() -> bool:
+            self.take()
+            return len(messages) >= count
+
+        until(enough, f"{count} messages of {topic.name}")
 
 
 def of(run: Path, topic: str) -> list[bytes]:

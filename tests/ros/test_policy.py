@@ -3,6 +3,7 @@
 """The access control policy allows exactly the topics and services that the nodes have."""
 
 import json
+import time
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -21,6 +22,7 @@ from flight_bringup.scenarios import find_scenario
 
 pytestmark = pytest.mark.package("flight_bringup")
 
+SETTLED = 1.0  # s without a change of the graph
 POLICY = REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "flight_bringup" / "security" / "flight.policy.xml"
 
 
@@ -69,20 +71,22 @@ def graph(peer_node: Peer, node: str) -> Access:
 
 
 def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
-    """The topics and services of the nodes, once the discovery has settled."""
+    """The topics and services of the nodes, once the discovery has settled: its endpoints are discovered one by one."""
     found: dict[str, Access] = {}
+    changed = time.monotonic()
 
     def settled() -> bool:
         present = {name for name, _ in peer_node.node.get_node_names_and_namespaces()}
         if not present >= set(nodes):
             return False
+        nonlocal changed
         before = dict(found)
         found.update({node: graph(peer_node, node) for node in nodes})
-        return found == before and all(access.publish and access.reply for access in found.values())
+        if found != before or not all(access.publish and access.reply for access in found.values()):
+            changed = time.monotonic()
+        return time.monotonic() - changed > SETTLED
 
-    for _ in range(3):  # the endpoints of a node are discovered one by one
-        peer_node.until(settled)
-        peer_node.spin(0.5)
+    peer_node.until(settled, "a graph that does not change")
     return found
 
 

@@ -7,10 +7,10 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -18,6 +18,7 @@ import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import INPUTS, Peer
+from tests.ros.waiting import until
 
 from flight_ros.messages import Encoder
 from flight_ros.topics import U
@@ -120,13 +121,6 @@ class Hosts(NamedTuple):
     second: tuple[str, ...]
 
 
-def wait_until(condition: Callable[[Any], bool], argument: Any) -> None:
-    deadline = time.monotonic() + 5.0
-    while not condition(argument):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def is_separate(holder: subprocess.Popen[bytes]) -> bool:
     """Whether the process has left this network namespace, or has ended."""
     own, other = Path("/proc/self/ns/net"), Path(f"/proc/{holder.pid}/ns/net")
@@ -147,7 +141,7 @@ def hosts() -> Iterator[Hosts]:
     try:
         places = [(nsenter, f"--net=/proc/{holder.pid}/ns/net") for holder in holders]
         for holder in holders:
-            wait_until(is_separate, holder)
+            until(partial(is_separate, holder), "a namespace of its own")
             if holder.poll() is not None:
                 assert holder.stderr is not None
                 pytest.skip(f"no network namespace for this user: {holder.stderr.read().decode().strip()}")
@@ -161,7 +155,7 @@ def hosts() -> Iterator[Hosts]:
             for command in (f"addr add 10.77.0.{number}/24 dev {name}", f"link set {name} up", "link set lo up"):
                 subprocess.run([*place, ip, *command.split()], check=True)
         for place in places:  # it takes up to a second, and Fast DDS ignores a device that is not up
-            wait_until(is_up, [*place, ip, "link", "show", name])
+            until(partial(is_up, [*place, ip, "link", "show", name]), "a device that is up")
         yield Hosts(*places)
     finally:
         for holder in holders:
