@@ -29,8 +29,8 @@ LEARNED = np.array([True])
 def test_divergence_is_three_times_the_error_before(errors: tuple[float, float], expected: bool) -> None:
     now, largest = (np.array([value**2, 0.0]) for value in errors)
     state, least = divergence.Errors(now, largest), divergence.least(("q", "V"))
-    assert divergence.diverges(state, least, np.array([True, True])) is expected
-    assert not divergence.diverges(state, least, np.array([False, True]))  # q flies the law of the start
+    assert divergence.diverging(state, least, np.array([True, True])).tolist() == [expected, False]
+    assert not divergence.diverging(state, least, np.array([False, True])).any()  # q flies the law of the start
 
 
 def test_running_mean_square_reaches_that_of_a_constant_error() -> None:
@@ -94,3 +94,10 @@ def test_harmless_oscillation_and_output_of_the_law_of_the_start_do_not_count() 
     assert flown(small, before=0.001).periods == [0.0]
     assert flown(4.0 * small, np.array([False])).periods == [0.0]
     assert flown(4.0 * small, before=0.001).periods == pytest.approx([1.0], rel=0.05)
+
+
+@pytest.mark.parametrize(("amplitude", "expected"), [(0.05, True), (0.02, False)])
+def test_record_oscillates_by_more_than_is_harmless(amplitude: float, expected: bool) -> None:
+    """Harmless is an rms of 0.02 rad/s, an amplitude of 0.028."""
+    y = np.stack([amplitude * np.sin(2.0 * np.pi * 2.2 * T), RANDOM.normal(0.0, 1.0, len(T))], axis=1)
+    assert divergence.oscillating(y, divergence.least(("q", "p"))).tolist() == [expected, False]

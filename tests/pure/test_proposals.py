@@ -193,7 +193,7 @@ def test_input_without_effect_is_held_though_the_law_fell_back_meanwhile(monkeyp
     beside = flight.controller.parameters
     assert isinstance(beside, RiseDiConfig)
     flight.now_ns += 10 * NANOSECONDS
-    monkeypatch.setattr(flight.controller, "diverges", lambda: True)
+    monkeypatch.setattr(flight.controller, "diverging", lambda: ("q",))
     flight.step(1)
     monkeypatch.undo()
     assert flight.controller.digest == START.digest()
@@ -376,3 +376,106 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     flight.step(1)
     assert flight.controller.parameters == START
     assert coupled(whole, ["r"]) == [name in {"p", "r"} for name in START.outputs]
+
+
+def diverge(flight: Flight, monkeypatch: pytest.MonkeyPatch, *outputs: str) -> None:
+    """A step in which outputs diverge; the window of the next proposal is 10 s later."""
+    monkeypatch.setattr(flight.controller, "diverging", lambda: outputs)
+    flight.step(1)
+    monkeypatch.undo()
+    flight.now_ns += 10 * NANOSECONDS
+
+
+def faded(time: float) -> dict[str, Any]:
+    """A change to a model that differs from CHANGE in one number."""
+    return CHANGE | {"observer.fade": time}
+
+
+def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step()
+    diverge(flight, monkeypatch, "q")
+    flight.receive()
+    flight.step()
+    assert flight.sentences[1:] == [
+        "falls back to the law of the start: q diverges",
+        "refused: found parameters that diverged in this engagement, expected others",
+    ]
+    assert flight.controller.digest == START.digest()
+    flight.controller.tick(flight.now_ns, active=False)
+    flight.step(1)
+    flight.now_ns += NANOSECONDS
+    flight.engage()
+    flight.receive()
+    flight.step()
+    assert flight.sentences[-1] == "flies model"
+
+
+def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a learner that proposes on and on, as one whose models all have the same fault."""
+    flight = Flight()
+    for time in (0.5, 0.6):
+        flight.receive(faded(time))
+        flight.step()
+        diverge(flight, monkeypatch, "q")
+    assert flight.controller.parameters == given_up(START, START, ["q", "V"])
+    for time in (0.7, 0.8):
+        flight.receive(faded(time))
+        flight.step()
+        assert acting_inputs(flight.controller.parameters) == ("aileron", "rudder")  # type: ignore[arg-type]
+        flight.now_ns += 10 * NANOSECONDS
+    assert flight.sentences == [
+        "flies model",
+        "falls back to the law of the start: q diverges",
+        "flies model",
+        "falls back to the law of the start, in q, V to the end of the engagement: q diverges again",
+        "flies model, without q, V",
+        "flies model, without q, V",
+    ]
+    for time in (0.9, 1.1):  # p and r, which have not fallen back by an error of their own
+        diverge(flight, monkeypatch, "p", "r")
+        flight.receive(faded(time))
+        flight.step()
+    assert outputs_without(flight.controller.parameters) == START.outputs
+    assert flight.sentences[-2].endswith("in p, r to the end of the engagement: p diverges again and r diverges again")
+    assert flight.sentences[-1].startswith("refused: proposal: found no model, expected one of other outputs than q, p, r, V")
+    flight.controller.tick(flight.now_ns, active=False)
+    flight.step(1)
+    flight.now_ns += NANOSECONDS
+    flight.engage()
+    for time, name in (
+        (0.5, "q"),
+        (0.6, "p"),
+    ):  # the fallbacks of the engagement before do not count, nor those of another part
+        flight.receive(faded(time))
+        flight.step()
+        assert acting_inputs(flight.controller.parameters) == START.inputs  # type: ignore[arg-type]
+        diverge(flight, monkeypatch, name)
+    assert outputs_without(flight.controller.parameters) == ()
+
+
+def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
+    """The model has 31 ms. A learner that found u 20 ms late asks for 30 ms, one that found it 40 ms late for 50 ms."""
+    flight = Flight()
+    flight.receive(CHANGE | {"observer.margin": 0.05})
+    flight.step()
+    assert re.search(r"unstable with u 50 ms late, expected a delay margin of at least 50 ms", flight.sentences[0])
+    assert flight.controller.digest == START.digest()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
+    """An elevator of -0.1 and +0.4 rad: with an effect B of 56.15 / s^2 it has 5.615 rad/s^2 down and 22.46 up."""
+    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    assert whole.feedforward is not None
+    B = tuple(sign * value for value in whole.feedforward.B)
+    model = whole.feedforward.model_copy(update={"B": B, "deviation": None})
+    limits = {"lower": (-0.1, -0.2, -0.3, -0.1), "upper": (0.4, 0.5, 0.6, 0.7)}
+    flown = whole.model_copy(update=limits | {"feedforward": model})
+    least = dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
+    lower, upper = ("down", "up") if sign > 0.0 else ("up", "down")
+    assert least[f"{lower}.q"] == pytest.approx(56.1499 * 0.1)
+    assert least[f"{upper}.q"] == pytest.approx(56.1499 * 0.4)
+    assert least[f"{lower}.V"] == pytest.approx(6.0 * 0.1)  # 0.06 m/s^2 per %
+    assert least[f"{upper}.V"] == pytest.approx(6.0 * 0.7)

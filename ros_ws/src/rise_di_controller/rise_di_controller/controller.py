@@ -153,9 +153,12 @@ class Controller:
         known = self._vanes_moved | (seconds(inputs.stamp_ns - self._engaged_ns) >= observer.vanes.time)
         self._vanes_still = np.where(known, measures == 0.0, self._vanes_still)
 
-    def diverges(self) -> bool:
-        """Whether a law with a model that was learned in flight diverges."""
-        return not self._first_law and divergence.diverges(self._errors, self._least, self._learned)
+    def diverging(self) -> tuple[str, ...]:
+        """The outputs that diverge under a model learned in flight."""
+        if self._first_law:
+            return ()
+        diverging = divergence.diverging(self._errors, self._least, self._learned)
+        return tuple(name for name, diverges in zip(self._parameters.outputs, diverging, strict=True) if diverges)
 
     def oscillations(self) -> dict[str, float]:
         """Periods, s, of the outputs that oscillate under a model learned in flight, more than before."""

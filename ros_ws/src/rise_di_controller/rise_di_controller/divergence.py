@@ -40,12 +40,12 @@ def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors
     return Errors(now, np.maximum(errors.largest, now) if first_law else errors.largest)
 
 
-def diverges(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> bool:
-    """Whether the rms error of an output is above FACTOR times its largest under the first law, and above `least`.
+def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Outputs, (m,), whose rms error is above FACTOR times its largest under the first law, and above `least`.
 
     Only outputs with a model that was learned count, mask (m,): the others fly the first law.
     """
-    return bool(np.any(learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))))
+    return learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
 
 class Oscillations:
@@ -82,6 +82,12 @@ class Oscillations:
         elif len(record) == self._record.maxlen:
             grown = square > np.maximum(GROWN**2 * self._largest, self._least)
             self.periods = np.array([spacing * period(x) * tested for x, tested in zip(record.T, learned & grown, strict=True)])
+
+
+def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
+    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`; commands that repeat count too."""
+    moving = np.var(y, axis=0) > HARMLESS**2 * least
+    return np.array([bool(moves) and period(x) > 0 for x, moves in zip(y.T, moving, strict=True)])
 
 
 def period(x: FloatArray) -> int:

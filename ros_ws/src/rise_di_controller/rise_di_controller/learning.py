@@ -5,7 +5,7 @@
 Pure: for the node and for the loop in one process.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -51,6 +51,9 @@ class Event(NamedTuple):
     change: Mapping[str, Any]
     sentence: str
 
+
+FALLBACKS = 2
+"""Fallbacks of a part in an engagement after which the part has no further model: the second model was certified, too."""
 
 AUTHORITY_TICKS = 10
 """Ticks of the controller from one sample of `authority` to the next."""
@@ -109,6 +112,8 @@ class Learning:
         self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
         self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
         self._fallback: Fallback | None = None  # the last one
+        self._fallbacks = Counter[str]()  # of this engagement, by output
+        self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
 
     def authority(self, controller: Controller) -> FloatArray:
         """`authority` of what flies."""
@@ -153,12 +158,24 @@ class Learning:
             taken = self._certify(controller, now_ns)
         if oscillations := controller.oscillations():
             taken = self._end_oscillations(oscillations, controller, now_ns)
-        elif controller.diverges():
-            taken = given_up(self._start, self._start, outputs_without(controller.parameters))
-            what = "falls back to the law of the start: it diverges"
-            self._fallback = Fallback(controller.digest, controller.parameters.input_scale, taken.digest())
-            self._take(controller, now_ns, prepared(taken), what)
+        elif diverging := controller.diverging():
+            taken = self._end_divergence(diverging, controller, now_ns)
         return taken
+
+    def _end_divergence(self, diverging: Collection[str], controller: Controller, now_ns: int) -> RiseDiConfig:
+        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to the end of the engagement."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        part = [name for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True) if diverges]
+        self._fallbacks.update(part)
+        ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
+        fallen = given_up(self._start, self._start, {*outputs_without(flown), *ended})
+        lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
+        reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
+        self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
+        self._diverged.add(controller.digest)
+        self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start{lasting}: {reason}")
+        return fallen
 
     def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
         """Take the law of the start, to the end of the engagement, in the parts of the model whose outputs oscillate."""
@@ -177,6 +194,8 @@ class Learning:
         self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
         self._due.clear()
         self._received.clear()
+        self._fallbacks.clear()
+        self._diverged.clear()
         if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self._start):
             return None
         self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
@@ -223,6 +242,8 @@ class Learning:
         except StopIteration as end:
             self._certificate = None
             refusal = self._unfit(proposal, controller)
+            if end.value.digest in self._diverged:
+                refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
                 without = outputs_without(end.value.parameters)
                 what = f"{FLIES} {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
