@@ -52,9 +52,9 @@ def test_clearance_is_distance_from_border() -> None:
 
 
 def test_clearance_of_several_zones() -> None:
-    """An aircraft stays in one of the zones to stay in, and out of each excluded zone."""
+    """An aircraft stays in one of the zones to stay in, and out of each excluded zone. An edge inside the other is none."""
     second = SQUARE._replace(north=tuple(value + 150.0 for value in SQUARE.north))
-    assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == pytest.approx([25.0, 10.0, 10.0])
+    assert at((SQUARE, second), (75.0, 0.0), (240.0, 0.0), (-90.0, 0.0)) == pytest.approx([100.0, 10.0, 10.0])
     hole = Zone((20.0,), (0.0,), 10.0, exclude=True)
     assert at((SQUARE, hole), (0.0, 0.0), (20.0, 0.0)) == pytest.approx([10.0, -10.0])
 

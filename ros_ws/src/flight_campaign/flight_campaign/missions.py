@@ -27,7 +27,7 @@ from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
 from flight_guidance import modes, path
-from flight_guidance.fence import RIGHT, Escape, last_safe_turn
+from flight_guidance.fence import Escape, last_safe_turn
 from flight_guidance.lateral import PathError
 from flight_guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
 from flight_guidance.params import GuidanceConfig
@@ -291,7 +291,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             jnp.where(joins_leg, *pair) for pair in zip((leg.from_altitude, 0.0), _profile(leg, pose), strict=True)
         )
         escape, home_altitude, homing = (
-            Escape(state.fence, False, state.clearance, 0.0),
+            Escape(state.fence, False, state.clearance, 0.0, 0.0),
             state.home_altitude,
             state.fence != 0.0,
         )
@@ -305,7 +305,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             entry, altitude = jnp.where(homing, orbit.curvature, entry), jnp.where(homing, home_altitude, altitude)
         climb = jnp.where(homing, 0.0, climb)
         wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
-        wanted = jnp.where(jnp.abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
+        wanted = modes.escaping_bank(escape, wanted, pose, speed, params)
         target = Target(altitude=altitude, climb=climb, V=jnp.where(joins_leg, leg.from_V, leg.V))
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target)
         after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)

@@ -2,13 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fence: zones to stay in and zones to keep out of, kept by the last safe turn.
 
-Each step predicts the turn at the largest bank to either side, until the course points home. Once the better of the two turns
-comes nearer to the fence than MARGIN of flight, the aircraft flies the better turn, then home. Functions take Python floats, or
-arrays with an element per aircraft of a fleet.
+Each step predicts the turn at the largest bank to either side, until the course points along the way home. Once the better of
+the two turns comes nearer to the fence than MARGIN of flight, the aircraft flies the better turn, then home. From outside the
+aircraft flies back inside the shortest way, then home. Functions take Python floats, or arrays with an element per aircraft of
+a fleet.
 """
 
 import math
-from functools import reduce
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +16,19 @@ import numpy as np
 from flight_core.units import GRAVITY
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.lateral import LARGEST_SLIP
+from flight_guidance.ways import POINTS, Ways, line_clearance, ways
+from flight_guidance.zones import Fence, Zone, clearance
+
+__all__ = ["Fence", "Zone", "clearance"]
 
 MARGIN = 0.5
 """s of flight over ground: the largest cross-track error that guidance claims in wind and turbulence."""
 
 HOMEWARD = math.radians(20.0)
-"""Angle before the bearing of home at which the turn ends."""
+"""Angle before the bearing of the way home at which the turn ends."""
+
+AHEAD = math.radians(60.0)
+"""Angle between the course and the bearing of the way home up to which an aircraft flies along the way."""
 
 SHARES = (1.0, 1.0 - LARGEST_SLIP)
 """Shares of the coordinated turn that the predicted turns have; the nearer turn counts.
@@ -29,25 +36,6 @@ SHARES = (1.0, 1.0 - LARGEST_SLIP)
 r follows psi' = g tan(phi) / V, but the aircraft flies along chi = psi + beta: a growing sideslip, and k_beta beta in r_m, take
 from the turn. Of the osprey with every entry of A and B off by up to 30 % the sideslip takes 0.19, of JSBSim's f16 0.09.
 """
-
-POINTS = 64
-"""Points of a predicted turn: a chord of the turn of 5 deg departs from the arc by a thousandth of the radius."""
-
-
-class Zone(NamedTuple):
-    """A polygon, or a circle: a single point and a radius."""
-
-    north: tuple[float, ...]  # m
-    east: tuple[float, ...]  # m
-    radius: float = 0.0  # m, 0 of a polygon
-    exclude: bool = False  # whether the aircraft keeps out
-
-
-class Fence(NamedTuple):
-    """The zones, and home. The aircraft stays in one of the zones without `exclude`, and out of each zone with it."""
-
-    zones: tuple[Zone, ...]
-    home: tuple[float, float] = (0.0, 0.0)  # north, east, m
 
 
 class Motion(NamedTuple):
@@ -64,38 +52,15 @@ class Motion(NamedTuple):
     lag: float  # s, of the turn behind the commanded bank: half of 1 / k_phi, and 2 / w_r of the reference model of r
 
 
-def inside(zone: Zone, north: Array, east: Array) -> Array:
-    """Distance from the border of a zone, m, positive inside of the polygon or circle. Arrays of any shape."""
-    xp = array_namespace(north)
-    if zone.radius:
-        return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
-    first, second = np.array(zone.north), np.array(zone.east)
-    edge_north, edge_east = np.roll(first, -1) - first, np.roll(second, -1) - second
-    x, y = north[..., None] - first, east[..., None] - second
-    share = xp.clip((x * edge_north + y * edge_east) / (edge_north**2 + edge_east**2), 0.0, 1.0)
-    distance = xp.min(xp.hypot(x - share * edge_north, y - share * edge_east), axis=-1)
-    level = np.where(edge_north == 0.0, 1.0, edge_north)  # an edge to the east crosses no line to the east
-    crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)  # by a ray to the east: even-odd rule
-    return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
+def _remaining(side: Array, bearing: Array, course: Array) -> Array:
+    """Angle of a turn to a side from the course to a bearing, rad, 0 to 2 pi."""
+    return side * (bearing - course) % (2.0 * math.pi)
 
 
-def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
-    """Distance from the fence, m, negative outside of the fence. Arrays of any shape."""
-    xp = array_namespace(north)
-    stay = [inside(zone, north, east) for zone in zones if not zone.exclude]
-    out = [-inside(zone, north, east) for zone in zones if zone.exclude]
-    return reduce(xp.minimum, [*([reduce(xp.maximum, stay)] if stay else []), *out])
-
-
-def described(distance: float) -> str:
-    """A distance of `clearance` in words: "9 m inside of the fence"."""
-    return f"{abs(distance):.0f} m {'inside' if distance >= 0.0 else 'outside'} of the fence"
-
-
-def _remaining(side: Array, home: tuple[float, float], place: tuple[Array, Array], course: Array) -> Array:
-    """Angle of a turn to a side from the course to the bearing of home, rad, 0 to 2 pi."""
-    xp = array_namespace(course)
-    return side * (xp.atan2(home[1] - place[1], home[0] - place[0]) - course) % (2.0 * math.pi)
+def _bearing(chart: Ways, fence: Fence, north: Array, east: Array) -> Array:
+    """Bearing of the way home, rad."""
+    aim_north, aim_east, _ = chart.aim(fence, north, east)
+    return array_namespace(north).atan2(aim_east - east, aim_north - north)
 
 
 def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
@@ -103,7 +68,7 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
 
         phi' = p_max after the lag, to the largest bank;  chi' = share g tan(phi) / V;  [n, e]' = V [cos, sin](chi) + W
 
-    until the course is HOMEWARD before home, at the latest after nearly a full turn. Trapezoidal rule over POINTS.
+    until the course is HOMEWARD before the way home, at the latest after nearly a full turn. Trapezoidal rule over POINTS.
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
@@ -119,7 +84,7 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     v_north = motion.speed * xp.cos(chi) + motion.wind[0]
     v_east = motion.speed * xp.sin(chi) + motion.wind[1]
     north, east = motion.north + _integral(v_north, longest), motion.east + _integral(v_east, longest)
-    remaining = _remaining(side, fence.home, (north, east), xp.atan2(v_east, v_north))
+    remaining = _remaining(side, _bearing(ways(fence), fence, north, east), xp.atan2(v_east, v_north))
     homeward = (remaining < HOMEWARD) & (t > rolled)
     after = xp.cumsum(homeward, axis=1) - homeward > 0
     nearest = xp.min(xp.where(after, math.inf, clearance(fence.zones, north, east)), axis=1)
@@ -134,31 +99,30 @@ def _integral(rate: Array, longest: Array) -> Array:
     return xp.concat([xp.zeros_like(rate[:, :1]), xp.cumsum(steps, axis=1)], axis=1)
 
 
-def way_home_clearance(fence: Fence, north: Array, east: Array) -> Array:
-    """Least clearance of the straight line home, m."""
-    share = np.linspace(0.0, 1.0, POINTS).reshape(-1, *(1,) * np.ndim(north))
-    to_north, to_east = north + share * (fence.home[0] - north), east + share * (fence.home[1] - east)
-    return array_namespace(north).min(clearance(fence.zones, to_north, to_east), axis=0)
-
-
 class Escape(NamedTuple):
     """Result of `last_safe_turn`."""
 
-    action: Any  # RIGHT, LEFT, HOME or 0
-    begins: Any  # whether a turn begins now
+    action: Any  # RIGHT, LEFT, HOME, BACK, AROUND or 0
+    begins: Any  # whether the fence begins to act
     clearance: Any  # m, now
-    predicted: Any  # m, least clearance of the better way
+    predicted: Any  # m, least clearance of the best way
+    course: Any  # rad, over ground: of the way home
 
 
-RIGHT, LEFT, HOME = 1.0, -1.0, 2.0
-"""Actions of the fence: a turn to the right, to the left, and the way home after the turn; 0 is none."""
+RIGHT, LEFT, HOME, BACK, AROUND = 1.0, -1.0, 2.0, 3.0, 4.0
+"""Actions of the fence; 0 is none.
+
+A turn to the right, to the left; the way home in a straight line; the way back from outside, the shortest way; the way home
+around a zone or a corner.
+"""
 
 
 def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     """The action of the fence after a step, from the action before.
 
-    A turn ends towards home. A turn begins where the better turn comes nearer to the fence than MARGIN of flight. On the way
-    home the straight line home is a third choice.
+    A turn begins where the better turn comes nearer to the fence than MARGIN of flight. It ends HOMEWARD before the way home,
+    and beyond where the way is free. On the way home a turn begins only where it keeps farther from the fence than the way that
+    is flown, and the clearance of now is enough. Outside no turn begins: the aircraft flies back until it is MARGIN inside.
     """
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))
@@ -166,14 +130,25 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     xp, place = array_namespace(motion.phi), (motion.north, motion.east)
     v_north = motion.speed * xp.cos(motion.heading) + motion.wind[0]
     v_east = motion.speed * xp.sin(motion.heading) + motion.wind[1]
-    course = xp.atan2(v_east, v_north)
-    turns = abs(action) == RIGHT
-    ends = turns & (_remaining(action, fence.home, place, course) < HOMEWARD)
-    after = xp.where(ends, HOME, action)
+    course, margin = xp.atan2(v_east, v_north), MARGIN * xp.hypot(v_north, v_east)
+    *aim, straight = ways(fence).aim(fence, *place)
+    bearing = xp.atan2(aim[1] - place[1], aim[0] - place[0])
+    now = clearance(fence.zones, *place)
+    is_outside = (now < 0.0) | ((action == BACK) & (now < margin))
+    homeward = xp.where(straight, HOME, AROUND)
+
     right, left = turn_clearance(fence, motion)
-    ahead = xp.cos(_remaining(1.0, fence.home, place, course)) > 0.5
-    straight = xp.where((after == HOME) & ahead, way_home_clearance(fence, *place), -math.inf)
-    predicted = xp.maximum(xp.maximum(right, left), straight)
-    begins = (abs(after) != RIGHT) & (predicted < MARGIN * xp.hypot(v_north, v_east))
-    turned = xp.where(begins, xp.where(right >= left, RIGHT, LEFT), after)
-    return Escape(turned, begins, clearance(fence.zones, *place), predicted)
+    turn = xp.maximum(right, left)
+    flies_home = action != 0.0
+    along = flies_home & (xp.cos(bearing - course) > math.cos(AHEAD))
+    way = xp.where(along, line_clearance(fence, *place, *aim), -math.inf)
+    predicted = xp.maximum(turn, way)
+    needed = xp.where(flies_home, xp.minimum(margin, now), margin)
+    must_turn = (predicted < needed) & (turn > way)
+    remaining = _remaining(action, bearing, course)
+    passed = (remaining > math.pi) & (way >= needed)
+    turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~passed
+
+    after = xp.where(must_turn, xp.where(right >= left, RIGHT, LEFT), xp.where(flies_home, homeward, 0.0))
+    after = xp.where(turns, action, xp.where(is_outside, BACK, after))
+    return Escape(after, (action == 0.0) & (after != 0.0), now, predicted, bearing)

@@ -21,7 +21,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, Scalar, array_namespace
 from flight_guidance import path, protection, reach
 from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates, yaw_for_bank
-from flight_guidance.fence import HOME, RIGHT, Escape, Fence, Motion, last_safe_turn
+from flight_guidance.fence import AROUND, BACK, HOME, RIGHT, Escape, Motion, last_safe_turn
 from flight_guidance.lateral import (
     PathError,
     PathParams,
@@ -30,6 +30,7 @@ from flight_guidance.lateral import (
     heading_estimate,
     path_acceleration,
     slip_estimate,
+    turn_towards,
 )
 from flight_guidance.path import Arc, Leg, Loiter, Point, Route
 from flight_guidance.reach import Authority
@@ -43,6 +44,7 @@ from flight_guidance.vertical import (
     slewed,
 )
 from flight_guidance.wind import Wind, wind_estimate, wind_of
+from flight_guidance.zones import Fence
 
 LARGEST = 1e9
 """Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
@@ -252,7 +254,7 @@ class GuidanceState(NamedTuple):
     u_m: tuple[float, ...]
     joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
     wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
-    fence: float = 0.0  # action of the fence: 1 and -1 turn to the right and left, 2 flies home after the turn, 0 none
+    fence: float = 0.0  # action of the fence: of `fence.Escape`
     loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
     psi: Scalar = 0.0  # estimated heading, rad
 
@@ -435,12 +437,22 @@ def step(
     state, missed = _with_commands(state, inputs.given, pose, dt, route)
     state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
-    if abs(state.fence) == RIGHT and state.mode is Mode.ENGAGED:
-        wanted = math.copysign(params.limits.bank, state.fence)
+    if state.mode is Mode.ENGAGED:
+        wanted = escaping_bank(escape, wanted, pose, airspeed(inputs.y, params), params)
     state, commands = command(state, pose, y, wanted, dt, params)
     commands = commands._replace(xtrack=error.e, track=error.track, to_go=to_go, missed=missed)
-    commands = commands._replace(clearance=float(escape.clearance), predicted=float(escape.predicted))
+    commands = commands._replace(clearance=escape.clearance, predicted=escape.predicted)
     return state._replace(t_ns=inputs.t_ns), commands
+
+
+def escaping_bank(escape: Escape, wanted: Scalar, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Scalar:
+    """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a turn, or of a course."""
+    course, ground_speed = _over_ground(pose)
+    xp = array_namespace(ground_speed)
+    acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
+    towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
+    wanted = xp.where(escape.action >= BACK, towards, wanted)
+    return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
 
 
 def command(
@@ -518,7 +530,9 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
         if state.mode is Mode.POSE_LOST:  # the aircraft may be anywhere by now
             after_loss = home(pose, params) if params.home.after_loss else {"phi": 0.0, "altitude": pose["altitude"]}
             lateral = Lateral.ORBIT if params.home.after_loss else Lateral.PHI
-            level = state._replace(lateral=lateral, vertical=Vertical.ALTITUDE, target=state.target._replace(**after_loss))
+            level = state._replace(
+                lateral=lateral, vertical=Vertical.ALTITUDE, target=state.target._replace(**after_loss), fence=0.0
+            )
             state = begin(level, inputs._replace(begin=Begin.AGAIN), params)
         state = state._replace(mode=Mode.ENGAGED, phi=pose["phi"], theta=pose["theta"])
         since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
@@ -557,14 +571,20 @@ def motion_of(
 def _within_fence(
     state: GuidanceState, pose: Mapping[str, float], y: Mapping[str, float], speed: float, params: GuidanceParams
 ) -> tuple[GuidanceState, Escape]:
-    """The state with the turn away from the fence; home is the target from the begin of the turn on."""
+    """The state with the action of the fence; home is the target from the begin of the action on.
+
+    A lateral command during a turn is flown after the turn, unless the aircraft is outside.
+    """
     if params.fence is None or state.mode is not Mode.ENGAGED:
-        return state, Escape(state.fence, False, LARGEST, LARGEST)
-    escape = last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params))
-    if escape.begins:
+        return state, Escape(state.fence, False, LARGEST, LARGEST, 0.0)
+    escape = Escape(*map(float, last_safe_turn(params.fence, state.fence, motion_of(state, pose, y, speed, params))))
+    commanded = state.lateral is not Lateral.ORBIT or (state.target.north, state.target.east) != params.home[:2]
+    if commanded and escape.action in {HOME, AROUND}:
+        escape = escape._replace(action=0.0)
+    elif escape.begins or (commanded and escape.action == BACK):
         target = state.target._replace(**home(pose, params))
         state = state._replace(lateral=Lateral.ORBIT, vertical=Vertical.ALTITUDE, target=target, joining=0.0)
-    return state._replace(fence=float(escape.action)), escape
+    return state._replace(fence=escape.action), escape
 
 
 def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
@@ -587,7 +607,7 @@ def _with_commands(
     if LATERAL.keys() & given.keys():
         state = state._replace(target=state.target._replace(r=0.0))
     state = state._replace(target=state.target._replace(**given))
-    if state.fence == HOME and LATERAL.keys() & given.keys():
+    if state.fence >= HOME and LATERAL.keys() & given.keys():
         state = state._replace(fence=0.0)
     for name in given:
         state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))

@@ -28,13 +28,14 @@ from flight_core.units import GRAVITY
 from flight_guidance import protection, reach
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
-from flight_guidance.fence import MARGIN, Fence, Zone, clearance, described
+from flight_guidance.fence import MARGIN
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
 from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, reach_sentence, read_target
 from flight_guidance.notices import Notices
 from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
 from flight_guidance.vertical import VerticalParams, path_lag
+from flight_guidance.zones import Fence, Zone, clearance, described
 
 BY_RULE = ("outputs", "natural_frequency", "speed", "throttle_authority", "roll_authority")
 FLOOR_FRACTION = 0.8
@@ -100,6 +101,10 @@ class ZoneConfig(Config):
     east: Numbers = Field(description="m")
     radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
     exclude: bool = Field(default=False, description="whether the aircraft keeps out of the zone; else the aircraft stays in")
+    group: Annotated[int, Field(ge=0)] | None = Field(
+        default=None,
+        description="of zones to stay in: the aircraft stays inside every zone of at least one group; none: a group of its own",
+    )
 
     def _check(self) -> None:
         require_length("east", self.east, [f"corner {k}" for k in range(len(self.north))])
@@ -109,10 +114,11 @@ class ZoneConfig(Config):
         corners = list(zip(self.north, self.east, strict=True))
         twice = [k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]]
         require(not twice, "north", f"the corner {corners[twice[0]] if twice else ''} twice in succession", "each corner once")
+        require(self.group is None or not self.exclude, "group", f"{self.group} of a zone to keep out of", "none")
 
     def zone(self) -> Zone:
         """The zone of the equations."""
-        return Zone(self.north, self.east, self.radius or 0.0, self.exclude)
+        return Zone(self.north, self.east, self.radius or 0.0, self.exclude, self.group)
 
 
 class HomeConfig(Config):
@@ -238,7 +244,7 @@ class GuidanceConfig(NodeConfig):
     def fence_zones(self) -> Fence | None:
         """The fence of the equations; None without zones."""
         zones = tuple(zone.zone() for zone in self.fence.values())
-        return Fence(zones, (self.home.north, self.home.east)) if zones else None
+        return Fence(zones, (self.home.north, self.home.east), float(math.ceil(self.least_radius()))) if zones else None
 
     def fence_clearance(self, north: float, east: float) -> float:
         """Distance of a place from the fence, m, negative outside; infinite without a fence."""

@@ -216,6 +216,8 @@ def read_fence_file(
         zones[key] = {"north": [point[0] for point in points], "east": [point[1] for point in points], "exclude": area.exclude}
         if area.radius is not None:
             zones[key]["radius"] = _number(f"fence.{key}", area.radius, "radius")
+        if area.group is not None:
+            zones[key]["group"] = area.group
     heights = _Heights(altitude, read.home, above_sea=above_sea)
     rally = [_placed(place._replace(key="rally point"), origin, heights) for place in read.rally]
     sections: dict[str, Any] = {"fence": zones}

@@ -602,6 +602,7 @@ class Area(NamedTuple):
     places: list[Place]
     radius: Any  # m; None of a polygon
     exclude: bool
+    group: Any = None  # of a zone to stay in
 
 
 class FencePlaces(NamedTuple):
@@ -629,18 +630,30 @@ def _plan_fence(tree: Any, key: str) -> FencePlaces:
     zones = []
     for zone in _entries(fence, "polygons", key):
         corners = [_lat_lon(corner) for corner in _listed(_member(zone, "polygon"), key)]
-        zones.append(Area(corners, None, not _flag(zone, "inclusion", None, key)))
+        zones.append(_grouped(Area(corners, None, not _flag(zone, "inclusion", None, key))))
     for zone in _entries(fence, "circles", key):
         circle, inclusion = _member(zone, "circle"), _flag(zone, "inclusion", None, key)
-        zones.append(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not inclusion))
+        zones.append(_grouped(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not inclusion)))
     rally = [_lat_lon(point, Above.HOME) for point in _entries(_member(tree, "rallyPoints"), "points", key)]
     back = _member(fence, "breachReturn")
     home = _home(_member(_member(tree, "mission"), "plannedHomePosition"))
     return FencePlaces(zones, rally, home, None if back is None else _lat_lon(back, Above.HOME))
 
 
+def _grouped(area: Area, group: Any = 0) -> Area:
+    """A zone of an autopilot, in its group where the aircraft stays in; a plan has the group 0 alone.
+
+    MAVLink, MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION and MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION, parameter 2, Inclusion Group:
+    "Vehicle must be inside ALL inclusion zones in a single group, vehicle must be inside at least one group".
+    """
+    return area if area.exclude else area._replace(group=group)
+
+
 def _json_fence(tree: Any, key: str) -> FencePlaces:
-    """Polygons, whose holes are excluded, and Points with the property `radius`; the property `exclude` excludes a zone."""
+    """Polygons, whose holes are excluded, and Points with the property `radius`.
+
+    The property `exclude` excludes a zone. Zones with the same property `group` are a group; else each zone is one alone.
+    """
     _require_wgs84(tree, key)
     zones: list[Area] = []
     for node, properties in _nodes(tree):
@@ -650,13 +663,15 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
         require(kind in ("Polygon", "MultiPolygon", "Point"), key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
         coordinates = _listed(_member(node, "coordinates"), key)
         exclude, radius = _flag(properties, "exclude", False, key), _member(properties, "radius")
+        group = _member(properties, "group")
         if kind == "Point":
             require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
-            zones.append(Area([_lon_lat(coordinates)], radius, exclude))
+            zones.append(Area([_lon_lat(coordinates)], radius, exclude, group))
             continue
         for rings in [coordinates] if kind == "Polygon" else coordinates:
             for k, ring in enumerate(_listed(rings, key)):
-                zones.append(Area([_lon_lat(position) for position in _listed(ring, key)], None, exclude or k > 0))
+                corners = [_lon_lat(position) for position in _listed(ring, key)]
+                zones.append(Area(corners, None, True) if k > 0 else Area(corners, None, exclude, group))
     return FencePlaces(zones)
 
 
@@ -676,12 +691,14 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
             expected = "corners of a polygon, each with their number, 3 or more"
             require(fits, f"{key}: {item.name}", f"{count:g} corners", expected)
             if not missing:
-                zones.append(Area([], None, exclude))
+                zones.append(_grouped(Area([], None, exclude), _group(item, key)))
                 missing = int(count)
+            same = exclude or _group(item, key) == zones[-1].group
+            require(same, f"{key}: {item.name}", f"group {item.params[1]:g}", f"{zones[-1].group}, as of the corners before")
             zones[-1].places.append(place)
             missing -= 1
         elif item.command in {CIRCLE_IN, CIRCLE_OUT}:
-            zones.append(Area([place], item.params[0], exclude))
+            zones.append(_grouped(Area([place], item.params[0], exclude), _group(item, key)))
         elif item.command == RALLY:
             rally.append(place._replace(above=FRAMES.get(item.frame, Above.GROUND)))
         elif item.command == RETURN:
@@ -690,6 +707,16 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
         there = len(zones[-1].places)
         raise ParameterError(f"{key}: found {there} of the {there + missing} corners of a polygon, expected all")
     return FencePlaces(zones, rally, home, back)
+
+
+def _group(item: _Item, key: str) -> int:
+    """The inclusion group of an item; 0 of a zone to keep out of, which has none."""
+    if item.command in {FENCE_OUT, CIRCLE_OUT}:
+        return 0
+    group = float(item.params[1])
+    fits = group >= 0.0 and group.is_integer()
+    require(fits, f"{key}: {item.name}", f"group {group:g}", "a whole number, 0 or more, in the second parameter")
+    return int(group)
 
 
 MOST_CORNERS = 10_000

@@ -17,8 +17,8 @@ from flight_core.files import dump_yaml, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.scenario import A_SCENARIO, Sections, parse_sections
-from flight_guidance.fence import described
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.zones import described
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.laws import AnyLaw

@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Zones of a fence, and the distance from the fence. Functions take arrays, of NumPy or of JAX, of any shape."""
+
+import math
+from functools import lru_cache, reduce
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.vectors import Array, FloatArray, array_namespace
+
+CHORDS = 180
+"""Chords of a circle among several groups: they depart from the circle by 0.15 thousandths of the radius."""
+
+SEAM = 1e-3
+"""m. Two groups that share a border are one region: a gap is wider. A position in m has more digits."""
+
+
+class Zone(NamedTuple):
+    """A polygon, or a circle: a single point and a radius."""
+
+    north: tuple[float, ...]  # m
+    east: tuple[float, ...]  # m
+    radius: float = 0.0  # m, 0 of a polygon
+    exclude: bool = False  # whether the aircraft keeps out
+    group: int | None = None  # of a zone to stay in; None: a group of its own
+
+
+class Fence(NamedTuple):
+    """The zones, and home.
+
+    The aircraft stays inside every zone of at least one group, and out of each zone with `exclude`.
+    """
+
+    zones: tuple[Zone, ...]
+    home: tuple[float, float] = (0.0, 0.0)  # north, east, m
+    radius: float = 0.0  # of the orbit round home, m
+
+
+def inside(zone: Zone, north: Array, east: Array) -> Array:
+    """Distance from the border of a zone, m, positive inside of the polygon or circle."""
+    xp = array_namespace(north)
+    if zone.radius:
+        return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
+    start_north, start_east = np.array(zone.north), np.array(zone.east)
+    edge_north = np.roll(start_north, -1) - start_north
+    edge_east = np.roll(start_east, -1) - start_east
+    distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
+    x, y = north[..., None] - start_north, east[..., None] - start_east
+    level = np.where(edge_north == 0.0, 1.0, edge_north)  # an edge to the east crosses no line to the east
+    crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)  # by a ray to the east: even-odd rule
+    return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
+
+
+def _distance(
+    start_north: FloatArray, start_east: FloatArray, edge_north: FloatArray, edge_east: FloatArray, north: Array, east: Array
+) -> Array:
+    """Distance of places from the nearest of edges, m."""
+    xp = array_namespace(north)
+    x, y = north[..., None] - start_north, east[..., None] - start_east
+    share = xp.clip((x * edge_north + y * edge_east) / (edge_north**2 + edge_east**2), 0.0, 1.0)
+    return xp.min(xp.hypot(x - share * edge_north, y - share * edge_east), axis=-1)
+
+
+def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
+    """Distance from the fence, m, negative outside of the fence."""
+    xp, groups = array_namespace(north), _groups(zones)
+    out = [-inside(zone, north, east) for zone in zones if zone.exclude]
+    if not groups:
+        return reduce(xp.minimum, out)
+    stay = _deepest(groups, north, east)
+    if len(groups) > 1:  # a border inside of another group is no border
+        stay = xp.where(stay >= 0.0, xp.maximum(stay, _distance(*_border(groups), north, east)), stay)
+    return reduce(xp.minimum, [stay, *out])
+
+
+def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
+    """The zones to stay in, by group."""
+    groups: dict[tuple[int | None, int], tuple[Zone, ...]] = {}
+    for k, zone in enumerate(zones):
+        if not zone.exclude:
+            key = (zone.group, k if zone.group is None else 0)
+            groups[key] = (*groups.get(key, ()), zone)
+    return tuple(groups.values())
+
+
+def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
+    """Distance from the border of the group that a place is deepest in, m, negative outside of all groups."""
+    xp = array_namespace(north)
+    depths = [reduce(xp.minimum, [inside(zone, north, east) for zone in group]) for group in groups]
+    return reduce(xp.maximum, depths)
+
+
+@lru_cache(maxsize=64)
+def _border(groups: tuple[tuple[Zone, ...], ...]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The border of all groups together: starts and lengths of edges to the north and to the east, m, shapes (M,).
+
+    Each edge of a zone is cut where other edges cross or touch it. A piece belongs to the border where one side is inside.
+    """
+    groups = tuple(tuple(map(_polygon, group)) for group in groups)
+    corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
+    starts, ends = np.concatenate(corners), np.concatenate([np.roll(ring, -1, axis=0) for ring in corners])
+    pieces = [_cut(start, end, starts, ends) for start, end in zip(starts, ends, strict=True)]
+    start, end = (np.concatenate(column) for column in zip(*pieces, strict=True))
+    edge, middle = end - start, (start + end) / 2.0
+    beside = SEAM * np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
+    sides = [_deepest(groups, *(middle + side * beside).T) >= 0.0 for side in (1.0, -1.0)]
+    on_border = sides[0] != sides[1]
+    return start[on_border, 0], start[on_border, 1], edge[on_border, 0], edge[on_border, 1]
+
+
+def _polygon(zone: Zone) -> Zone:
+    """The zone, a circle as a polygon of CHORDS."""
+    if not zone.radius:
+        return zone
+    angles = [2.0 * math.pi * k / CHORDS for k in range(CHORDS)]
+    north = tuple(zone.north[0] + zone.radius * math.cos(angle) for angle in angles)
+    east = tuple(zone.east[0] + zone.radius * math.sin(angle) for angle in angles)
+    return zone._replace(north=north, east=east, radius=0.0)
+
+
+def _cut(start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where edges cross it or begin on it."""
+    edge, edges, to_start = end - start, ends - starts, starts - start
+    length = math.hypot(*edge)
+    across = edge[0] * edges[:, 1] - edge[1] * edges[:, 0]
+    parallel = across == 0.0
+    divisor = np.where(parallel, 1.0, across)
+    cut_at = (to_start[:, 0] * edges[:, 1] - to_start[:, 1] * edges[:, 0]) / divisor
+    along = (to_start[:, 0] * edge[1] - to_start[:, 1] * edge[0]) / divisor
+    crosses = ~parallel & (along > 0.0) & (along < 1.0)
+    begins_at = to_start @ edge / length**2
+    begins = abs(edge[0] * to_start[:, 1] - edge[1] * to_start[:, 0]) < SEAM * length
+    cuts = np.concatenate([cut_at[crosses], begins_at[begins]])
+    shares = np.unique(np.round([0.0, 1.0, *cuts[(cuts > 0.0) & (cuts < 1.0)]], 12))
+    points = start + shares[:, None] * edge
+    return points[:-1], points[1:]
+
+
+def described(distance: float) -> str:
+    """A distance of `clearance` in words: "9 m inside of the fence"."""
+    return f"{abs(distance):.0f} m {'inside' if distance >= 0.0 else 'outside'} of the fence"
