@@ -31,10 +31,14 @@ TRIM_TOLERANCE = 0.05  # of half the range: the effects on the two sides of the 
 DECISIVE = re.compile(r"RCMAP_\w+|(RC|SERVO)\d+_(FUNCTION|MIN|MAX|TRIM|REVERSED)|(CA|PWM)_\w+")
 """Parameters of ArduPilot and PX4 between a command and the surface: where one changes, so does the sign or the effect."""
 
-MENDS = {  # in the map, by a part of the name of the parameter
-    "REVERSED": "change `positive` of the row of `inputs`",
-    "MIN": "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`",
-    "MAX": "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`",
+CALIBRATE = (
+    "change `range`, `scale` and `offset` of the rows of `inputs` and `trims`, or calibrate the transmitter and fly again"
+)
+MENDS = {  # by a part of the name of the parameter; no mend reverses what the pilot's stick does
+    "REVERSED": "change `positive` of the row of `inputs`, and not the parameter",
+    "TRIM": "calibrate the transmitter with its trims in the middle and fly again",
+    "MIN": CALIBRATE,
+    "MAX": CALIBRATE,
     "RCMAP": "change `field` of the rows of `inputs` and `trims`",
 }
 
@@ -142,8 +146,7 @@ def require_agreement(name_of_map: str, sticks: Iterable[Stick], recorded: Param
     if differing:
         found, expected = (", ".join(f"{name} {side[name]:g}" for name in differing) for side in (known, differing))
         mends = dict.fromkeys(mend for name in differing for end, mend in MENDS.items() if end in name.split("_"))
-        mend = ", or ".join([*mends, "set the parameter and fly again"])
-        raise ParameterError(f"the log: found {found}, expected {expected} as in the map {name_of_map}: {mend}")
+        raise ParameterError(f"the log: found {found}, expected {expected} as in the map {name_of_map}: {'; '.join(mends)}")
     absent = [name for name in parameters if name not in values]
     return f"the log has no {', '.join(absent)} before the samples: compare the map with them yourself" if absent else ""
 
