@@ -28,6 +28,7 @@ class Installed(NamedTuple):
     origin: str | None
 
     def read_text(self, name: str) -> str | None:
+        """The origin."""
         assert name == "direct_url.json"
         return self.origin
 
@@ -46,7 +47,7 @@ class Installed(NamedTuple):
 def test_installed_stack_names_what_it_came_from(
     origin: str | None, command: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not a package of its name on an index from which it did not come: a stranger may own that name."""
+    """Not a package of an index from which it did not come: a foreign package may have that name."""
     monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
     monkeypatch.setattr(installation, "distribution", lambda name: Installed(origin))
     assert missing("jax") == f"found no Python package jax, expected it: {command}"
@@ -90,5 +91,5 @@ def test_targets_and_extras_exist() -> None:
     "path", [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))], ids=lambda path: path.stem
 )
 def test_page_names_no_package_of_an_index(path: Path) -> None:
-    """The stack is installed from its checkout: nobody has published `rise-di`."""
+    """The stack is installed from its checkout: it is not released, and a foreign package may have its name."""
     assert not re.search(r"pip install[^\n`]*rise-di(\[| |$)|\"rise-di\[", path.read_text(encoding="utf-8"))

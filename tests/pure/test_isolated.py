@@ -6,7 +6,7 @@ import ctypes
 import logging
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from types import MappingProxyType
@@ -131,7 +131,7 @@ def changes(path: str) -> list[str]:
     """Write a file in the working folder; the ways by which a file of the user's was changed."""
     Path("own").write_text("own", encoding="utf-8")
     file = Path(path)
-    ways = {
+    ways: dict[str, Callable[[], object]] = {
         "write": lambda: file.write_text("", encoding="utf-8"),
         "append": lambda: file.open("a", encoding="utf-8").close(),
         "cut": lambda: os.truncate(path, 0),

@@ -60,7 +60,7 @@ def missing(package: str) -> str:
 def _pip_command(extra: str) -> str:
     """The command that installs an extra of the stack from where the stack came: a checkout, a wheel, a repository, an index.
 
-    A checkout that is not released must not send its user to a package of this name that somebody else may have published.
+    A checkout that is not released must not send its user to an index, where a foreign package may have this name.
     Source: PEP 610, direct_url.json, which an installation from an index does not have.
     """
     try:

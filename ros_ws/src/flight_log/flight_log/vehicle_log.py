@@ -487,7 +487,7 @@ def read_foreign_log(path: Path) -> VehicleLog:
     size = path.stat().st_size
     timeout, memory = LIMITS[0] + LIMITS[1] * size / 1e6, MEMORY[0] + MEMORY[1] * size
     try:
-        return isolated.call(_read_absolute, str(path.absolute()), timeout=timeout, memory=memory)  # type: ignore[no-any-return]
+        return isolated.call(_read_absolute, str(path.absolute()), timeout=timeout, memory=memory)
     except isolated.IsolatedCallError as error:
         raise ParameterError(f"{path}: found {file_kind(path)} whose decoding {error}, expected {EXPECTED}") from None
 
