@@ -283,7 +283,7 @@ def test_crash_exception_and_exit_of_isolated_process_are_errors_here() -> None:
 
 def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     real = isolated.call
-    monkeypatch.setattr(isolated, "call", lambda *_, timeout: real(ctypes.string_at, 0, timeout=timeout))
+    monkeypatch.setattr(isolated, "call", lambda *_, timeout, **_limits: real(ctypes.string_at, 0, timeout=timeout))
     # No other test has cached the trim of this condition.
     scenario = find_scenario("jsbsim_c172p").vary(aircraft={"speed": 47.11})
     assert simulate(scenario).outcome == "jsbsim:c172p cannot be flown: JSBSim was killed by SIGSEGV"

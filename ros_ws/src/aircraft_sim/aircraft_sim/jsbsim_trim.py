@@ -105,7 +105,8 @@ def trim_solution(condition: FlightCondition) -> TrimSolution:
     Raises FlightEnded.
     """
     try:
-        unknowns = isolated.call(solve_and_probe, *condition, timeout=TIMEOUT)
+        foreign = foreign_model(condition.name) is not None
+        unknowns = isolated.call(solve_and_probe, *condition, timeout=TIMEOUT, foreign=foreign)
     except isolated.IsolatedCallError as error:
         raise FlightEnded(f"{condition.title} cannot be flown: JSBSim {error}") from None
     return None if unknowns is None else tuple(unknowns)

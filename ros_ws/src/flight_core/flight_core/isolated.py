@@ -36,7 +36,7 @@ class IsolatedCallError(RuntimeError):
     """The subprocess crashed or timed out. The message is the rest of a sentence: "was killed by SIGSEGV"."""
 
 
-def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: int = DATA_LIMIT) -> Any:
+def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: int = DATA_LIMIT, foreign: bool = True) -> Any:
     """Return value of function(*arguments) in a fresh process, confined to an empty working folder.
 
     The subprocess finds the function by module and name. Arguments must fit JSON; the return value consists of plain values,
@@ -44,7 +44,7 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: 
 
     The subprocess has `memory` bytes of data, FILE_LIMIT, and `timeout` seconds of processor time, or WAIT times as many of
     wall time: an endless computation is found on a busy machine too, and a finite computation gets enough time. Where the
-    kernel permits, it has no network and writes in its folder alone; where not, a warning says so once. Raises
+    kernel permits, it has no network and writes in its folder alone; where not, a warning says so once, if `foreign`. Raises
     IsolatedCallError where the process crashes (a segmentation fault, an exception) or returns nothing in that time.
     """
     call_text = json.dumps([timeout, memory, function.__module__, function.__qualname__, arguments])
@@ -73,7 +73,7 @@ def call(function: Callable[..., Any], *arguments: Any, timeout: float, memory: 
             raise IsolatedCallError(f"exited with status {process.returncode} ({last})")
         with file.open("rb") as stream:
             kind, value, open_ways = _Reader(stream, function.__module__).load()
-    for way in open_ways:
+    for way in open_ways if foreign else ():
         note(way)
     if kind in ERRORS:
         raise ERRORS[kind](value)
