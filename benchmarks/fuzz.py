@@ -37,7 +37,7 @@ STACK = [
 def main() -> None:
     """Fuzz, or replay."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = "mcap, metadata, scenario, airframe, export, map, message, route, targets, control or page"
+    names = "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, targets, control or page"
     parser.add_argument("target", help=names)
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
     parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")

@@ -8,6 +8,7 @@ inputs of each target, made by the writers of the stack; tests/corpus/<target>/ 
 
 import asyncio
 import atexit
+import gc
 import json
 import logging
 import math
@@ -27,8 +28,10 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.joint_states import JOINT_STATE, STORE, vector
 from tests.maps import MAP_FILES
+from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
 from tests.view_link import NodesInMemory
 
 from aircraft_sim.airframe import LIBRARY as AIRFRAMES
@@ -56,6 +59,7 @@ from flight_log.repair import repair
 from flight_log.rosbag2_metadata import FileContents, TopicCount, bag_metadata_yaml, read_bag_metadata
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_changes
 from flight_log.tape_reader import read_run
+from flight_log.vehicle_log import read_vehicle_log
 from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server, answer
@@ -220,6 +224,14 @@ def route(data: bytes, folder: Path) -> None:
         rejected(lambda path=path: read_fence_file(path, Origin(47.4, 8.5), 30.0))  # type: ignore[misc]  # likewise
 
 
+def vehicle_log(data: bytes, folder: Path) -> None:
+    """The log of an autopilot. It is decoded here: `rise-di import` does it in an isolated process."""
+    path = folder / "vehicle.log"
+    path.write_bytes(data)
+    rejected(lambda: read_vehicle_log(path))
+    gc.collect()  # pymavlink leaves a damaged file open: Python warns here, and not in the middle of another test
+
+
 def targets(data: bytes, folder: Path) -> None:
     """Poses, y and targets of guidance, as 64 bit numbers. What a step commands is finite and inside its slew limits.
 
@@ -323,6 +335,7 @@ TARGETS: Mapping[str, Target] = {
     "map": channel_map,
     "message": message,
     "route": route,
+    "vehicle_log": vehicle_log,
     "targets": targets,
     "control": control,
     "page": page,
@@ -461,6 +474,21 @@ def _numbers() -> list[bytes]:
     return [struct.pack(f"<{4 * GUIDED_NUMBERS}d", *[*level, float(k), 1.0] * 4) for k in range(len(MODES))]
 
 
+def _vehicle_logs() -> list[bytes]:
+    """A log of each kind, with a rate gyro alone."""
+    stamps = range(0, 400_000, 20_000)
+    rates = [(stamp, (0.1, -0.2, 0.3)) for stamp in stamps]
+    packets = [(stamp, mavlink.MAVLink_attitude_message(stamp // 1000, *[0.1] * 6)) for stamp in stamps]
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / name for name in ("a.bin", "a.ulg", "a.tlog")]
+        write_dataflash(
+            paths[0], {"IMU": (("GyrX", "GyrY", "GyrZ"), rates)}, {"RC1_MIN": 1100.0}, "ArduPlane V4.6.0 (1f2e3d4c)"
+        )
+        write_ulog(paths[1], {"vehicle_angular_velocity": ("float[3] xyz", rates)}, {"FW_AIRSPD_TRIM": 15.0})
+        write_tlog(paths[2], packets)
+        return [path.read_bytes() for path in paths]
+
+
 SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "mcap": _mcaps,
     "metadata": _metadata,
@@ -470,6 +498,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "map": lambda: [path.read_bytes() for path in MAP_FILES.values()],
     "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
     "route": lambda: _ROUTES,
+    "vehicle_log": _vehicle_logs,
     "targets": _numbers,
     "control": lambda: [json.dumps(body).encode() for body in _BODIES],
     "page": lambda: _REQUESTS,
