@@ -8,13 +8,14 @@ COMPLETED = "completed"
 INTERRUPTED = "interrupted"
 INCOMPLETE = "log incomplete"  # after an outcome and a comma, before what the log lacks
 MISSED = "missed"  # after an outcome and a comma, before the legs of a route that were missed
+OUTSIDE = "outside of the fence"  # after an outcome and a comma, before for how long and how far
 NOT_FLOWN = "not flown"  # after an outcome, a comma and the legs of a route that were ahead at the end
 LANDED = " landed "  # in an outcome, between the aircraft and the time
 IMPORT = "imported"  # of a log that an autopilot wrote
 NEVER_FLEW = "never flew"  # before the reason
 UNKNOWN = "unknown"  # on the tape of a log
 STATUS_INTERRUPTED, STATUS_ENDED_EARLY = 130, 3  # exit statuses of a flight, 0 completed or landed
-STATUS_INCOMPLETE = 4  # completed with an incomplete log, or a leg missed or not flown
+STATUS_INCOMPLETE = 4  # completed with an incomplete log, a leg missed or not flown, or outside of the fence
 LOST_CONTACT = "lost contact with"  # before the name of the node lost: the end of a node that is not the cause
 
 
@@ -27,7 +28,7 @@ def ended_early(held: float, duration: float) -> str:
 
 def exit_status(outcome: str) -> int:
     """Exit status of a flight by the outcome."""
-    if outcome.startswith(f"{COMPLETED}, "):
+    if outcome.startswith(f"{COMPLETED}, ") or f", {OUTSIDE}" in outcome:
         return STATUS_INCOMPLETE
     if LANDED in outcome:
         return 0

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Notices of guidance: a missed leg, a turn away from the fence, a flight carried back, a strong wind, a lost link, new limits.
+"""Notices of guidance: a missed leg, the fence, a flight carried back, a strong wind, a lost link, new limits.
 
 The node logs the sentences as warnings; the summary of a flight takes the same sentences from the log.
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple
 from flight_core.channels import UNKNOWN
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
-from flight_guidance.modes import Lateral
+from flight_guidance.modes import LARGEST, Lateral
 from flight_guidance.reach import Authority
 
 DWELL = 10.0
@@ -91,6 +91,7 @@ class Notices:
         self._link = _Lasting(0.0)
         self._stale = _Lasting(STALE_TIME)
         self._blown, self._strong, self._leg, self._action = _Lasting(), _Lasting(), 0, 0.0
+        self._outside_from, self._farthest = math.nan, 0.0  # NaN: inside
 
     def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
         """The notices of a sample at the flight time t, s, from the CHANNELS of the log."""
@@ -101,6 +102,7 @@ class Notices:
         if abs(self._action) == RIGHT and self._action != action:
             side = "right" if self._action == RIGHT else "left"
             texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
+        texts += self._outside(t, log["fence.clearance"])
         wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
         if (authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))) != self._authority:
             self._authority, reached, self._reached = authority, self._reached, self._reach(authority)
@@ -116,6 +118,20 @@ class Notices:
             beyond = f"above {largest:.1f} m/s circles of the least radius take more than the largest bank"
             texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {beyond}")
         return [Notice(t, text) for text in texts]
+
+    def _outside(self, t: float, clearance: float) -> list[str]:
+        """The sentence where the aircraft leaves the fence, or is back inside. While pose is lost, neither is known."""
+        if clearance >= LARGEST:
+            return []
+        is_outside, was_outside = clearance < 0.0, not math.isnan(self._outside_from)
+        self._farthest = max(self._farthest, -clearance)
+        if is_outside and not was_outside:
+            self._outside_from, self._farthest = t, -clearance
+            return ["outside of the fence: the shortest way inside, then home"]
+        if was_outside and not is_outside:
+            lasted, self._outside_from = t - self._outside_from, math.nan
+            return [f"inside of the fence after {lasted:.1f} s outside, {self._farthest:.0f} m at most"]
+        return []
 
     def of_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
         """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""

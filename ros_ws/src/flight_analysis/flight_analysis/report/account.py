@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.guided import FlownLeg, flown_legs, unflown_legs
+from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
 from flight_core.modes import Mode
-from flight_core.outcome import COMPLETED, INCOMPLETE, MISSED, NEVER_FLEW, NOT_FLOWN, UNKNOWN, ended_early
+from flight_core.outcome import COMPLETED, INCOMPLETE, LANDED, MISSED, NEVER_FLEW, NOT_FLOWN, OUTSIDE, UNKNOWN, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import SINCE_EPOCH_NS
@@ -28,7 +28,9 @@ PARTS = (" and missing", " is truncated: ")  # in notes of a log on its parts
 RESTART = 10  # a number of a tick that is less by more
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
-SHORTFALL = re.compile(rf", (?:{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{INCOMPLETE}).*", re.DOTALL)  # of an outcome
+SHORTFALL = re.compile(
+    rf", (?:{OUTSIDE} |{MISSED} leg |legs? \d+(?: to \d+)? {NOT_FLOWN}|{INCOMPLETE}).*", re.DOTALL
+)  # of an outcome
 
 
 class TopicAccount(NamedTuple):
@@ -91,6 +93,7 @@ class Account(NamedTuple):
     processes: Mapping[str, ProcessAccount] = {}
     commands: Commands | None = None
     late: float | None = None  # s, flight time of the first u of a flight that flew less than half of its time
+    outside: Outside | None = None  # of the fence; None without one
 
     def over(self, *topics: str) -> str:
         """The part of these topics that a figure is taken over; empty for whole topics."""
@@ -118,7 +121,7 @@ class Account(NamedTuple):
 
 
 def final_outcome(outcome: str, account: Account) -> str:
-    """The outcome with the legs missed and not flown, and with what the log lacks.
+    """The outcome with the time outside of the fence, the legs missed and not flown, and with what the log lacks.
 
     As in "completed, missed leg 2 by 35 m, legs 4 to 6 not flown, log incomplete: ...".
 
@@ -129,9 +132,13 @@ def final_outcome(outcome: str, account: Account) -> str:
         return f"{NEVER_FLEW}: the first u came at t = {account.late:.3f} of {account.end:.3f} s"
     if base == COMPLETED and account.unguided:
         return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
+    left = account.outside if account.outside is not None and account.outside.left else None
+    outside = [] if left is None else [f"{OUTSIDE} for {left.outside_s:.1f} s, {left.farthest_m:.0f} m at most"]
+    if LANDED in base:
+        return ", ".join([base, *outside])
     if not base.startswith((COMPLETED, UNKNOWN)):
         return base
-    parts = [base, *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed)]
+    parts = [base, *outside, *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed)]
     if account.unflown:
         first, last = account.unflown[0], account.unflown[-1]
         parts.append(f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}")
@@ -226,7 +233,7 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     parts = _lost_parts(tape.notes, planned=planned_ns is not None)
     return Account(
         end, topics, (*parts, *lacks, *_absent(tape, scenario)), _too_busy(busy), unguided, tuple(legs), tuple(unflown),
-        _processes(tape), late=first if first is not None and first > end / 2.0 else None,
+        _processes(tape), late=first if first is not None and first > end / 2.0 else None, outside=time_outside(tape, section),
     )  # fmt: skip
 
 
@@ -421,10 +428,12 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
         return None
     keys = TopicAccount._fields
     topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
-    legs = tuple(FlownLeg(**leg) for leg in (summary["guidance"] or {}).get("legs", ()))
+    guided = summary["guidance"] or {}
+    legs = tuple(FlownLeg(**leg) for leg in guided.get("legs", ()))
+    outside = None if guided.get("fence") is None else Outside(**guided["fence"])
     unguided, unflown = content.get("unguided", False), tuple(content.get("unflown", ()))
     processes = {name: ProcessAccount(**of) for name, of in content.get("processes", {}).items()}
     commands = None if content.get("commands") is None else Commands(**content["commands"])
     lacks = tuple(content["lacks"])
     late = content.get("late")
-    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands, late)
+    return Account(content["end"], topics, lacks, content["busy"], unguided, legs, unflown, processes, commands, late, outside)

@@ -18,6 +18,7 @@ from flight_guidance.modes import LATERAL, TARGETS, Lateral, Vertical, bits
 from flight_guidance.notices import LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route, leg_places, lengths_after, route_outline
+from flight_guidance.zones import clearance
 
 UNITS: Mapping[str, str] = {
     **dict.fromkeys(("phi", "theta", "heading", "course"), "rad"),
@@ -136,6 +137,30 @@ def unflown_legs(tape: Tape, section: GuidanceConfig) -> range:
     return range(0) if route is None else range(int(log["leg"][last]), len(route.legs) - 1)
 
 
+class Outside(NamedTuple):
+    """The time outside of the fence, while guidance flew."""
+
+    outside_s: float
+    farthest_m: float  # from the fence, m; 0 inside
+    left: bool  # whether the aircraft was outside after it had been inside, or at the end
+
+
+def time_outside(tape: Tape, section: GuidanceConfig | None) -> Outside | None:
+    """Time outside of the fence by `pose`, as of the first step of guidance; None without a fence, or without a pose then."""
+    fence = None if section is None else section.fence_zones()
+    if fence is None or "pose" not in tape or "guidance" not in tape or not len(tape["guidance"].stamp_ns):
+        return None
+    begun = tape["pose"].stamp_ns >= tape["guidance"].stamp_ns[0]
+    t = tape.time("pose")[begun]
+    if not len(t):
+        return None
+    inside = clearance(fence.zones, tape["pose"]["north"][begun], tape["pose"]["east"][begun])
+    is_outside = inside < 0.0
+    lasted = float(np.sum(np.diff(t)[is_outside[:-1]]))
+    after_inside = is_outside & (np.maximum.accumulate(inside) >= 0.0)
+    return Outside(lasted, max(float(-np.min(inside)), 0.0), bool(after_inside.any() or is_outside[-1]))
+
+
 def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[str, Any]:
     """What a map shows of a mission, ready for JSON, in m.
 
@@ -203,18 +228,19 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 
-def guidance_summary(tape: Tape) -> dict[str, Any] | None:
+def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
     """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without guidance."""
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None
     log = tape["guidance"]
-    limited = log.group("limited")
+    limited, outside = log.group("limited"), time_outside(tape, section)
     return {
         "segments": [
             segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
             for segment in segments(tape)
         ],
         "legs": [leg._asdict() for leg in flown_legs(tape)],
+        "fence": None if outside is None else outside._asdict(),
         "wind": _mean_wind(tape),
         "bank": _largest(log["pose.phi"]),
         "age_pose": _largest(log["age.pose"]),

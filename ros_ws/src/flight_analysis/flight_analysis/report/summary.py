@@ -169,7 +169,7 @@ def summarise(
         "ticks": None if ticks is None or not np.isfinite(ticks).all() else ticks._asdict(),
         "latency": None if latency is None or not np.isfinite(latency).all() else latency._asdict(),
         "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
-        "guidance": guidance_summary(tape),
+        "guidance": guidance_summary(tape, scenario.guidance),
         "models": [span._asdict() for span in errors_by_model(tape)],
         "account": of.as_json(),
         "notes": [
