@@ -455,6 +455,45 @@ def test_fence_of_file_is_zones_and_home(tmp_path: Path, ending: str) -> None:
         )
 
 
+def test_inclusion_zones_of_an_autopilot_are_one_group(tmp_path: Path) -> None:
+    """MAVLink: inside all zones of a group. A plan has no groups; PX4 and ArduPilot stay inside all of its zones."""
+    path = tmp_path / "fence.plan"
+    polygon = PLAN_FENCE["geoFence"]["polygons"][0]
+    circle = {"circle": CENTRE, "inclusion": True}
+    tree = {"geoFence": {"polygons": [polygon, polygon], "circles": [circle, *PLAN_FENCE["geoFence"]["circles"]]}}
+    path.write_text(json.dumps(PLAN_FENCE | tree), encoding="utf-8")
+    assert [zone.get("group") for zone in read_fence_file(path)["fence"].values()] == [0, 0, 0, None]
+    path = tmp_path / "fence.geojson"
+    path.write_text(json.dumps(GEOJSON_FENCE), encoding="utf-8")
+    assert [zone.get("group") for zone in read_fence_file(path, ZURICH)["fence"].values()] == [None, None]
+
+
+CORNERS = ((47.39, 8.49), (47.42, 8.49), (47.42, 8.53))
+
+
+@pytest.mark.parametrize("group", [0.0, 3.0])
+def test_inclusion_group_of_item_is_read(group: float, tmp_path: Path) -> None:
+    path = tmp_path / "fence.waypoints"
+    rows = [*((3, 5001, *corner, 0.0, 3.0, group) for corner in CORNERS), (3, 5003, 47.41, 8.51, 0.0, 200.0, group)]
+    path.write_text(wpl(*rows, (3, 5004, 47.41, 8.51, 0.0, 20.0)), encoding="utf-8")
+    assert [zone.get("group") for zone in read_fence_file(path, ZURICH)["fence"].values()] == [group, group, None]
+
+
+@pytest.mark.parametrize(
+    ("groups", "sentence"),
+    [
+        ((0.0, 0.0, 1.0), r"\(item 3\): found group 1, expected 0, as of the corners"),
+        ((0.5,) * 3, "found group 0.5, expected a"),
+    ],
+)
+def test_polygon_of_no_group_refused(groups: tuple[float, ...], sentence: str, tmp_path: Path) -> None:
+    path = tmp_path / "fence.waypoints"
+    rows = [(3, 5001, *corner, 0.0, 3.0, group) for corner, group in zip(CORNERS, groups, strict=True)]
+    path.write_text(wpl(*rows), encoding="utf-8")
+    with pytest.raises(ParameterError, match=sentence):
+        read_fence_file(path, ZURICH)
+
+
 def test_home_is_return_point_of_fence_without_rally_points(tmp_path: Path) -> None:
     there = local(47.405, 8.5, ZURICH)
     path = tmp_path / "fence.plan"
