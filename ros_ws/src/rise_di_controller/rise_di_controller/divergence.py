@@ -85,7 +85,7 @@ class Oscillations:
 
 
 def oscillating(y: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
-    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`; commands that repeat count too."""
+    """Outputs, (m,), that oscillate over a record y, (N, m), by more than HARMLESS of `least`, also by repeated commands."""
     moving = np.var(y, axis=0) > HARMLESS**2 * least
     return np.array([bool(moves) and period(x) > 0 for x, moves in zip(y.T, moving, strict=True)])
 
