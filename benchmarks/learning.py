@@ -160,9 +160,9 @@ class Timed:
     def __init__(self, own: Learner) -> None:
         self._own, self.steps = own, list[float]()
 
-    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Of the learner."""
-        self._own.take(stamp_ns, y, u)
+        self._own.take(stamp_ns, y, u, flown)
 
     def propose(self, flown: int) -> Proposal:
         """Of the learner."""

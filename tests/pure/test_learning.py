@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.design import learner as design_learner
 from flight_analysis.design.change_test import Change
-from flight_analysis.design.learner import Learner
+from flight_analysis.design.learner import Known, Learner
 from flight_analysis.design.model_identification import Entry, Part, Prediction
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.figures import learned_figure, plot_context
@@ -37,7 +37,8 @@ from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
 from rise_di.learning import learn_again, learner
-from rise_di_controller.learning import acting_inputs, changes, given_up
+from rise_di_controller.learning import acting_inputs, authority, authority_names, changes, given_up
+from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.observer import PastTick, estimates_after
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -89,13 +90,21 @@ def error(tape: Tape, first: float, last: float) -> FloatArray:
     return np.array([np.sqrt(np.mean((truth[f"x.{name}"] - y_m[name])[within] ** 2)) for name in NAMES])
 
 
+def plant_of(airframe: Airframe, controller: RiseDiConfig) -> LinearPlant:
+    """An airframe in the order of a controller; gravity is in A."""
+    rows = [airframe.outputs.index(name) for name in controller.outputs]
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    A = airframe.matrix_a() + airframe.matrix_gravity()
+    return LinearPlant(A, airframe.matrix_b()[:, columns], airframe.matrix_c()[rows])
+
+
 class Fixed:
     """A learner whose proposals are given."""
 
     def __init__(self, *proposals: RiseDiConfig) -> None:
         self._proposals = list(proposals)
 
-    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Nothing is learned."""
 
     def propose(self, flown: int) -> Proposal:
@@ -196,7 +205,7 @@ def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:
 def test_lost_ticks_are_unknown_in_record() -> None:
     made, period_ns = made_learner(scenario()), 10_000_000
     for k in (0, 1, 3, 3, 6):
-        made.take(k * period_ns + 400, np.full(4, float(k)), np.array([1.0, 2.0, 3.0, 4.0]) * k)
+        made.take(k * period_ns + 400, np.full(4, float(k)), np.array([1.0, 2.0, 3.0, 4.0]) * k, 0)
     recorded = made.recording()
     # y is q, p, r, V in the law and q, V, p, r in the airframe; u is held
     np.testing.assert_array_equal(recorded.y[:, 0], [0.0, 1.0, np.nan, 3.0, np.nan, np.nan, 6.0])
@@ -207,14 +216,14 @@ def test_short_record_is_refused() -> None:
     made = made_learner(scenario())
     assert made.propose(0) == Proposal(None, "record: found 0 s, expected 10 s")
     for t in (0, 5):  # the ticks between them are lost
-        made.take(t * NANOSECONDS, np.zeros(4), np.zeros(4))
+        made.take(t * NANOSECONDS, np.zeros(4), np.zeros(4), 0)
     assert made.propose(0) == Proposal(None, "record: found 5.01 s, expected 10 s")
 
 
 def test_record_without_motion_and_noise_is_refused() -> None:
     made = made_learner(scenario(learn={"updates": [10.0]}))
     for k in range(1001):
-        made.take(k * 10_000_000, np.array([0.0, 0.01 * (k % 3), 0.0, 0.0]), np.zeros(4))
+        made.take(k * 10_000_000, np.array([0.0, 0.01 * (k % 3), 0.0, 0.0]), np.zeros(4), 0)
     expected = "record: found a constant q, V, r, expected outputs that move, or the noise of their sensors"
     assert made.propose(0) == Proposal(None, expected)
 
@@ -223,7 +232,7 @@ def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pyt
     made, identified = made_learner(scenario(learn={"updates": [15.0]})), Mock(return_value=SimpleNamespace(parts=()))
     monkeypatch.setattr(design_learner, "identify", identified)
     for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     sentence = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
     assert sentence == "no identification is due, and no part is tested for a change"
     identified.assert_not_called()
@@ -240,7 +249,7 @@ def test_only_part_of_a_proposal_that_was_refused_is_proposed_again(monkeypatch:
     part = Part(("aileron", "rudder"), ("p", "r"), (aileron,), worse, better, "", 0.0, gusts=False)
     monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
     for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     sentences = [made.propose(start.digest()).sentence for _ in range(2)]  # the start flies on
     assert sentences == ["B[p, aileron] +10 +- 1 %"] * 2
 
@@ -259,7 +268,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     monkeypatch.setattr(design_learner, "identify", identified)
     monkeypatch.setattr(made, "_design", lambda *_: start)
     for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
     assert made.model is not None
     assert made.model.matrix_b()[5, 0] == pytest.approx(0.3 * 29.0)
@@ -320,7 +329,7 @@ def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
     change = Change(("p", "r"), 10.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
     monkeypatch.setattr(made, "_changes", lambda _: [change])
     for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     assert made.propose(start.digest()).sentence.startswith(sentence)
 
 
@@ -336,7 +345,7 @@ def test_prior_after_a_change_is_the_model_that_flew_and_the_file_in_turns(monke
     monkeypatch.setattr(made, "_changes", lambda _: [Change(("p", "r"), 10.0, {"rudder": 0.4}, "")])
     monkeypatch.setattr(made, "_model", flew)
     for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
     made.propose(made._proposed)
     monkeypatch.setattr(made, "_changes", lambda _: [])
     for _ in range(2):
@@ -370,12 +379,135 @@ def test_weaker_effect_replaces_that_of_the_file_as_it_is(monkeypatch: pytest.Mo
     monkeypatch.setattr(made, "_design", lambda *_: chosen.rise_di())
     sentences = []
     for k in range(1201):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4))
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
         if k in {1000, 1100, 1200}:
             sentences.append(made.propose(made._proposed).sentence)
     assert sentences[0] == "q and V of the airframe osprey as it is"
     assert sentences[1].startswith("B[q, elevator] -30 +- 2 %")
     assert sentences[2].startswith("B[q, elevator]: found 71 % of that of the model that flies")
+
+
+LATERAL = Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437), Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028)
+"""Effects that a flight showed, with deviations: of the aileron 10 % more than in the file, of the rudder 20 % less."""
+
+
+def lateral(*, whiteness: float = 1.0, delay: float = 0.0, delay_deviation: float = 0.0) -> Part:
+    """The part of p and r as identified."""
+    before = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
+    after = Prediction(np.ones(2), np.array([1.0, whiteness]), 2.0)
+    outputs = ("p", "r")
+    return Part(("aileron", "rudder"), outputs, LATERAL, before, after, "", delay, gusts=False, delay_deviation=delay_deviation)
+
+
+def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
+    """A learner with a record of 10 s, whose search finds a part."""
+    made = made_learner(scenario(learn={"updates": [10.0]}))
+    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
+    return made
+
+
+def test_model_that_leaves_out_what_the_aircraft_does_is_refused_for_its_whiteness_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """White innovations have 1 with a deviation of 0.3; the bound is 3."""
+    refused = learner_that_finds(lateral(whiteness=3.1), monkeypatch).propose(0)
+    assert refused == Proposal(None, "innovations of r: found a whiteness of 3.1, expected at most 3, 1 being white")
+    assert learner_that_finds(lateral(whiteness=2.9), monkeypatch).propose(0).controller is not None
+
+
+def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """B exp(-2 s) times the limit of 0.523599 rad, with s relative to the value that was found."""
+    proposed = learner_that_finds(lateral(), monkeypatch).propose(0).controller
+    assert proposed is not None
+    least = dict(zip(authority_names(proposed.outputs), authority(proposed, scenario().rise_di()).tolist(), strict=True))
+    assert least["up.p"] == pytest.approx(1.1 * 85.9437 * np.exp(-2.0 * 0.05 / 1.1) * 0.523599)
+    assert least["down.r"] == pytest.approx(0.8 * 9.74028 * np.exp(-2.0 * 0.08 / 0.8) * 0.523599)
+
+
+@pytest.mark.parametrize(
+    ("delay", "deviation", "margin"),
+    [
+        (0.0, 0.004, 0.03),  # 8 and 10 ms are within the 30 ms of the start
+        (0.02, 0.002, 0.034),  # found, two deviations, and 10 ms that are left
+        (0.04, 0.0012, 0.0524),
+    ],
+)
+def test_delay_margin_counts_the_delay_that_was_found(
+    delay: float, deviation: float, margin: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list[float]()
+
+    def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
+        assert start.observer is not None
+        asked.append(start.observer.margin)
+        raise ParameterError("none has it")
+
+    made = learner_that_finds(lateral(delay=delay, delay_deviation=deviation), monkeypatch)
+    monkeypatch.setattr(made, "_design", design)
+    sentence = made.propose(0).sentence
+    assert asked == [pytest.approx(margin)]
+    late = f"u is up to {1e3 * (delay + 2.0 * deviation):.0f} ms late: " if margin > 0.03 else ""
+    assert sentence == f"{late}none has it"
+    assert made.model is None  # what flies stays
+
+
+def test_start_with_less_margin_keeps_what_it_leaves_beyond_its_own_delay() -> None:
+    observer = scenario().rise_di().model_dump()["observer"] | {"margin": 0.015}
+    start = scenario(delay=0.006, observer=observer).rise_di()
+    assert design_learner.margin_behind(0.006, start) == 0.015
+    assert design_learner.margin_behind(0.02, start) == pytest.approx(0.029)  # 9 ms beyond 6 ms, and so beyond 20 ms
+
+
+def test_part_whose_inputs_are_later_than_the_search_looks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four deviations of 15 ms: the delay may be any longer one."""
+    refused = learner_that_finds(lateral(delay=0.06), monkeypatch).propose(0)
+    assert refused == Proposal(None, "aileron and rudder: found u 60 ms late or later, expected less than 60 ms")
+
+
+def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
+    """No file says that u is 40 ms late: with the margin of the start alone the loop is unstable from the first model on."""
+    actuators = scenario().aircraft.actuators.model_dump() | {"delay": 0.04}
+    late = scenario().vary(aircraft={"actuators": actuators}, flight={"duration": 26.0})
+    learned = made_learner(late)
+    tape = simulate(late, learn=lambda _: learned)
+    alone = simulate(late.vary(controller={"learn": None}))
+    (taken,) = tape.changes
+    assert taken["observer.margin"] == pytest.approx(0.04 + 0.01, abs=0.01)  # a delay within 5 ms, and its deviations
+    flown = vary(late.rise_di(), taken)
+    true, loop = late.aircraft.sampled_airframe(), Loop(np.array(flown.lag), 0.04, 0.01)
+    assert is_stable(plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4))
+    units = np.array([0.01, 0.1, 0.02, 0.01])
+    assert np.sum(error(tape, SWITCH, 26.0) / units) < np.sum(error(alone, SWITCH, 26.0) / units)
+
+
+RECORDED = 2000  # ticks of 10 ms; the last 1000 are tested
+
+
+@pytest.mark.parametrize(
+    ("flown", "frequency", "tested"),
+    [
+        ((1, 1, 1), 0.0, True),
+        ((1, 2, 1), 0.0, False),  # fell back 5 s ago
+        ((2, 1, 1), 0.0, True),  # fell back 15 s ago
+        ((1, 1, 1), 2.2, False),
+    ],
+)
+def test_damage_is_not_looked_for_in_seconds_with_a_fallback_or_an_oscillation(
+    flown: tuple[int, int, int], frequency: float, tested: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a q oscillation of 2.2 Hz, after two fallbacks, a healthy engine had no effect by this test."""
+    made, test = made_learner(scenario(learn={"updates": [10.0]})), Mock(return_value=())
+    monkeypatch.setattr(design_learner, "change_test", test)
+    made._known = {("p", "r"): Known(0, {}, 0.0, False)}
+    before, meanwhile, after = flown
+    for k in range(RECORDED):
+        digest = before if k < 500 else meanwhile if k < 1500 else after
+        y = np.array([0.1 * np.sin(2.0 * np.pi * frequency * 0.01 * k), 0.0, 0.0, 0.0])
+        made.take(k * 10_000_000, y, np.zeros(4), digest)
+    made._changes((RECORDED - 1) * 10_000_000)
+    assert test.called is tested
 
 
 def test_flight_without_learner_is_refused() -> None:

@@ -285,7 +285,7 @@ def test_effects_at_another_speed_are_reduced_to_the_trim_speed() -> None:
     ticks = simulate(scenario.vary(controller={"learn": None}))["internals"]
     made = Learner(scenario.rise_di(), OSPREY, lambda start, model: start)
     for stamp_ns, y, u in zip(ticks.stamp_ns.tolist(), ticks.group("y").values, ticks.group("u").values, strict=True):
-        made.take(stamp_ns, y, u)
+        made.take(stamp_ns, y, u, 0)
     made.propose(0)
     found, true, file = made.identification, scenario.aircraft.sampled_airframe(), OSPREY.matrix_b()
     assert found is not None

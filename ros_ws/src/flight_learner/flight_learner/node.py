@@ -130,7 +130,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
                 self._begin()
             return
         if mode == Mode.ENGAGED:
-            self._learner.take(sample.stamp_ns, y, u)
+            self._learner.take(sample.stamp_ns, y, u, int(flown))
         self._has_record = True
         self._end_ns, self._flown = sample.stamp_ns + round(age * NANOSECONDS), int(flown)
         self._is_due = self._updates.due(self._end_ns) or self._is_due

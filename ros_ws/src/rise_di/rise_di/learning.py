@@ -34,7 +34,6 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     controller, aircraft = scenario.controller, scenario.aircraft
     if not isinstance(controller, RiseDiConfig) or controller.learn is None:
         return None
-    margin = 0.0 if controller.observer is None else controller.observer.margin
     if aircraft.is_jsbsim:
         condition = aircraft.flight_condition()
         airframe, rough = sketched(Path(condition.name).stem, controller, condition.speed), ROUGH
@@ -50,8 +49,9 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
         require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", f"{airframe.speed:g} m/s, that of the model")
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
-        designed = observed(start, scenario, model, margin, uncertain=False, sketched=aircraft.is_jsbsim, speeds=speeds)
-        return designed[0]
+        assert start.observer is not None  # noqa: S101 - a controller that learns has one
+        margin, sketch = start.observer.margin, aircraft.is_jsbsim
+        return observed(start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds)[0]
 
     return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
 
@@ -113,7 +113,7 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
             (learned, updates), proposed, begin_ns = begun(), start, now_ns
         longest_ns = max(longest_ns, now_ns - begin_ns)
         if mode[k] == Mode.ENGAGED:
-            learned.take(stamp_ns, np.array(y[k]), np.array(u[k]))
+            learned.take(stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed)
         if updates.due(now_ns):
             proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()

@@ -25,8 +25,8 @@ class Proposal(NamedTuple):
 class Learner(Protocol):
     """What learns from a flight. Channels in the law's order."""
 
-    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
-        """Take y and u, after its limits, of a tick of the engaged law, (m,)."""
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
+        """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its parameters."""
 
     def propose(self, flown: int) -> Proposal:
         """Parameters from the record so far; `flown` is the digest of the parameters at its end."""
@@ -127,7 +127,7 @@ class LearningLoop:
         if output is None or not controller.has_internals:
             return None
         if controller.mode is Mode.ENGAGED:
-            self._learner.take(output.stamp_ns, output.inputs.y, output.u)
+            self._learner.take(output.stamp_ns, output.inputs.y, output.u, controller.digest)
         if not self._learning.ticked(controller, now_ns):
             return None
         proposal = self._learner.propose(controller.digest)

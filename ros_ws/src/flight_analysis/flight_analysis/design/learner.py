@@ -9,7 +9,7 @@ refused with a sentence. The controller refuses parameters that fail its own che
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from itertools import chain, combinations, product
+from itertools import chain, combinations, pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from flight_analysis.design.innovation_filters import DRIFT, TRANSIENT, Actuatio
 from flight_analysis.design.model_identification import (
     HELD_OUT,
     KNOWN,
+    MAX_DELAY_ERROR,
     MAX_DEVIATION,
     MAX_WHITENESS,
     PRIOR,
@@ -38,18 +39,20 @@ from flight_analysis.design.model_identification import (
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
+from rise_di_controller import divergence
 from rise_di_controller.learning import given_up, outputs_without, with_channels_of
 from rise_di_controller.rise_di import RiseDiConfig
 
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
 DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
+DELAY_LEFT = 0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
 FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
 SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
 
 SPREAD = 0.02  # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4 %
 
 Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
-"""The controller with the feedforward and the observer of a model. Raises ParameterError."""
+"""A controller with the feedforward and the observer of a model, and its delay margin. Raises ParameterError."""
 
 
 class Known(NamedTuple):
@@ -59,6 +62,21 @@ class Known(NamedTuple):
     deviation: Mapping[str, float]  # of its entries by name, 1
     delay: float  # of its inputs, s
     is_rough: bool  # that of the rough airframe as it is
+    delay_deviation: float = 0.0  # s, standard deviation of `delay`
+
+    @property
+    def latest(self) -> float:
+        """The delay of its inputs and two standard deviations, s."""
+        return self.delay + 2.0 * self.delay_deviation
+
+
+class Sample(NamedTuple):
+    """A tick of the record; y and u in the law's order."""
+
+    stamp_ns: int
+    y: FloatArray  # (m,)
+    u: FloatArray  # (m,), after its limits
+    flown: int  # digest of the parameters
 
 
 class Learner:
@@ -85,7 +103,7 @@ class Learner:
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
         self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
-        self._record: deque[tuple[int, FloatArray, FloatArray]] = deque()
+        self._record: deque[Sample] = deque()
         self._window_ns = nanoseconds(settings.window)
         self._planned = deque(map(nanoseconds, settings.updates))
         self._first_ns: int | None = None
@@ -99,6 +117,7 @@ class Learner:
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
         self._flew = self._last = controller  # the last proposal that flew, and the last one
         self._proposed = controller.digest()  # of the last one
+        self._proposals = set[int]()  # digests of all of them
         self.identification: Identification | None = None  # the last one
 
     @property
@@ -106,21 +125,22 @@ class Learner:
         """The rough airframe with the models of the parts that are known; None where there is none."""
         return self._model if self._known else None
 
-    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray) -> None:
-        """Record y and u, after its limits, of a tick, (m,), in the law's order."""
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
+        """Record y and u, after its limits, of a tick, (m,), in the law's order, and the digest of its parameters."""
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         if not self._record or stamp_ns > self._record[-1][0]:
-            self._record.append((stamp_ns, y, u))
-        while stamp_ns - self._record[0][0] >= self._window_ns:
+            self._record.append(Sample(stamp_ns, y, u, flown))
+        while stamp_ns - self._record[0].stamp_ns >= self._window_ns:
             self._record.popleft()
 
     def recording(self, after_ns: int = -1) -> Recording:
         """The record after an instant in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""
-        record = [row for row in self._record if row[0] > after_ns]
-        stamp_ns = np.array([row[0] for row in record])
+        record = [sample for sample in self._record if sample.stamp_ns > after_ns]
+        stamp_ns = np.array([sample.stamp_ns for sample in record])
         place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
         place, kept = np.unique(place, return_index=True)
-        y, u = (np.array([row[column] for row in record])[kept] for column in (1, 2))
+        y = np.array([sample.y for sample in record])[kept]
+        u = np.array([sample.u for sample in record])[kept]
         t = seconds(int(stamp_ns[0])) + self._period * np.arange(place[-1] + 1)
         whole = np.full((len(t), y.shape[1]), np.nan)
         whole[place] = y
@@ -151,8 +171,8 @@ class Learner:
 
     def _proposal(self, flown: int) -> Proposal:
         """The proposal of `propose`. Raises ParameterError where there is none."""
-        end_ns = self._record[-1][0] if self._record else 0
-        length = seconds(end_ns - self._record[0][0]) + self._period if self._record else 0.0  # lost ticks included
+        end_ns = self._record[-1].stamp_ns if self._record else 0
+        length = seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
             return Proposal(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
         self._note_fallback(flown)
@@ -167,7 +187,7 @@ class Learner:
         if not (due or found or self._changed):
             return Proposal(None, unchanged(changes))
         if found:
-            self._record = deque(row for row in self._record if row[0] > end_ns - nanoseconds(RECORD))
+            self._record = deque(sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD))
             self._prior = self._model
             self._changed |= {change.outputs for change in found}
         identified = self.identification = self._identified()
@@ -188,14 +208,14 @@ class Learner:
             learned = {outputs for outputs, of_part in known.items() if not of_part.is_rough} - self._changed
             before = model if part.outputs in learned and not lost else None
             of_flight = "" if rough else part.refusal or not_white(part) or weaker(part, before)
-            if refusal := uncoupled(part, known) or of_flight:
+            if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or of_flight:
                 refusals.append(refusal)
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
             model = with_entries(model, entries)
             deviation = {entry.name: abs(entry.deviation * entry.unit / entry.value) for entry in entries if entry.value}
             known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
-            known[part.outputs] = Known(end_ns, deviation, self._actuation.delay if rough else part.delay, rough)
+            known[part.outputs] = Known(end_ns, deviation, part.delay, rough, part.delay_deviation)
             sentences.append(
                 f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
             )
@@ -209,6 +229,7 @@ class Learner:
         self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
         self._known, self._model, self._dead = known, model, gone
         self._last, self._proposed = proposed, proposed.digest()
+        self._proposals.add(self._proposed)
         return Proposal(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
     def _note_fallback(self, flown: int) -> None:
@@ -301,12 +322,19 @@ class Learner:
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
-        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not steady over the test."""
+        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not steady over the test.
+
+        Nor is there one where the law fell back in these seconds, or an output oscillated: a loop near instability moves y as
+        no model with a stable loop says, and healthy inputs look weak.
+        """
         tested = {part: known for part, known in self._known.items() if part not in self._changed}
         old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
         if not old or self._believed.drift > DRIFT:
             return []
-        whole = self.recording(end_ns - nanoseconds(RECORD))
+        begin_ns = end_ns - nanoseconds(RECORD)
+        if self._fell_back(begin_ns) or self._oscillated(begin_ns):
+            return []
+        whole = self.recording(begin_ns)
         recent, ratio = self._steady(whole)
         if len(recent.t) < len(whole.t):
             return []
@@ -314,19 +342,66 @@ class Learner:
         changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
         return [change for change in changes if change.outputs in old]
 
+    def _fell_back(self, after_ns: int) -> bool:
+        """Whether the law fell back after an instant: other parameters than a proposal replaced those that flew."""
+        flown = [sample.flown for sample in self._record if sample.stamp_ns > after_ns]
+        return any(new != old and new not in self._proposals for old, new in pairwise(flown))
+
+    def _oscillated(self, after_ns: int) -> bool:
+        """Whether an output oscillated after an instant, over the whole time."""
+        y = np.array([sample.y for sample in self._record if sample.stamp_ns > after_ns])
+        return bool(divergence.oscillating(y, divergence.least(self._controller.outputs)).any())
+
     def _designed(
         self, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
     ) -> RiseDiConfig:
-        """The controller of a model, with the law of the start in the parts without one. Raises ParameterError."""
+        """The controller of a model, with the law of the start in the parts without one.
+
+        Its delay margin is the one behind the latest delay of the parts. Raises ParameterError.
+        """
+        start = self._controller
+        latest = max((value.latest for value in known.values()), default=0.0)
+        try:
+            return self._designed_behind(latest, model, known, dead)
+        except ParameterError as error:
+            if margin_behind(latest, start) > margin_of(start):
+                raise ParameterError(f"u is up to {1e3 * latest:.0f} ms late: {error}") from None
+            raise
+
+    def _designed_behind(
+        self, delay: float, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+    ) -> RiseDiConfig:
+        """`_designed`, with the delay margin behind a delay, s. Raises ParameterError."""
         start = self._controller
         learned = {output for part in known for output in part}
         bare = [output not in learned for output in start.outputs]
         designed = start.model_copy(update={"learn": None})
         if learned:
-            designed = self._design(designed, model)
+            designed = self._design(with_margin(designed, margin_behind(delay, start)), model)
             designed = _with_deviations(designed, {k: v for part in known.values() for k, v in part.deviation.items()})
         proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
         return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal")
+
+
+def margin_of(controller: RiseDiConfig) -> float:
+    """The delay margin that a controller loads with, s."""
+    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
+    return controller.observer.margin
+
+
+def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
+    """A controller that loads with another delay margin, s."""
+    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
+    return controller.model_copy(update={"observer": controller.observer.model_copy(update={"margin": margin})})
+
+
+def margin_behind(delay: float, start: RiseDiConfig) -> float:
+    """The delay margin of a model whose inputs are late by a delay, s: that of the start, or more.
+
+    Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
+    """
+    left = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
+    return max(margin_of(start), round(delay + left, 4))  # 0.1 ms, as few digits as the file of a scenario
 
 
 def unchanged(changes: Iterable[Change]) -> str:
@@ -378,6 +453,15 @@ def not_white(found: Part) -> str:
         return ""
     name = found.outputs[worst]
     return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
+
+
+def too_late(found: Part, delay: float) -> str:
+    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of the loop, s."""
+    bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
+    if found.delay < bound - 1e-6:  # s, of rounding
+        return ""
+    names = " and ".join(found.inputs)
+    return f"{names}: found u {1e3 * found.delay:.0f} ms late or later, expected less than {1e3 * bound:.0f} ms"
 
 
 def uncoupled(found: Part, known: Iterable[tuple[str, ...]]) -> str:

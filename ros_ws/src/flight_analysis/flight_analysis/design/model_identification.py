@@ -43,6 +43,7 @@ from flight_core.vectors import FloatArray
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
 WIND_PRIOR = 1.0  # 1, the same of the logarithm of the strength of the wind along an axis
 MAX_ERROR = 0.6  # 1, lower bound of a relative error: two standard deviations
+MAX_DELAY_ERROR = 4.0  # standard deviations, bound of the error of the delay: 60 ms for one of 15 ms
 MAX_FACTOR = 2.5  # 1, of a value over the nominal one: 1 / (1 - MAX_ERROR), for a rough model errs by a factor either way
 
 FOLLOWS = 10.0  # 1, of innovations that follow the u of another part, see `correlation`: uncoupled aircraft have up to 3
@@ -238,7 +239,8 @@ class Search:
         self._lower = -self._upper
         self._upper[self._errors] = deviation / PRIOR * [entry.largest for entry in self.nominal_entries()]
         if len(of_delay):  # no u acts before it is sent
-            self._lower[-1] = max(self._lower[-1], -self._delay / self._delay_deviation)
+            self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
+            self._upper[-1] = MAX_DELAY_ERROR
         self._winds = slice(len(deviation), len(deviation) + len(of_winds))
         self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
 
@@ -554,6 +556,7 @@ class Part(NamedTuple):
     refusal: str  # why this part must not be used, one sentence; empty if it may
     delay: float  # s, of its inputs
     gusts: bool  # whether FEW of its seconds, or more, are of gusts
+    delay_deviation: float = 0.0  # s, standard deviation of `delay`; 0 for a known delay
 
 
 class Identification(NamedTuple):
@@ -622,7 +625,8 @@ def identify(
         )
         refusal, delay = next(filter(None, sentences), ""), recorded.period * search.delay(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
-        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts)
+        delay_deviation = unknown.delay * float(fit.deviation[-1])
+        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
 
     found = []
     for search in map(search_of, every):
