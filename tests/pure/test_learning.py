@@ -453,6 +453,17 @@ def test_delay_margin_counts_the_delay_that_was_found(
     assert made.model is None  # what flies stays
 
 
+def test_file_that_explains_the_flight_behind_a_delay_is_designed_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The nominal model predicts the flight with the delay that the search found: without it, its innovations are not white."""
+    white = Prediction(np.ones(2), np.ones(2), 2.0)
+    made = learner_that_finds(lateral(delay=0.02, delay_deviation=0.002)._replace(before=white, after=white), monkeypatch)
+    proposed = made.propose(0)
+    assert proposed.sentence == "p and r of the airframe osprey as it is"
+    assert proposed.controller is not None
+    assert proposed.controller.observer is not None
+    assert proposed.controller.observer.margin == pytest.approx(0.034)  # found, two deviations, and 10 ms that are left
+
+
 def test_start_with_less_margin_keeps_what_it_leaves_beyond_its_own_delay() -> None:
     observer = scenario().rise_di().model_dump()["observer"] | {"margin": 0.015}
     start = scenario(delay=0.006, observer=observer).rise_di()
@@ -476,6 +487,7 @@ def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_la
     (taken,) = tape.changes
     assert taken["observer.margin"] == pytest.approx(0.04 + 0.01, abs=0.01)  # a delay within 5 ms, and its deviations
     flown = vary(late.rise_di(), taken)
+    assert isinstance(flown, RiseDiConfig)
     true, loop = late.aircraft.sampled_airframe(), Loop(np.array(flown.lag), 0.04, 0.01)
     assert is_stable(plant_of(true, flown), linear_law(flown.tuned_law(), 4, 0.01), loop, np.zeros(4))
     units = np.array([0.01, 0.1, 0.02, 0.01])
