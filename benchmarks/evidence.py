@@ -92,7 +92,8 @@ QUICK_CAMPAIGN = (*CAMPAIGN, "--aircraft", "2000", "--chunk", "200", "--exact", 
 CLUSTER = (PYTHON, "-m", "benchmarks.cluster", "--json", FILE)
 VIEW = (PYTHON, "-m", "benchmarks.view", "--json", FILE)
 QUICK_VIEW = (*VIEW, "--hours", "0.05", "--seconds", "20", "--count", "2")
-SECURITY = (*PYTEST, "tests/ros/test_security.py")
+SECURITY = (*PYTEST, "tests/ros/test_security.py", "tests/nodes/test_security.py")
+POLICY = ("tests/ros/test_policy.py", "tests/nodes/test_policy.py")
 HYPOTHESIS = (*PYTEST, "-n", "auto", "tests/fuzz")
 CAMPAIGN_OF = ("rise-di", "campaign", "--uncertainty", "0.3", "--seed", "7", "--json")
 FLEET, MISSIONS = ((*CAMPAIGN_OF, name, "--aircraft") for name in ("osprey_servo", "osprey_route"))
@@ -111,7 +112,7 @@ MEASUREMENTS = (
         "3 min",
         timed=True,
     ),
-    Measurement("security", (*SECURITY, "tests/ros/test_policy.py"), SECURITY, evidence_rows.tests, "2 min"),
+    Measurement("security", (*SECURITY, *POLICY), SECURITY, evidence_rows.tests, "2 min"),
     Measurement("fuzz", HYPOTHESIS, HYPOTHESIS, evidence_rows.tests, "1 min"),
     Measurement("fuzz-coverage", (*FUZZ, "--seconds", "30"), (*FUZZ, "--seconds", "5"), evidence_rows.fuzz, "3 min"),
     Measurement("campaign", CAMPAIGN, QUICK_CAMPAIGN, evidence_rows.campaign, "3 min", timed=True),

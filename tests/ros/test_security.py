@@ -4,7 +4,6 @@
 
 import json
 import shutil
-import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import psutil
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process, Start
@@ -22,7 +20,7 @@ from tests.ros.waiting import until
 
 from flight_ros.messages import Encoder
 from flight_ros.topics import U
-from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
+from flight_ros.transport import LOOPBACK_PROFILE
 
 pytestmark = pytest.mark.package("flight_ros")
 
@@ -81,34 +79,6 @@ def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None
     second = aircraft(start_node, "-p", "max_age:=0.1")
     peer_node.until(partial(peer_node.counted, "refused u: old"), each=lambda: publisher.publish(replayed))
     assert "receiving u from" not in second.output
-
-
-# Sockets
-
-
-class EarlierProcess(psutil.Process):
-    """As psutil has it before release 6."""
-
-    connections = psutil.Process.net_connections
-
-    @property
-    def net_connections(self) -> None:  # type: ignore[override]
-        """Raise AttributeError."""
-        raise AttributeError
-
-
-@pytest.mark.parametrize("process", [psutil.Process, EarlierProcess])
-def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
-    process: type[psutil.Process], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(psutil, "Process", process)
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOOPBACK_PROFILE))
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local:
-        opened.bind(("0.0.0.0", 0))  # noqa: S104 - on purpose, for nothing to read
-        local.bind(("127.0.0.1", 0))
-        found = open_to_network()
-        assert f"0.0.0.0:{opened.getsockname()[1]}" in found
-        assert not any(address.endswith(f":{local.getsockname()[1]}") for address in found)
 
 
 # Attacks from another host: a separate network namespace, connected by a pair of virtual Ethernet devices

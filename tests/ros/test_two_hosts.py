@@ -7,12 +7,14 @@ import shutil
 import signal
 import struct
 import subprocess
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.ros.conftest import Start, settable_clock
-from tests.ros.test_security import environment, is_separate, wait_until
+from tests.ros.test_security import environment, is_separate
+from tests.ros.waiting import until
 
 from flight_ros.network import network_profile
 
@@ -32,7 +34,7 @@ def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(start: Start, start
     holders = [subprocess.Popen([unshare, "--net", "sleep", "300"], stderr=subprocess.PIPE) for _ in ADDRESSES]
     try:
         for holder in holders:
-            wait_until(is_separate, holder)
+            until(partial(is_separate, holder), "a namespace of its own")
             if holder.poll() is not None:
                 pytest.skip("no network namespace for this user")
         relay = start("tests.ros.relay", *(str(holder.pid) for holder in holders), str(DELAY), str(LOSS), within=environment())

@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sockets that are open to the network are found."""
+
+import socket
+
+import psutil
+import pytest
+
+from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
+
+pytestmark = pytest.mark.package("flight_ros")
+
+
+class EarlierProcess(psutil.Process):
+    """As psutil has it before release 6."""
+
+    connections = psutil.Process.net_connections
+
+    @property
+    def net_connections(self) -> None:  # type: ignore[override]
+        """Raise AttributeError."""
+        raise AttributeError
+
+
+@pytest.mark.parametrize("process", [psutil.Process, EarlierProcess])
+def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
+    process: type[psutil.Process], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(psutil, "Process", process)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOOPBACK_PROFILE))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local:
+        opened.bind(("0.0.0.0", 0))  # noqa: S104 - on purpose, for nothing to read
+        local.bind(("127.0.0.1", 0))
+        found = open_to_network()
+        assert f"0.0.0.0:{opened.getsockname()[1]}" in found
+        assert not any(address.endswith(f":{local.getsockname()[1]}") for address in found)
