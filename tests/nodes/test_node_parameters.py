@@ -26,10 +26,6 @@ NODES: Mapping[str, type[FlightNode[Any]]] = {
     "controller": ControllerNode,
     "recorder": RecorderNode,
 }
-KEY_FILE = (
-    "found a message key, expected none: messages no longer carry codes; "
-    "DDS Security (SROS2), or a tunnel between hosts, protects a flight (docs/security.md)"
-)
 
 
 @pytest.mark.parametrize("name", ["aircraft", "reference_model", "controller"])
@@ -48,7 +44,6 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
         (["-p", "beta:=[1.0,2.0]"], "controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
         (["-p", "D:=[1,1,1,0]"], "controller.D[3]: found 0, expected 1 or -1"),
         (["-p", "use_sim_time:=true"], "controller.use_sim_time: found true, expected false: in real time a node ticks"),
-        (["-p", "key_file:=flight.key"], f"controller.key_file: {KEY_FILE}"),
         (["-r", "__node:=rise"], "rise: found no parameters, expected a section for /rise in a file of --params-file"),
         (["-p", "rate:=0100"], "rate: found '0100' in line 1, expected a number without a 0 before it"),
     ],
