@@ -79,10 +79,10 @@ class Process:
         """Its child process of this module."""
         return next(child for child in self.children() if module in child.cmdline())
 
-    def until(self, condition: Callable[[], T], because: str = "", timeout: float = HANG) -> T:
+    def until(self, condition: Callable[[], T | None], because: str, timeout: float = HANG) -> T:
         """Wait until a condition holds. The process must not end before."""
 
-        def holds() -> T:
+        def holds() -> T | None:
             value = condition()
             assert value or self.popen.poll() is None, self.output
             return value

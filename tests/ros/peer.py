@@ -50,8 +50,8 @@ class Peer:
 
     def until(
         self,
-        condition: Callable[[], T],
-        because: str = "",
+        condition: Callable[[], T | None],
+        because: str,
         *,
         each: Callable[[], object] | None = None,
         timeout: float = HANG,
@@ -88,9 +88,9 @@ class Peer:
     def call(self, kind: Any, name: str, request: Any, each: Callable[[], None] | None = None) -> Any:
         """Call a service and wait for its answer; `each` is called every 5 ms meanwhile."""
         client = self.node.create_client(kind, name)
-        self.until(client.service_is_ready, each=each)
+        self.until(client.service_is_ready, f"the service {name}", each=each)
         future = client.call_async(request)
-        self.until(future.done, each=each)
+        self.until(future.done, f"an answer of {name}", each=each)
         return future.result()
 
     def transition(self, number: int) -> bool:

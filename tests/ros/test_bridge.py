@@ -175,9 +175,9 @@ def test_bridge_that_ends_releases_and_one_that_is_killed_leaves_it_to_the_autop
 def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--duration", "9", "--json")
-    setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
+    setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
     refused = start("flight_cli.cli", "engage")
-    setup.peer.until(lambda: flight.popen.poll() is not None)
+    setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
     assert refused.end() == 1
     assert "error: not engaged: dry_run is true: nothing is sent" in refused.output
     assert flight.end() in {0, STATUS_INCOMPLETE}, flight.output  # incomplete: the host paused
@@ -208,18 +208,18 @@ def test_controller_is_active_only_while_engaged_and_summary_says_when_and_why(
     setup.autopilot()
     flight = start("flight_cli.cli", "fly", str(SCENARIO), "--bridge", setup.map, "--send", "--duration", "10000", "--json")
     # A busy host may start the bridge later than the 10 s for which the command waits for one.
-    setup.peer.until(lambda: setup.peer.node.count_publishers("bridge/engagement"))
+    setup.peer.until(lambda: setup.peer.node.count_publishers("bridge/engagement"), "the bridge")
     engaged = start("flight_cli.cli", "engage")  # before all nodes run: it waits for the first u
-    setup.peer.until(lambda: engaged.popen.poll() is not None)
+    setup.peer.until(lambda: engaged.popen.poll() is not None, "the end of the command")
     engaged.succeed()
-    setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]))
+    setup.peer.until(lambda: any(any(u.position) for u in setup.peer.received["u"]), "a u away from trim")
     off = start("flight_cli.cli", "engage", "--off")
-    setup.peer.until(lambda: off.popen.poll() is not None)
+    setup.peer.until(lambda: off.popen.poll() is not None, "the end of the command")
     off.succeed()
     end_ns = time.time_ns() + 3 * NANOSECONDS  # a second beyond what is checked
     setup.peer.until(lambda: (y := setup.peer.last("y")) and stamp_ns(y) > end_ns, "three seconds without an engagement")
     flight.interrupt()
-    setup.peer.until(lambda: flight.popen.poll() is not None)
+    setup.peer.until(lambda: flight.popen.poll() is not None, "the end of the flight")
     assert flight.end() == 130, flight.output
     run = tmp_path / "runs" / "latest"
     summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
@@ -249,9 +249,9 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup,
     options = ("--speed", "25", "--amplitude", "0.3", "--write", "found", "--json")
     # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and refused it.
     identify = start("flight_cli.cli", "identify", "--bridge", setup.map, *options)
-    setup.peer.until(lambda: setup.peer.received["bridge/would_send"])
+    setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
     setup.command(None).succeed()
-    setup.peer.until(lambda: identify.popen.poll() is not None)
+    setup.peer.until(lambda: identify.popen.poll() is not None, "the end of the command")
     identify.succeed()
     found = json.loads(identify.lines[-1])
     assert found["inputs"] == ["aileron"]

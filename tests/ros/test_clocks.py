@@ -30,8 +30,8 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
     def told(sentence: str) -> bool:  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
         return any(float(offset) == pytest.approx(0.15, abs=0.01) for offset in re.findall(sentence, controller.output))
 
-    controller.until(partial(told, f"{estimate}: synchronise the hosts"))
-    controller.until(partial(told, f"old: {estimate}"))
+    controller.until(partial(told, f"{estimate}: synchronise the hosts"), "the difference of the clocks, told")
+    controller.until(partial(told, f"old: {estimate}"), "the refusal, with the difference of the clocks")
     with peer(topics=()) as peer_node:
         found: list[float] = []
 
@@ -40,4 +40,7 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
             found.extend(float(values[key]) for key in [f"clock of {name} (s)"] if key in values)
 
         peer_node.node.create_subscription(DIAGNOSTICS.type, DIAGNOSTICS.name, take, 10)
-        peer_node.until(lambda: any(offset == pytest.approx(-0.15, abs=0.002) for offset in found))
+        peer_node.until(
+            lambda: any(offset == pytest.approx(-0.15, abs=0.002) for offset in found),
+            "the difference of the clocks in the diagnostics",
+        )

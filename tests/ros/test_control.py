@@ -72,7 +72,7 @@ class Page:
             found = self.post("state")[1]
             return is_expected(found)
 
-        flight.until(as_expected)
+        flight.until(as_expected, "the state that the page expects")
         return found
 
 
@@ -82,6 +82,7 @@ def test_target_not_taken_by_guidance_ends_when_cancelled(peer_node: Peer) -> No
         guidance = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force
         peer_node.until(
             lambda: peer_node.received["target"],
+            "a target",
             each=lambda: peer_node.publish("guidance", to_message(time.time_ns(), *guidance)),
         )
         client.cancel()
@@ -113,7 +114,10 @@ def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path
     assert page.post("fault", values={"actuators.stuck_at": [None, None, None, 0]})[0] == 200
     assert page.post("gust", axis="vertical", speed=3.0, length=100.0)[0] == 200  # 4 s: a pause of the host hides no gust
     truth = peer_node.received["truth"]
-    peer_node.until(lambda: any(message.position[message.name.index("gust.vertical")] > 2.0 for message in truth[-1:]))
+    peer_node.until(
+        lambda: any(message.position[message.name.index("gust.vertical")] > 2.0 for message in truth[-1:]),
+        "a gust in the truth",
+    )
     status, refused = page.post("fault", values={"sensors.dropout": 2.0})
     assert (status, "sensors.dropout" in refused["refused"]) == (422, True)
     assert page.post("deactivate")[0] == 200

@@ -46,7 +46,7 @@ def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(start: St
     def engaged(name: str) -> bool:
         return any("OFF -> ENGAGED" in log.read_text() for log in tmp_path.glob(f"runs/*-{name}-*/log/one_process.log"))
 
-    fleet.until(lambda: engaged("one") and engaged("two"))
+    fleet.until(lambda: engaged("one") and engaged("two"), "both aircraft engaged")
     target = [sys.executable, "-m", "flight_cli.cli", "target", "heading=90"]
     missing = subprocess.Popen(target, stderr=subprocess.PIPE, text=True)
     nodes = fleet.children()

@@ -30,7 +30,7 @@ Engaged = tuple[Process, list[psutil.Process]]
 def engaged(start: Start, tmp_path: Path) -> Engaged:
     """A flight whose controller has engaged, and its four processes."""
     flight = start("flight_cli.cli", "fly", "osprey_gust")
-    flight.until(lambda: is_engaged(tmp_path))
+    flight.until(lambda: is_engaged(tmp_path), "a flight that has engaged")
     return flight, flight.children()
 
 
@@ -90,7 +90,7 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
 def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start) -> None:
     flight = start("flight_cli.cli", "fly", "osprey_gust")
     used = psutil.Process(flight.popen.pid).cpu_times
-    flight.until(lambda: used().user + used().system >= seconds)
+    flight.until(lambda: used().user + used().system >= seconds, "the processor time of the interrupt")
     nodes = flight.children()
     flight.interrupt()
     assert flight.end() in {130, -signal.SIGINT}, flight.output

@@ -34,7 +34,7 @@ def test_pose_of_flight_reaches_flightgear(start: Start, peer_node: Peer) -> Non
 
         words = ("--origin", "47.38,8.54", "--altitude", "400", "--to", f"127.0.0.1:{viewer.getsockname()[1]}")
         command = start("flight_cli.cli", "flightgear", "--namespace", "uav1", *words)
-        peer_node.until(lambda: bool(received), each=send)
+        peer_node.until(lambda: bool(received), "a packet for FlightGear", each=send)
     assert [fields(raw)["altitude"] for raw in received] == [450.0]  # m above sea level
     command.interrupt()
     assert command.end() == 130

@@ -124,7 +124,7 @@ class Flight:
         self.peer.publish("pose", to_message(now_ns, POSE, pose, "/aircraft#1"))
         self.peer.publish("internals", to_message(now_ns, ["mode"], np.array([float(ControllerMode.ENGAGED)]), "/controller#1"))
 
-    def until(self, condition: Callable[[], object], because: str = "") -> None:
+    def until(self, condition: Callable[[], object], because: str) -> None:
         """Send until the condition holds."""
         self.peer.until(condition, because, each=self.send)
 
@@ -138,14 +138,14 @@ class Flight:
 def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     """Guidance that has engaged."""
     made = Flight(start, peer_node, calm)
-    made.until(lambda: peer_node.received["u_m"])
+    made.until(lambda: peer_node.received["u_m"], "a u_m")
     return made
 
 
 def test_route_to_stopped_guidance_ends_when_cancelled(flight: Flight) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker, flight.process.stopped():
         sent = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
-        flight.until(lambda: flight.peer.node.count_publishers("route") == 1)
+        flight.until(lambda: flight.peer.node.count_publishers("route") == 1, "the publisher of the route")
         client.cancel()
         with pytest.raises(ParameterError, match="cancelled by a later request"):
             sent.result()
@@ -153,11 +153,14 @@ def test_route_to_stopped_guidance_ends_when_cancelled(flight: Flight) -> None:
 
 def test_command_target_says_what_is_in_force_and_what_refused(flight: Flight, start: Start) -> None:
     good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
-    flight.until(lambda: good.popen.poll() is not None)
+    flight.until(lambda: good.popen.poll() is not None, "the end of the command")
     assert "in force: heading=90, altitude=60" in good.succeed().output
-    flight.until(lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0))
+    flight.until(
+        lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0),
+        "both targets in force",
+    )
     refused = start("flight_cli.cli", "target", "phi=80")  # degrees
-    flight.until(lambda: refused.popen.poll() is not None)
+    flight.until(lambda: refused.popen.poll() is not None, "the end of the command")
     assert refused.end() == 1
     assert "error: not in force: target.phi: found 80, expected -30 to 30 deg" in refused.output
 
@@ -167,20 +170,22 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
 
         def answer(method: Callable[..., str], *arguments: object) -> str:
             pending = worker.submit(method, *arguments)
-            flight.until(pending.done)
+            flight.until(pending.done, "an answer")
             return pending.result()
 
         assert answer(client.send_target, {"phi": 0.2}) == ""
-        flight.until(lambda: flight.last("target.phi") == 0.2)
+        flight.until(lambda: flight.last("target.phi") == 0.2, "the target in force")
         # The log has these values already; guidance refuses two lateral commands at once.
         refused = answer(client.send_target, {"theta": 0.0, "leg": 0.0, "phi": 0.2})
         assert refused == "target: found theta, leg, phi, expected one lateral and one vertical command at most"
         assert answer(client.guide, "skip") == "no route with a further leg is flown"
         assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
-        flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE)
-        flight.until(lambda: flight.peer.node.count_publishers("route") == 0)  # a later guidance receives no route of before
+        flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, "a flown route")
+        flight.until(
+            lambda: flight.peer.node.count_publishers("route") == 0, "a route that is withdrawn"
+        )  # a later guidance receives no route of before
         leg = flight.last("leg")
         assert answer(client.guide, "skip") == ""
-        flight.until(lambda: flight.last("leg") > leg)
+        flight.until(lambda: flight.last("leg") > leg, "the next leg")
         assert answer(client.guide, "hold") == ""
-        flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING)
+        flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING, "the held heading")

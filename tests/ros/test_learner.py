@@ -74,11 +74,11 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")
     start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
-    command.until(lambda: command.output.count("no model: record") > said)
+    command.until(lambda: command.output.count("no model: record") > said, "an identification of another learner")
     # no byte more, as on a full disk: the write fails, and Python ignores SIGXFSZ
     command.child("flight_recorder.main").rlimit(psutil.RLIMIT_FSIZE, (0, 0))
     recorder_log = next((tmp_path / "runs").rglob("recorder.log"))
-    command.until(lambda: "recording ended" in recorder_log.read_text())
+    command.until(lambda: "recording ended" in recorder_log.read_text(), "the end of the recording")
     said = command.output.count("t = ")
-    command.until(lambda: command.output.count("t = ") > said)
+    command.until(lambda: command.output.count("t = ") > said, "a line of the flight")
     assert command.interrupt().end() == 130  # it flew on until then

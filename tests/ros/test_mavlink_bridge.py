@@ -48,14 +48,18 @@ def test_engaged_bridge_overrides_sticks_and_gives_them_back_by_request_and_at_a
         def engage(on: bool) -> str:
             return str(node.call(SetBool, "bridge/engage", SetBool.Request(data=on), command).message)
 
-        node.until(lambda: engage(on=True) == "", each=command)
-        node.until(lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"), each=command)
+        node.until(lambda: engage(on=True) == "", "an engagement", each=command)
+        node.until(lambda: autopilot.has_logged(f"channels 1500 {PULSE} 1500 1500"), "the overridden sticks", each=command)
         engage(on=False)
-        node.until(lambda: autopilot.lines[-1] == TRIM, each=command)
+        node.until(lambda: autopilot.lines[-1] == TRIM, "the sticks of the transmitter", each=command)
         (y, attitude) = (node.last(topic) for topic in ("y", "mavlink/ATTITUDE"))
         assert list(y.name) == ["q", "V", "p", "r"]
         assert list(attitude.name) == ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"]
 
-        node.until(lambda: engage(on=True) == "", each=command)
+        node.until(lambda: engage(on=True) == "", "an engagement", each=command)
         autopilot.popen.kill()
-        node.until(lambda: bridge.has_logged("ENGAGED -> RELEASE: ", "old (mavlink/ATTITUDE)"), each=command)
+        node.until(
+            lambda: bridge.has_logged("ENGAGED -> RELEASE: ", "old (mavlink/ATTITUDE)"),
+            "the release at the lost link",
+            each=command,
+        )

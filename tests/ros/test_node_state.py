@@ -39,7 +39,10 @@ def test_late_subscriber_gets_state_of_each_process(start_node: Start) -> None:
         states = received_states(peer_node, "/one/node_state")
         # The aircraft has the publisher of u; the controller lacks that of y_m.
         expected = {"controller": "ready", "aircraft": "matched"}
-        peer_node.until(lambda: states == {f"/one/{name}#{node.popen.pid}": expected[name] for name, node in nodes.items()})
+        peer_node.until(
+            lambda: states == {f"/one/{name}#{node.popen.pid}": expected[name] for name, node in nodes.items()},
+            "the state of each process",
+        )
 
 
 def test_aircraft_completes_lockstep_flight_and_process_has_id(
@@ -53,14 +56,14 @@ def test_aircraft_completes_lockstep_flight_and_process_has_id(
         states = received_states(peer_node)
         roles = ("aircraft", "controller", "recorder", "reference_model")
         expected = {f"/{role}#{flight.popen.pid}": "completed" if role == "aircraft" else "ready" for role in roles}
-        peer_node.until(lambda: states == expected)
+        peer_node.until(lambda: states == expected, "the completed flight and the ready nodes")
 
 
 def test_monitor_tells_node_from_one_of_another_flight(start_node: Start, osprey_gust: Scenario) -> None:
     node = start_node("rise_di_controller")
     with FlightMonitor(osprey_gust.controller.outputs, lockstep=True) as monitor:
         pid = node.popen.pid
-        node.until(lambda: monitor.is_ready("controller", pid))
+        node.until(lambda: monitor.is_ready("controller", pid), "a controller that is ready")
         assert not monitor.is_ready("controller", pid + 1)
         assert not monitor.is_ready("recorder", pid)
 
@@ -70,9 +73,9 @@ def test_aircraft_waits_for_start(start_node: Start, peer_node: Peer) -> None:
     aircraft = start_node("aircraft_sim", "-p", "start_time:=-1.0").wait_for("ready")
     states = received_states(peer_node)
     send = peer_node.node.create_publisher(START.type, START.name, STATE)
-    peer_node.until(lambda: set(states.values()) == {"ready"})
+    peer_node.until(lambda: set(states.values()) == {"ready"}, "an aircraft that is ready")
     peer_node.node.create_publisher(JointState, "u", PUBLISH)
-    peer_node.until(lambda: states[f"/aircraft#{aircraft.popen.pid}"] == "matched")
+    peer_node.until(lambda: states[f"/aircraft#{aircraft.popen.pid}"] == "matched", "an aircraft that is matched")
     assert peer_node.received["/y"] == []
     start_ns = time.time_ns() + 200_000_000
     send.publish(instant(start_ns))

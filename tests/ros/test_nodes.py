@@ -72,7 +72,10 @@ def test_node_stopped_during_start_shuts_down_cleanly(start_node: Start, peer_no
     node = start_node("rise_di_controller")
     early_participant = f"_start_{node.popen.pid}"
     # The start may be faster than the discovery.
-    peer_node.until(lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output)
+    peer_node.until(
+        lambda: early_participant in peer_node.node.get_node_names() or "ready" in node.output,
+        "the early participant, or a node that is ready",
+    )
     node.popen.send_signal(signal.SIGTERM)
     assert node.end() == 0
     assert "Traceback" not in node.output
@@ -80,7 +83,7 @@ def test_node_stopped_during_start_shuts_down_cleanly(start_node: Start, peer_no
 
 def test_early_participant_destroyed_once_node_exists(start_node: Start, peer_node: Peer) -> None:
     start_node("rise_di_controller").wait_for("ready")
-    peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"})
+    peer_node.until(lambda: set(peer_node.node.get_node_names()) == {"peer", "controller"}, "no early participant")
 
 
 def test_no_module_imported_by_ready_node(start_node: Start, monkeypatch: pytest.MonkeyPatch, peer_node: Peer) -> None:
@@ -91,7 +94,7 @@ def test_no_module_imported_by_ready_node(start_node: Start, monkeypatch: pytest
     def reports(name: str) -> int:
         return sum(message.status[0].name == f"/{name}" for message in peer_node.received["/diagnostics"])
 
-    peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()))
+    peer_node.until(lambda: all(reports(name) >= 3 for name in NODES.values()), "three reports of each node")
     assert any("ENGAGED" in node.output for node in nodes)
     for node in nodes:
         assert [line for line in node.output.partition("]: ready")[2].splitlines() if "import time:" in line] == []
@@ -107,7 +110,7 @@ def test_requests_whose_replies_do_not_arrive_leave_controller_ticks(start_node:
     def changes() -> list[float]:
         return [float(stamp) for stamp in re.findall(r"\[([\d.]+)\] \[controller\]: k_g: ", node.output)]
 
-    peer_node.until(lambda: len(changes()) >= 3, each=lambda: client.call_async(request))
+    peer_node.until(lambda: len(changes()) >= 3, "three changes of a gain", each=lambda: client.call_async(request))
     assert np.diff(changes()).min() > 0.9  # s; without a pause 0.11
 
 

@@ -167,7 +167,7 @@ def test_controller_in_real_time_follows_recorded_flight(
             node = start_node("rise_di_controller").wait_for("ready")
             process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
             node.wait_for("WAITING -> ENGAGED")
-            peer_node.until(lambda: process.popen.poll() is not None)  # noqa: B023 - of this flight
+            peer_node.until(lambda: process.popen.poll() is not None, "the end of the player")  # noqa: B023 - of this flight
             process.succeed()
             u = peer_node.u()
         node.interrupt().succeed()

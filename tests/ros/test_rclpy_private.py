@@ -42,8 +42,8 @@ def test_serialised_message_taken_without_executor(peer_node: Peer) -> None:
     publish = peer_node.node.create_publisher(Int64, "number", QoSProfile(depth=10)).publish
     wait_set = rclpy_private.WaitSet([subscription], context)
     assert not wait_set.wait(0)
-    peer_node.until(lambda: peer_node.node.count_subscribers("number") == 1)
-    peer_node.until(lambda: wait_set.wait(1_000_000), each=lambda: publish(serialize_message(Int64(data=7))))
+    peer_node.until(lambda: peer_node.node.count_subscribers("number") == 1, "the subscription")
+    peer_node.until(lambda: wait_set.wait(1_000_000), "a message", each=lambda: publish(serialize_message(Int64(data=7))))
     raw, information = rclpy_private.take_messages(subscription, 1)[0]
     assert deserialize_message(raw, Int64).data == 7
     assert information["source_timestamp"] <= information["received_timestamp"]
@@ -56,9 +56,9 @@ def test_bytes_that_are_no_message_raise_error_that_nodes_catch() -> None:
 
 def test_participant_is_in_graph_until_it_destroyed(peer_node: Peer) -> None:
     participant = rclpy_private.create_participant("_early", peer_node.node.context)
-    peer_node.until(lambda: "_early" in peer_node.node.get_node_names())
+    peer_node.until(lambda: "_early" in peer_node.node.get_node_names(), "the participant")
     rclpy_private.destroy_participant(participant)
-    peer_node.until(lambda: "_early" not in peer_node.node.get_node_names())
+    peer_node.until(lambda: "_early" not in peer_node.node.get_node_names(), "no participant")
 
 
 def test_ready_callback_executed_and_raises_what_it_raises(peer_node: Peer) -> None:
@@ -84,6 +84,6 @@ def test_ready_callback_executed_and_raises_what_it_raises(peer_node: Peer) -> N
             except RuntimeError as error:
                 found.append(str(error))
 
-    peer_node.until(lambda: bool(found), each=look)
+    peer_node.until(lambda: bool(found), "the exception of the callback", each=look)
     assert found[0] == "of the callback"
     node.destroy_node()

@@ -57,9 +57,9 @@ def errors(process: Process) -> list[str]:
 def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
     peer_node.node.get_logger().info("logged before the recorder started")
     process = recorder("run")
-    peer_node.until(lambda: recorded(peer_node, "/rosout") > 1)
+    peer_node.until(lambda: recorded(peer_node, "/rosout") > 1, "a line of the log")
     peer_node.node.declare_parameter("gain", 3.0)
-    peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0)
+    peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0, "a parameter event")
     process.interrupt().succeed()
     with AnyReader([tmp_path / "run"]) as reader:
         recorded_messages = [
@@ -78,10 +78,14 @@ def test_further_topics_recorded_with_any_offered_qos(recorder: Recorder, peer_n
     process = recorder("run", "topics:=[/latched, relative/pressure, /late, /y]")
     process.wait_for("ready")
     weak = peer_node.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
-    peer_node.until(lambda: recorded(peer_node, "/relative/pressure") > 2, each=lambda: weak.publish(FluidPressure()))
+    peer_node.until(
+        lambda: recorded(peer_node, "/relative/pressure") > 2, "the pressure", each=lambda: weak.publish(FluidPressure())
+    )
     late = peer_node.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
-    peer_node.until(lambda: recorded(peer_node, "/late") > 2, each=lambda: late.publish(Temperature(temperature=1.0)))
-    peer_node.until(lambda: recorded(peer_node, "/latched") > 0)
+    peer_node.until(
+        lambda: recorded(peer_node, "/late") > 2, "the late topic", each=lambda: late.publish(Temperature(temperature=1.0))
+    )
+    peer_node.until(lambda: recorded(peer_node, "/latched") > 0, "the latched message")
     process.interrupt().succeed()
     counts = count_messages(tmp_path / "run")
     assert counts["/latched"] == 1  # published before the recorder started
@@ -94,10 +98,12 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recorder, peer_node:
     strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
     strong.publish(String(data="strong"))
     process = recorder("run", "topics:=[/mixed]")
-    peer_node.until(lambda: recorded(peer_node, "/mixed") == 1)
+    peer_node.until(lambda: recorded(peer_node, "/mixed") == 1, "the strong message")
     weak = peer_node.node.create_publisher(String, "/mixed", BEST_EFFORT)
     process.wait_for("/mixed: now recorded with best_effort")
-    peer_node.until(lambda: recorded(peer_node, "/mixed") > 3, each=lambda: weak.publish(String(data="weak")))
+    peer_node.until(
+        lambda: recorded(peer_node, "/mixed") > 3, "the weak messages", each=lambda: weak.publish(String(data="weak"))
+    )
     process.interrupt().succeed()
     texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/mixed"]
     assert sum(b"strong" in text for text in texts) == 1
@@ -127,11 +133,13 @@ def test_forged_end_of_topic_named(
         for topic in ("y", "y_m", "truth"):
             peer_node.publish(topic, to_message(time.time_ns(), OUTPUTS, np.zeros(4), f"/{topic}#1"))
 
-    peer_node.until(lambda: recorded(peer_node, "/truth") > 100, each=send)
+    peer_node.until(lambda: recorded(peer_node, "/truth") > 100, "a hundred samples of the truth", each=send)
     (writer,) = peer_node.node.get_publishers_info_by_topic("/truth")
     forge_gap(domain, bytes(writer.endpoint_gid))
     begin = time.time()
-    peer_node.until(lambda: process.has_logged("/truth: no message for 1 s while others go on"), each=send)
+    peer_node.until(
+        lambda: process.has_logged("/truth: no message for 1 s while others go on"), "the silence of the truth, told", each=send
+    )
     assert time.time() - begin < 3.0 + host_delays.since(begin)  # 1.1 s, and what a busy host needs
     process.interrupt().succeed()
     notes = read_run(tmp_path / "run").tape.notes
@@ -143,7 +151,7 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
     process.wait_for("ready")
     names, sent = [f"x.{k}" for k in range(100)], 0
     publisher = peer_node.node.create_publisher(JointState, "truth", PUBLISH)
-    peer_node.until(lambda: publisher.get_subscription_count() == 1)
+    peer_node.until(lambda: publisher.get_subscription_count() == 1, "the subscription of the recorder")
 
     def send(count: int) -> None:
         nonlocal sent
@@ -153,12 +161,15 @@ def test_lost_messages_are_counted_and_reported(recorder: Recorder, peer_node: P
 
     with process.stopped():
         send(1500)  # a publisher keeps a history of 2000
-    peer_node.until(lambda: recorded(peer_node, "/truth") == sent)
+    peer_node.until(lambda: recorded(peer_node, "/truth") == sent, "each message of the history")
     assert "lost /truth" not in diagnostics(peer_node)[2]
     with process.stopped():
         send(8000)  # more than that history and the socket buffer hold
-    peer_node.until(lambda: int(diagnostics(peer_node)[2].get("lost /truth", 0)) > 0)
-    peer_node.until(lambda: sent == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"]))
+    peer_node.until(lambda: int(diagnostics(peer_node)[2].get("lost /truth", 0)) > 0, "a loss, told")
+    peer_node.until(
+        lambda: sent == recorded(peer_node, "/truth") + int(diagnostics(peer_node)[2]["lost /truth"]),
+        "each message recorded or lost",
+    )
     process.interrupt().succeed()
     run = read_run(tmp_path / "run")
     lost = int(run.metadata["rise_di_lost"]["/truth"])

@@ -45,7 +45,7 @@ def replayed(start: Start, run: Path, *settings: str, equal: bool = True) -> dic
 def receive_more(peer_node: Peer, count: int) -> None:
     """Wait for further samples of `internals`."""
     enough = len(peer_node.received["internals"]) + count
-    peer_node.until(lambda: len(peer_node.received["internals"]) >= enough)
+    peer_node.until(lambda: len(peer_node.received["internals"]) >= enough, "further ticks")
 
 
 def with_limits(path: Path) -> Path:
@@ -79,19 +79,19 @@ def test_flight_in_real_time_replayed_with_parameter_changes_outages_and_busy_ho
     def modes() -> list[int]:
         return peer_node.modes()[-1:]
 
-    peer_node.until(lambda: modes() == [Mode.ENGAGED])
+    peer_node.until(lambda: modes() == [Mode.ENGAGED], "the law engaged")
     assert peer_node.set_parameters(k_g=1.5, Lambda=[4.0, 4.0, 2.0, 0.4])
     receive_more(peer_node, 50)
     assert peer_node.set_parameters(upper=[0.01] * 4)
     with both_cores_busy():  # ticks are late, and some are missed
         receive_more(peer_node, 50)
     assert peer_node.transition(Transition.TRANSITION_DEACTIVATE)
-    peer_node.until(lambda: modes() == [Mode.INACTIVE])
+    peer_node.until(lambda: modes() == [Mode.INACTIVE], "the law inactive")
     receive_more(peer_node, 20)
     assert peer_node.transition(Transition.TRANSITION_CLEANUP)
     assert peer_node.transition(Transition.TRANSITION_CONFIGURE)  # the law re-engages from its last u
     assert peer_node.transition(Transition.TRANSITION_ACTIVATE)
-    peer_node.until(lambda: modes() == [Mode.ENGAGED])
+    peer_node.until(lambda: modes() == [Mode.ENGAGED], "the law engaged again")
     receive_more(peer_node, 50)
     flight.interrupt()
     assert flight.end() == 130, flight.output
@@ -127,12 +127,15 @@ def test_late_recorder_leaves_first_tick_unchecked_and_notes_missing_samples(
     for package in ("rise_di_controller", "aircraft_sim", "reference_model"):
         start(f"{package}.main", *parameters)
     more_than_history = publisher_qos(period).depth + 200
-    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history)
+    peer_node.until(lambda: len(peer_node.received["internals"]) > more_than_history, "more ticks than the publishers keep")
     begin = time.time()
     recorder = start("flight_recorder.main", *parameters, "-p", f"scenario_file:={scenario}", "-p", "directory:=run")
     recorder.wait_for("recording to")
     with_history = 2 * publisher_qos(period).depth
-    peer_node.until(lambda: min(recorded(peer_node, "/u"), recorded(peer_node, "/internals")) > with_history)
+    peer_node.until(
+        lambda: min(recorded(peer_node, "/u"), recorded(peer_node, "/internals")) > with_history,
+        "the history and more in the log",
+    )
     recorder.interrupt().succeed()
     output = replayed(start, tmp_path / "run")
     assert output["checked"] < 0.99 * output["expected"]

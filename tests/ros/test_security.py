@@ -71,13 +71,19 @@ def test_replayed_u_refused_by_stamp(start_node: Start, peer_node: Peer) -> None
         send()
         publisher.publish(replayed)
 
-    peer_node.until(lambda: first.has_logged("receiving u from"), each=send)
+    peer_node.until(lambda: first.has_logged("receiving u from"), "a u that is taken", each=send)
     replayed = recorded[0]
-    peer_node.until(partial(peer_node.counted, "refused u: old"), each=replay_beside)  # once it is older than max_age
+    peer_node.until(
+        partial(peer_node.counted, "refused u: old"), "the refusal of the replayed u", each=replay_beside
+    )  # once it is older than max_age
     first.interrupt().succeed()
     peer_node.received["/diagnostics"].clear()
     second = aircraft(start_node, "-p", "max_age:=0.1")
-    peer_node.until(partial(peer_node.counted, "refused u: old"), each=lambda: publisher.publish(replayed))
+    peer_node.until(
+        partial(peer_node.counted, "refused u: old"),
+        "the refusal of the replayed u after a restart",
+        each=lambda: publisher.publish(replayed),
+    )
     assert "receiving u from" not in second.output
 
 

@@ -55,7 +55,7 @@ def test_age_of_u_is_right_and_pulled_cable_ends_in_failsafe(start: Start, start
         aircraft = start_node("aircraft_sim", within=hosts[1])
         # 0.05 s, as estimated from samples that wait in the relay and for a tick
         controller.wait_for(f"the clock of /aircraft#{aircraft.popen.pid} is 0.0")
-        stopwatch.until(lambda: len(stopwatch.lines) > REPORTS)
+        stopwatch.until(lambda: len(stopwatch.lines) > REPORTS, "the reports of the aircraft")
         rows = [re.fullmatch("told (.*) measured (.*)", line) for line in stopwatch.lines]
         told, measured = np.array([[float(value) for value in row.groups()] for row in rows if row][1:]).T
         # The aircraft looks for u every 2 ms, 1 ms late on average. Measured 0.5 to 1.2 ms; a second clock would give 50 ms.

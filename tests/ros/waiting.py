@@ -61,7 +61,10 @@ running: list[Logging] = []
 
 
 def until(
-    condition: Callable[[], T], because: str, each: Callable[[], object] = lambda: time.sleep(LOOK), timeout: float = HANG
+    condition: Callable[[], T | None],
+    because: str,
+    each: Callable[[], object] = lambda: time.sleep(LOOK),
+    timeout: float = HANG,
 ) -> T:
     """Wait until a condition is true; what it returned. `each` is called between two looks and takes some milliseconds.
 

@@ -617,10 +617,10 @@ def parameters(flight: Flight, random: Generator) -> None:
         def request(name: str, value: object) -> Any:
             return client.call_async(SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()]))
 
-        peer_node.until(client.service_is_ready)
+        peer_node.until(client.service_is_ready, "the service of parameters")
         k_g = load_scenario(flight.scenario).rise_di().k_g
         first = request("k_g", k_g)
-        peer_node.until(first.done)  # both ends of the service have discovered each other
+        peer_node.until(first.done, "the first answer")  # both ends of the service have discovered each other
         flight.begin_fault()
         futures: list[Any] = []
         done = 0
@@ -638,7 +638,7 @@ def parameters(flight: Flight, random: Generator) -> None:
         flight.end_fault()
         accepted = [future.result().results[0].successful for future in futures]
         assert accepted == valid.tolist()
-        peer_node.until(request("k_g", k_g).done)
+        peer_node.until(request("k_g", k_g).done, "the gain of before")
 
 
 def invalid_change(random: Generator) -> tuple[str, object]:
