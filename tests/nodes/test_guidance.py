@@ -166,7 +166,10 @@ def test_controller_that_was_inactive_holds_what_is_measured_and_one_in_failsafe
     for mode, kept in ((ControllerMode.HOLD, True), (ControllerMode.INACTIVE, False)):
         flight.target(heading=1.0)
         flight.mode = mode
+        flight.run(0.1)
+        silent = len(flight.world.sent["/u_m"])
         flight.run(0.5)
+        assert len(flight.world.sent["/u_m"]) == silent  # no command to a controller that does not fly
         flight.mode = ControllerMode.ENGAGED
         flight.run()
         assert (flight.last("target.heading") == 1.0) is kept

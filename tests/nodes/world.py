@@ -265,7 +265,7 @@ class World:
         node.destroy_node()
 
     def kill(self, node: AnyNode) -> None:
-        """SIGKILL. The node stays in the graph for the lease of its participant; `forget` ends it."""
+        """SIGKILL. What the node published stays in the graph, as for the lease of a participant."""
         self.loops.pop(node, None)
         self.nodes.remove(node)
         node.destroy_node()
