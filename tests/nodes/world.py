@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Self, TypeVar, cast
 import numpy as np
 import pytest
 import rclpy
+import rclpy.publisher
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
@@ -88,13 +89,18 @@ class Endpoint(NamedTuple):
     endpoint_type: TopicEndpointTypeEnum
 
 
-class Publisher:
+class Publisher(rclpy.publisher.Publisher):  # type: ignore[misc]
     """A publisher of a node, or of the test."""
 
     def __init__(self, world: "World", kind: type, topic: str, qos: QoSProfile | int, node: str) -> None:
-        self.topic_name, self.kind, self.sequence = topic, kind, 0
-        self._world = world
+        self.kind, self.sequence = kind, 0
+        self._world, self._topic = world, topic
         self.endpoint = world.endpoint(topic, kind, qos, node, TopicEndpointTypeEnum.PUBLISHER)
+
+    @property
+    def topic_name(self) -> str:
+        """The full name."""
+        return self._topic
 
     def publish(self, message: Any) -> None:
         """Put a message, or its bytes, into the queue of each subscription."""
@@ -152,6 +158,7 @@ class Client:
 
     def __init__(self, world: "World", service: str) -> None:
         self._world, self._service = world, service
+        self.srv_name = service
 
     def service_is_ready(self) -> bool:
         """Whether anyone answers."""
