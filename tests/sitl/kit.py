@@ -211,11 +211,19 @@ class Autopilot:
                 flight.end()
             self.level()
 
+    def requested(self, *options: str) -> Process:
+        """The end of `rise-di engage`, requested again until the rates of a MAVLink link are known, 2 s after its begin."""
+        for _ in range(ENGAGEMENTS):
+            request = self.start("engage", *options)
+            if request.end() == 0 or "not known yet" not in request.output:
+                break
+        return request
+
     def _engage_level(self, *options: str) -> None:
         """Engage, again from level flight where the aircraft climbs or sinks at the hand-over, as after a jammed surface."""
         for _ in range(ENGAGEMENTS):
             self.hand_over()
-            engaged = self.start("engage", *options)
+            engaged = self.requested(*options)
             if engaged.end() == 0 or "engage_if" not in engaged.output:
                 break
             self.level()
@@ -227,7 +235,7 @@ class Autopilot:
         excited = self.start(*command)
         excited.wait_for("DISENGAGED")
         self.hand_over()
-        self.engage().succeed()
+        self.requested(*self.engage_options).succeed()
         excited.wait_for("log: ", 150.0)
         self.level()
         return excited
