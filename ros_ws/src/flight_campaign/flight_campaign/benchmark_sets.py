@@ -138,4 +138,8 @@ def frame(scenario: Scenario) -> dict[str, Any]:
 
 
 def _airframe(scenario: Scenario) -> dict[str, Any]:
-    return load_airframe(scenario.aircraft.airframe).model_dump(mode="json", exclude_defaults=True)
+    """The airframe as the sets fly it: they lose no thrust, so where an input gives none is left out."""
+    airframe = load_airframe(scenario.aircraft.airframe).model_dump(mode="json", exclude_defaults=True)
+    for described in airframe["inputs"].values():
+        described.pop("no_thrust", None)
+    return airframe
