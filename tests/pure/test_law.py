@@ -12,6 +12,7 @@ from tests.closed_loop import law_params
 
 from flight_core.vectors import FloatArray
 from rise_di_controller.law import LawParams, LawState, Sign, control, engage, gain, retune, step
+from rise_di_controller.saturation import limited_integral
 
 pytestmark = pytest.mark.package("rise_di_controller")
 
@@ -124,3 +125,25 @@ def test_retuned_law_keeps_its_input_also_where_the_sign_of_an_effect_changes() 
     state, _ = step(engage(np.array([1.0]), np.zeros(1)), np.array([1.2]), np.zeros(1), np.array(DT), old)
     retuned = retune(state, old, new)
     assert control(retuned, retuned, new) == pytest.approx(control(state, state, old), abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "change", "beyond", "expected"),
+    [
+        (1.0, 3.0, 0.5, 0.2, 2.2),  # 0.2 of 0.5 beyond: 60 % of the increment of 2 are kept
+        (1.0, 3.0, -0.5, -0.2, 2.2),
+        (-1.0, -3.0, -0.5, -0.125, -2.5),  # 75 % are kept
+        (1.0, 3.0, 0.5, 0.5, 1.0),
+        (1.0, 3.0, 0.5, 0.8, 1.0),  # more than the increment is beyond: nothing is kept
+        (1.0, 3.0, 0.5, -0.2, 3.0),  # inward
+        (1.0, 3.0, 0.5, 0.0, 3.0),
+        (1.0, 3.0, 0.0, 0.3, 3.0),
+    ],
+)
+def test_outward_increment_is_reduced_by_what_is_beyond(
+    before: float, after: float, change: float, beyond: float, expected: float
+) -> None:
+    """The formula of the docstring: a part of the increment where change and beyond have one sign, else `after` to the bit."""
+    values = (np.array([value]) for value in (before, after, change, beyond))
+    limited = limited_integral(*values)
+    assert limited[0] == (pytest.approx(expected, rel=1e-12) if change * beyond > 0 else expected)
