@@ -16,6 +16,7 @@ from flight_bringup.scenarios import find_scenario
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
+from flight_core.text import printable
 from flight_log.tape_reader import RecordedRun, read_run
 from rise_di_controller.rise_di import RiseDiConfig
 
@@ -62,11 +63,12 @@ def export(
     and for a folder that cannot be written.
     """
     chosen, folder = find_scenario(scenario), as_path(folder, "c", "the path of a folder")
+    title = printable(chosen.name)  # of a file, whose name may hold any character
     controller = exportable(chosen.controller)
     commands = compilers(compiler) if proof or fmu else []
-    files = write_code(controller, chosen.name, folder, float32=float32)
+    files = write_code(controller, title, folder, float32=float32)
     if fmu:
-        files.append(build_fmu(folder, commands[0], controller, chosen.name, folder / FMU))
+        files.append(build_fmu(folder, commands[0], controller, title, folder / FMU))
     if not proof:
         return Exported(files, None, "")
     logged = ""
@@ -77,10 +79,10 @@ def export(
     else:
         sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
         same = sets[0].digest() == controller.digest()
-        require(same, "run", "a flight with other parameters", f"those of {chosen.name}")
+        require(same, "run", "a flight with other parameters", f"those of {title}")
         recordings, logged = iter([recording]), f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
     proved = prove(folder, commands, sets, recordings, float32=float32)
-    text = report(proved, chosen.name) + logged
+    text = report(proved, title) + logged
     with writing("c", folder, "a folder that can"):
         write_file(folder / REPORT, text)
     return Exported([*files, folder / REPORT], proved, text)

@@ -73,16 +73,25 @@ def write_code(controller: RiseDiConfig, scenario: str, folder: Path, *, float32
 
 def compilers(named: Sequence[str] = ()) -> list[list[str]]:
     """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises ParameterError for none."""
-    for command in named:
-        if not (words := shlex.split(command)) or shutil.which(words[0]) is None:
-            raise ParameterError(f"compiler: found no program {command!r}, expected the command of a C compiler")
-    commands = [shlex.split(command) for command in named] or [[name] for name in COMPILERS if shutil.which(name)]
+    commands = [_words(command) for command in named] or [[name] for name in COMPILERS if shutil.which(name)]
     if not commands:
         raise ParameterError(
             f"compiler: found none of {', '.join(COMPILERS)} on the PATH, expected one for the proof; "
             "--no-proof writes the code without a proof"
         )
     return commands
+
+
+def _words(command: str) -> list[str]:
+    """The words of the command of a compiler, as a shell reads them. Raises ParameterError for what is no program."""
+    expected = "expected the command of a C compiler"
+    try:
+        words = shlex.split(command)
+    except ValueError as error:  # a quotation without an end
+        raise ParameterError(f"compiler: found {command!r} ({error}), {expected}") from None
+    if not words or shutil.which(words[0]) is None:
+        raise ParameterError(f"compiler: found no program {command!r}, {expected}")
+    return words
 
 
 class Program:
@@ -112,9 +121,12 @@ class Program:
         """Integers (T, 9) and reals (T, w) of the states of C, and what the program prints."""
         (self._folder / "events").write_bytes(recording.events.tobytes())
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
-        done = subprocess.run(
-            ["./proof", "sets", "events", "loaded", "states"], cwd=self._folder, capture_output=True, text=True, check=False
-        )
+        command = ["./proof", "sets", "events", "loaded", "states"]
+        try:
+            done = subprocess.run(command, cwd=self._folder, capture_output=True, text=True, check=False)  # noqa: S603 - built here
+        except OSError as error:
+            found = f"found a program that does not start here ({error.strerror})"
+            raise ParameterError(f"compiler: {found}, expected a compiler for this machine") from None
         if done.returncode:
             raise ParameterError(f"the exported code: {(done.stderr or 'the program failed').strip()[-2000:]}")
         whole, reals = len(INTEGERS), len(real_names(self._sets[0]))
@@ -136,7 +148,8 @@ class Program:
             both = (np.hstack([recording.integers[tick], recording.reals[tick]]), np.hstack([integers[tick], reals[tick]]))
             first = Difference(tick, (*INTEGERS, *names)[column], float(both[0][column]), float(both[1][column]))
         u = recording.reals[:, :m]
-        parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(np.ptp(u, axis=0), np.finfo(float).tiny)
+        with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
+            parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(np.ptp(u, axis=0), np.finfo(float).tiny)
         modes_equal = bool((integers == recording.integers).all())
         return Comparison(
             recording.name, recording.ticks, same.size, int((~same).sum()), first, float(parts.max()), modes_equal
