@@ -241,6 +241,19 @@ def test_malformed_sample_refused_counted_and_never_used(
     assert set(flight.column("y.q")) == {0.01}
 
 
+def test_impossible_sample_refused_counted_and_never_used(flight: Flight) -> None:
+    flight.engage()
+
+    def send_both() -> None:
+        flight.send()
+        flight.world.send("/y", dict.fromkeys(OUTPUTS, 0.0) | {"q": 1e308})
+
+    flight.world.run(1.5, send_both)
+    assert int(diagnostics(flight.world, "/controller")[1]["refused y: implausible"]) > 100
+    assert set(flight.column("mode")) == {Mode.ENGAGED}
+    assert set(flight.column("y.q")) == {0.01}
+
+
 def test_gains_change_in_flight_bumpless(osprey_gust: Scenario) -> None:
     with flying(osprey_gust, sign="soft") as flight:
         flight.y = 0.2

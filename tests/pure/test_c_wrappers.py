@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz, the unit of FMI 2.0."""
 
+import importlib.util
 import math
 import shutil
 import subprocess
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,10 +16,12 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 
+import rise_di
 from flight_analysis.c_export.constants import exportable
 from flight_analysis.c_export.events import run_recording
 from flight_analysis.c_export.library import CController, build_fmu, build_library
 from flight_analysis.c_export.proof import FLAGS, build, write_code
+from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
@@ -32,7 +37,7 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"),
 ]
-TAKEN, FUTURE, ORDER, NOT_FINITE = range(4)  # rise_di_status of rise_di.h
+TAKEN, FUTURE, ORDER, NOT_FINITE, IMPLAUSIBLE = range(5)  # rise_di_status of rise_di.h
 
 
 @pytest.fixture
@@ -161,9 +166,129 @@ def test_program_of_the_page_flies(tmp_path: Path) -> None:
     assert subprocess.run(["./caller"], cwd=tmp_path, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("flag", ["-ffast-math", "-fsingle-precision-constant", "-mfpmath=387"])
-def test_code_refuses_flags_that_change_bits(flag: str, tmp_path: Path) -> None:
-    write_code(exportable(find_scenario("osprey_servo").controller), "osprey_servo", tmp_path, float32=False)
-    build(["gcc", *FLAGS, "-c", "rise_di.c"], tmp_path)
+CLANG = [["clang"]] if shutil.which("clang") else []
+CLANG += [[sys.executable, "-m", "ziglang", "cc"]] if importlib.util.find_spec("ziglang") else []
+FAST_MATH = (
+    "-ffast-math",
+    "-funsafe-math-optimizations",
+    "-fassociative-math -fno-signed-zeros -fno-trapping-math",
+    "-freciprocal-math",
+    "-ffinite-math-only",
+    "-fno-signed-zeros",
+    "-freciprocal-math -fno-signed-zeros -fno-trapping-math",  # as PX4 has them
+)
+MACROS = ("FAST_MATH", "ASSOCIATIVE_MATH", "RECIPROCAL_MATH", "FINITE_MATH_ONLY", "NO_SIGNED_ZEROS", "NO_TRAPPING_MATH")
+WITHOUT_MACROS = [f"-U__{name}__" for name in MACROS]
+"""As of a compiler that does not name its flags: clang has two of these macros."""
+
+STARTER = """
+#include "rise_di.h"
+static const rise_di_parameters parameters = RISE_DI_PARAMETERS;
+static rise_di_controller controller;
+int main(void) {
+    rise_di_real y[RISE_DI_M] = {0};
+    rise_di_output output;
+    if (rise_di_start(&controller, &parameters)) {
+        return 0;
+    }
+    const bool refused = rise_di_take_y(&controller, 0, 0, y) == RISE_DI_NOT_STARTED &&
+        rise_di_take_y_m(&controller, 0, 0, y) == RISE_DI_NOT_STARTED && !rise_di_tick(&controller, 0, true, &output);
+    return refused ? 1 : 2;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def code(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The code of osprey_observer, with a feedforward and so with the sine, and a program that starts it."""
+    folder = tmp_path_factory.mktemp("code")
+    write_code(exportable(find_scenario("osprey_observer").controller), "osprey_observer", folder, float32=False)
+    (folder / "starter.c").write_text(STARTER, encoding="utf-8")
+    return folder
+
+
+def started(code: Path, compiler: Sequence[str], flags: Sequence[str]) -> int:
+    """Exit status of the program: 0 where the controller starts, 1 where it does not and then refuses every call."""
+    build([*compiler, *FLAGS, *flags, "-o", "starter", "starter.c", "rise_di.c"], code)
+    return subprocess.run(["./starter"], cwd=code, check=False).returncode
+
+
+@pytest.mark.parametrize("flags", [*FAST_MATH, "-fno-trapping-math", "-fsingle-precision-constant", "-mfpmath=387"])
+def test_compiler_stops_at_flags_that_change_bits(flags: str, code: Path) -> None:
     with pytest.raises(ParameterError, match=r"rise_di\.c"):
-        build(["gcc", *FLAGS, flag, "-c", "rise_di.c"], tmp_path)
+        build(["gcc", *FLAGS, *flags.split(), "-c", "rise_di.c"], code)
+
+
+@pytest.mark.parametrize("flags", FAST_MATH)
+def test_controller_does_not_start_under_flags_that_change_bits(flags: str, code: Path) -> None:
+    """Where no macro tells of them, the test of rise_di_start does, at each optimisation: 0.3 is not rounded to 0 then."""
+    for level in ("-O1", "-O3"):
+        assert started(code, ["gcc"], [level, *flags.split(), *WITHOUT_MACROS]) == 1
+
+
+def test_controller_starts_without_these_flags(code: Path) -> None:
+    for level in ("-O0", "-O1", "-O3"):
+        assert started(code, ["gcc"], [level, *WITHOUT_MACROS]) == 0
+
+
+@pytest.mark.skipif(not CLANG, reason="no clang on this machine, nor the package ziglang, which has one")
+@pytest.mark.parametrize("flags", FAST_MATH)
+def test_clang_does_not_fly_under_flags_that_change_bits(flags: str, code: Path) -> None:
+    for compiler in CLANG:
+        assert started(code, compiler, []) == 0
+        with suppress(ParameterError):  # an #error
+            assert started(code, compiler, flags.split()) == 1
+
+
+PX4_WARNINGS = (
+    "-Werror -Warray-bounds -Wcast-align -Wdisabled-optimization -Wdouble-promotion -Wfatal-errors -Wfloat-equal -Wformat=1 "
+    "-Winit-self -Wlogical-op -Wpointer-arith -Wshadow -Wuninitialized -Wunknown-pragmas -Wunused-variable "
+    "-Wunused-but-set-variable -Wbad-function-cast -Wstrict-prototypes -Wmissing-prototypes -Wnested-externs"
+)
+"""Of PX4: cmake/px4_add_common_flags.cmake, for all languages and for C."""
+
+
+@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "osprey_vtail"])
+@pytest.mark.parametrize("float32", [False, True], ids=["double", "float"])
+def test_code_has_no_warning_of_px4(name: str, float32: bool, tmp_path: Path) -> None:
+    write_code(exportable(find_scenario(name).controller), name, tmp_path, float32=float32)
+    build(["gcc", *FLAGS, *PX4_WARNINGS.split(), "-c", "rise_di.c"], tmp_path)
+
+
+def test_calls_before_the_start_are_refused(code: Path) -> None:
+    """In memory of zeros, as of a static controller."""
+    (code / "early.c").write_text(STARTER.replace("rise_di_start(&controller, &parameters)", "(int)parameters.sign < 0"))
+    build(["gcc", *FLAGS, "-fsanitize=address,undefined", "-o", "early", "early.c", "rise_di.c"], code)
+    assert subprocess.run(["./early"], cwd=code, check=False).returncode == 1
+
+
+def test_wrong_samples_are_lost_as_by_controller(c_controller: Callable[[RiseDiConfig], CController]) -> None:
+    """A spike, a jump that stays, noise that grows, y_m beyond its bound: the same samples are lost, u has the same bits."""
+    config, rng = exportable(find_scenario("osprey_observer").controller), np.random.default_rng(4)
+    python, c, lost = Controller(config), c_controller(config), 0
+    for k in range(700):
+        now_ns = k * NANOSECONDS // 100
+        y, y_m = (0.1 * np.sin(0.01 * k + np.arange(8.0)) + 0.002 * rng.normal(size=8)).reshape(2, 4)
+        y = y + {150: 35.0, 160: 1e3, 170: 1e6, 180: 1e308, 190: -3.0}.get(k, 0.0) * np.eye(4)[k % 3]
+        y = y + (5.0 if 200 <= k < 300 else 0.0) + (5.0 * rng.normal(size=4) if 400 <= k < 450 else 0.0)
+        y_m = y_m + (1e9 if k == 350 else 0.0)
+        for sentence, status in (
+            (python.take_y_m(StampedVector(now_ns, y_m), now_ns), c.take_y_m(now_ns, y_m, now_ns)),
+            (python.take_y(StampedVector(now_ns, y), now_ns), c.take_y(now_ns, y, now_ns)),
+        ):
+            assert status == (IMPLAUSIBLE if sentence else TAKEN)
+            lost += bool(sentence)
+        output = python.tick(now_ns)
+        u, mode = c.tick(now_ns)
+        assert mode == (-1 if output is None else python.mode)
+        assert u.tobytes() == python.state.u.tobytes()
+    assert lost > 10  # 5 spikes, 2 at each end of the jump, 1 of y_m, some of the noise
+
+
+def test_name_of_the_scenario_is_printable_in_the_code(tmp_path: Path) -> None:
+    """A name of a file may hold an escape sequence, which a terminal would obey."""
+    named = tmp_path / "a\x1b]0;title\x07\nb.yaml"
+    named.write_text(scenario_yaml(find_scenario("osprey_servo")), encoding="utf-8")
+    rise_di.export(named, tmp_path / "c", proof=False)
+    text = (tmp_path / "c" / "rise_di_parameters.h").read_text(encoding="utf-8")
+    assert r"the controller of a\x1b]0;title\x07\nb, written" in text

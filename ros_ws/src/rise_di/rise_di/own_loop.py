@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The controller in a loop of the user's own: tick by tick, around a plant that is a function, and in python-control."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -54,6 +55,7 @@ class Loop:
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
         self.output: ControlOutput | None = None  # of the last tick; None where nothing is to be sent
+        self.lost = ""  # why a sample of the last tick is lost; empty where none is
 
     @property
     def mode(self) -> Mode:
@@ -70,18 +72,24 @@ class Loop:
 
         With an allocation u has the effectors, shape (p,). y and y_m, shape (m,), SI, deviations from trim, belong to t and
         have the order of `outputs`; y of an observer with vanes has the order of `measured`. None is a lost
-        sample. t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
+        sample, and so is one that no aircraft can give: `lost` has the reason, and the first of a row is a RuntimeWarning.
+        t may jitter; it never goes back. The failsafe of the guard starts where samples are older than `max_age`.
         Raises ParameterError for a t that goes back, for a wrong length and for a value that is not finite.
         """
         now_ns = nanoseconds(as_number(t, "t", 0.0, unit="s"))
         last_ns = self._now_ns
         require(now_ns > last_ns, "t", f"{t:g} s", f"more than {seconds(last_ns):g} s, the t of the last tick")
         self._now_ns = now_ns
+        before, self.lost = self.lost, ""
         for key, value, take in (("y", y, self._controller.take_y), ("y_m", y_m, self._controller.take_y_m)):
             if value is not None:
                 names = self.measured if key == "y" else self.outputs
-                take(StampedVector(now_ns, self.vector(value, key, names)), now_ns)
+                self.lost = take(StampedVector(now_ns, self.vector(value, key, names)), now_ns) or self.lost
+        if self.lost and not before:
+            warnings.warn(f"sample lost at t = {t:g} s: {self.lost}", RuntimeWarning, stacklevel=2)
         self.output = self._controller.tick(now_ns)
+        if restarted := self._controller.restarted():
+            warnings.warn(f"the law engages again at t = {t:g} s: {restarted}", RuntimeWarning, stacklevel=2)
         return self._controller.state.command.copy()
 
     def retune(self, controller: ControllerConfig) -> None:

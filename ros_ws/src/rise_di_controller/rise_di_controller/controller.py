@@ -14,7 +14,7 @@ from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray, StampedVector, require_newer, require_not_future
-from rise_di_controller import divergence, guard, internals
+from rise_di_controller import divergence, guard, internals, samples
 from rise_di_controller.control_law import TunedLaw
 from rise_di_controller.params import ControllerConfig, as_controller
 
@@ -79,6 +79,8 @@ class Controller:
         self._oscillations, self._learns = divergence.Oscillations(self._least), parameters.history_ticks() > 0
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
+        self._samples: samples.SampleState | None = None  # None before the first y
+        self._restarted = ""  # why the law has engaged again by itself, as a sentence
         self._y: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
         self._y_m: deque[StampedVector] = deque(maxlen=guard.SAMPLE_BUFFER_SIZE)
 
@@ -170,30 +172,59 @@ class Controller:
     def _has_first_model(self, parameters: ControllerConfig) -> bool:
         return parameters.models() == self._first.models()
 
-    def take_y(self, sample: StampedVector, now_ns: int) -> None:
-        """Buffer a sample of y, shape (m,), in the law's order.
+    def take_y(self, sample: StampedVector, now_ns: int) -> str:
+        """Buffer a sample of y, in the law's order. Returns why the sample is lost, as a sentence; empty for a sample taken.
 
-        Raises ChannelError: reason "future" for a stamp more than the age limit ahead of the clock, reason "order" for a stamp
-        not later than the previous stamp.
+        Lost is a sample that no aircraft can give (`samples`): it counts as not arrived. A sample whose jump is confirmed
+        engages the law again. Raises ChannelError: reason "future" for a stamp more than the age limit ahead of the clock,
+        reason "order" for a stamp not later than the stamp of the sample taken before.
         """
-        self._take(self._y, sample, now_ns)
+        m = len(self._parameters.outputs)
+        outputs = sample._replace(value=sample.value[:m])
+        if lost := self._lost(self._y, outputs, now_ns):
+            return lost
+        if self._samples is None:
+            self._samples = samples.begun(outputs)
+        else:
+            last = self._samples.last
+            self._samples, change = samples.step(self._samples, outputs, self._guard.samples)
+            if change is not samples.Change.NEAR:
+                jump = samples.jump(last, outputs, self._parameters.outputs)
+                if change is samples.Change.FAR:
+                    return jump
+                self._restarted = f"{jump}, and stays there"
+                self.restart()
+        self._y.append(sample)
+        return ""
 
-    def take_y_m(self, sample: StampedVector, now_ns: int) -> None:
-        """Buffer a sample of y_m, as `take_y` does."""
-        self._take(self._y_m, sample, now_ns)
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
+        """Buffer a sample of y_m, (m,), as `take_y` does; y_m may jump."""
+        if lost := self._lost(self._y_m, sample, now_ns):
+            return lost
+        self._y_m.append(sample)
+        return ""
 
-    def _take(self, samples: deque[StampedVector], sample: StampedVector, now_ns: int) -> None:
+    def _lost(self, taken: deque[StampedVector], sample: StampedVector, now_ns: int) -> str:
+        """Why a sample of m values is beyond the bounds; empty for one inside. Raises ChannelError."""
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
-        if samples:
-            require_newer(sample.stamp_ns, samples[-1].stamp_ns)
-        samples.append(sample)
+        if taken:
+            require_newer(sample.stamp_ns, taken[-1].stamp_ns)
+        return samples.beyond(sample.value, self._parameters.outputs, self._guard.samples)
+
+    def restarted(self) -> str:
+        """Why the law has engaged again by itself since the last call, as a sentence; empty if it has not."""
+        sentence, self._restarted = self._restarted, ""
+        return sentence
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
         """A tick at `now_ns`, `late_ns` after the deadline. Returns None where nothing is to be published."""
         y = self._newest_paired_y()
+        was_engaged = self._state.mode is Mode.ENGAGED
         self._state, inputs = guard.tick(self._state, now_ns, y, list(self._y_m), self._guard, self._law, active)
         if inputs is None:
             return None
+        if was_engaged and self._state.mode is Mode.ENGAGED and inputs.dt == 0.0:  # a step has another dt
+            self._restarted = "u or the state of the law was not finite"
         self._measure_vanes(inputs)
         self._number += self.has_internals
         e = inputs.y - inputs.y_m

@@ -7,6 +7,7 @@
 - Watchdog: an input older than `max_age` is stale (`tick`).
 - Failsafe for stale inputs: hold u, then ramp u to trim (modes HOLD, RAMP, TRIM).
 - Bumpless transfer: engagement and re-engagement start from the present u, with the law's state as at the first engagement.
+- Finite: a sample with NaN or infinity is as none, and a law whose u or state would not be finite engages again.
 """
 
 from collections.abc import Sequence
@@ -20,16 +21,19 @@ from flight_core.rates import seconds
 from flight_core.vectors import Array, FloatArray, StampedVector
 from rise_di_controller import feedforward, observer
 from rise_di_controller.allocation import Allocation, allocate, reached
-from rise_di_controller.control_law import Measurements, TunedLaw
+from rise_di_controller.control_law import Measurements, TunedLaw, fields
 from rise_di_controller.feedforward import FeedforwardState, Nominal
 from rise_di_controller.law import LawState, shifted
 from rise_di_controller.observer import ObserverParams, ObserverState, PastTick, VaneObserverState
+from rise_di_controller.samples import SampleLimits
 from rise_di_controller.saturation import Limits, saturate
 from rise_di_controller.schedule import OverSpeed, ScheduleState, law_at, observers_of
 
 # Least distance of two samples for a slope, as a fraction of the extrapolation. Closer samples are noisier:
 # the extrapolation would amplify the noise of the difference more than 20 times.
 MIN_SLOPE_SPAN = 0.05
+
+LARGEST_VANE = np.pi  # rad, where the motion of a vane ends
 
 # Samples kept of y and of y_m, so that y_m at the stamp of y is kept: 0.1 s at 1 kHz, more at lower rates.
 SAMPLE_BUFFER_SIZE = 100
@@ -44,6 +48,7 @@ class GuardParams(NamedTuple):
     ramp_ns: int  # failsafe: how long u then takes to trim
     deactivation_holds: bool  # whether u is held when deactivated; otherwise u ramps to trim
     limits: Limits
+    samples: SampleLimits  # of y and y_m, for the controller
     nominal: Nominal | None = None  # None: no feedforward
     history: int = 0  # ticks over which a new observer runs before it flies; 0: it starts from the present error
     allocation: Allocation | None = None  # None: the inputs of the law are the effectors
@@ -159,39 +164,24 @@ def tick(
     Arguments: `y` the newest sample, `y_m` the last samples with increasing stamps, in the law's order; readings of vanes
     follow the outputs in y. `u_ff_recorded` and `vane_m_recorded` replace a feedforward of unknown state, in replay.
     """
-    reference, vane = None, None
+    vane = None
     if guard.vanes and y is not None:
-        y, vane = y._replace(value=y.value[: len(state.u)]), y.value[len(state.u) :]
-    if y is not None and y_m and max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) <= guard.max_age_ns:
-        reference = align(y_m, y.stamp_ns, guard.period_ns)
+        m = len(state.u)
+        vane = _readings(y.value[m:], state.vanes)
+        y = y._replace(value=y.value[:m])
+    reference = None if y is None else _fresh_reference(now_ns, y, y_m, guard)
     if not active and state.law is None and y is not None and reference is not None and not state.u.any():
         return state._replace(mode=Mode.INACTIVE), TickInputs(now_ns, y.value, reference, 0.0, 0.0)
     if not active or y is None or reference is None:
         return _failsafe(state, now_ns, guard, active)
-    offset = seconds(y_m[-1].stamp_ns - y.stamp_ns)
-    control_law, params = law
+    inputs = TickInputs(y.stamp_ns, y.value, reference, seconds(y_m[-1].stamp_ns - y.stamp_ns), 0.0)
     if state.law is None or state.y is None or state.y_m is None or state.mode is not Mode.ENGAGED:
-        zero = np.zeros_like(state.u)
-        ff_state = None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
-        vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
-        measured = Measurements(y.value, reference, np.zeros_like(reference), state.u, state.u, vane=vane)
-        engaged = state._replace(
-            mode=Mode.ENGAGED,
-            law=control_law.engage(measured, params),
-            y=y,
-            y_m=reference,
-            u_trim=state.u,
-            u_free=state.u,
-            u_ff=zero,
-            feedforward=ff_state,
-            history=(),
-            vanes=vanes,
-        )
-        return engaged, TickInputs(y.stamp_ns, y.value, reference, offset, 0.0)
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
     if y.stamp_ns <= state.y.stamp_ns:
         return state, None
     nominal = seconds(guard.period_ns)
     dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
+    control_law, params = law
     law_state, u_trim, u_ff, ff_state = state.law, state.u_trim, state.u_ff, state.feedforward
     missed = max(round(dt / nominal) - 1, 0)
     if missed:
@@ -209,15 +199,68 @@ def tick(
     slope, vane_m = (reference - state.y_m) / dt, None if vanes is None else vanes.reference
     measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
     after, u_free, u, effectors = law_within_limits(law_state, measured, dt, law, guard, state.effectors)
+    stepped = state._replace(
+        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
+    )
+    if not _is_finite(stepped):
+        return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
     if guard.history:
         scale = getattr(after, "scale", None)
         lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal), scale),) * missed
         last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt), scale)
-        state = state._replace(history=(*state.history, *lost, last)[-guard.history :])
-    state = state._replace(
-        law=after, y=y, y_m=reference, u=u, u_free=u_free, u_ff=u_ff, feedforward=ff_state, effectors=effectors, vanes=vanes
+        stepped = stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
+    return stepped, inputs._replace(dt=dt)
+
+
+def _fresh_reference(now_ns: int, y: StampedVector, y_m: Sequence[StampedVector], guard: GuardParams) -> FloatArray | None:
+    """The reference at the stamp of y, (m,); None where y or y_m is stale or not finite, or has no sample near that stamp."""
+    if not y_m or max(abs(now_ns - sample.stamp_ns) for sample in (y, y_m[-1])) > guard.max_age_ns:
+        return None
+    reference = align(y_m, y.stamp_ns, guard.period_ns)
+    return None if reference is None or not np.isfinite(y.value + reference).all() else reference
+
+
+def _engaged(
+    state: ControllerState,
+    y: StampedVector,
+    inputs: TickInputs,
+    vane: FloatArray | None,
+    guard: GuardParams,
+    law: TunedLaw,
+    vane_m_recorded: FloatArray | None,
+) -> ControllerState:
+    """The state at an engagement: the law begins from the present u."""
+    reference, zero = inputs.y_m, np.zeros_like(state.u)
+    ff_state = None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
+    measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
+    return state._replace(
+        mode=Mode.ENGAGED,
+        law=law.control_law.engage(measured, law.params),
+        y=y,
+        y_m=reference,
+        u_trim=state.u,
+        u_free=state.u,
+        u_ff=zero,
+        feedforward=ff_state,
+        history=(),
+        vanes=_vanes(vane, ff_state, guard, vane_m_recorded),
     )
-    return state, TickInputs(y.stamp_ns, y.value, reference, offset, dt)
+
+
+def _is_finite(state: ControllerState) -> bool:
+    """Whether u and what the next u comes from are finite."""
+    arrays = [state.u, state.u_free, state.u_ff, *fields(state.law).values()]
+    if state.effectors is not None:
+        arrays.append(state.effectors)
+    if state.feedforward is not None:
+        arrays += [state.feedforward.x, state.feedforward.u, state.feedforward.u_0]
+    return bool(np.isfinite(np.concatenate(arrays)).all())
+
+
+def _readings(reading: FloatArray, before: Vanes | None) -> FloatArray:
+    """The readings of the vanes, (k,): one that no vane gives is that of the tick before, so the vane counts as still."""
+    last = np.zeros_like(reading) if before is None else before.reading
+    return np.where(np.abs(reading) <= LARGEST_VANE, reading, last)
 
 
 def _nominal(guard: GuardParams, law: Any) -> Nominal | None:

@@ -5,7 +5,7 @@
 It subscribes to y and y_m and publishes u and internals. It handles overruns, conflicting publishers and stale inputs.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
@@ -14,7 +14,7 @@ from flight_core.modes import Mode
 from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import nanoseconds, period_ns, seconds
 from flight_core.text import bounded
-from flight_core.vectors import ChannelError
+from flight_core.vectors import ChannelError, StampedVector
 from flight_ros import reports
 from flight_ros.flight_node import FlightNode
 from flight_ros.lockstep import LockstepInputs
@@ -50,7 +50,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._active = False
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
-        of_y, of_y_m = (self.parameters.measured, self._controller.take_y), (self.parameters.outputs, self._controller.take_y_m)
+        of_y = self.parameters.measured, self._taking(self._controller.take_y)
+        of_y_m = self.parameters.outputs, self._taking(self._controller.take_y_m)
         self._y, self._y_m = (
             self.receive(topic, Decoder(names).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
             for topic, (names, take) in ((Y, of_y), (Y_M, of_y_m))
@@ -70,6 +71,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             )
         self._last_ns = 0  # of the last tick
         self._still_vanes: tuple[str, ...] = ()
+        self._restarts = 0  # of the law, by itself
         if self.parameters.autostart:
             self.trigger_configure()
             if self.parameters.start_active:
@@ -125,6 +127,21 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._active and self._controller.mode is not Mode.ENGAGED:
             self._warn_stale_inputs(now_ns)
 
+    def _taking(self, take: Callable[[StampedVector, int], str]) -> Callable[[StampedVector, int], None]:
+        """`take`, with a ChannelError for a sample that is lost, so that the receiver counts and logs it."""
+
+        def taking(sample: StampedVector, now_ns: int) -> None:
+            if lost := take(sample, now_ns):
+                raise ChannelError("implausible", lost)
+
+        return taking
+
+    def _tell_restart(self) -> None:
+        """Log and count that the law has engaged again by itself, a line in 2 s at most."""
+        if restarted := self._controller.restarted():
+            self._restarts += 1
+            self.get_logger().warning(f"the law engages again: {restarted}", throttle_duration_sec=2.0)
+
     def _tell_vanes(self) -> None:
         """Log a vane at the begin and the end of a standstill."""
         before, self._still_vanes = self._still_vanes, self._controller.still_vanes()
@@ -158,6 +175,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if self._controller.mode is not before:
             self.get_logger().info(f"{before.name} -> {self._controller.mode.name}")
         self._tell_vanes()
+        self._tell_restart()
         if output is None or not self._publishes:
             return False
         # A tick that was stopped half-way does not publish its old u: the aircraft has started its failsafe, and u would jump.
@@ -274,4 +292,5 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         if not self.parameters.lockstep:
             ages = {f"age of {name} (s)": f"{age:.4f}" for name, age in self._controller.ages(self.now_ns()).items()}
         still = {"vanes left out": ", ".join(self._still_vanes) or "none"} if self.parameters.vanes else {}
-        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **still, **ages}
+        restarts = {"restarts of the law": self._restarts}
+        return level, mode.name, {"mode": mode.name, "law": self.parameters.summary(), **restarts, **still, **ages}

@@ -34,7 +34,7 @@ from flight_core.parameters import (
 )
 from flight_core.rates import divide, nanoseconds, period_ns
 from flight_core.vectors import FloatArray
-from rise_di_controller import internals
+from rise_di_controller import internals, samples
 from rise_di_controller.allocation import Allocation, allocation
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
 from rise_di_controller.decomposition import DecompositionError, signs
@@ -215,6 +215,11 @@ class ControllerConfig(NodeConfig):
     input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
     lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
     delay: NonNegative = Field(description="pure delay from y to the actuators in addition to sampling, s")
+    y_max: Positives | None = Field(
+        default=None,
+        description="the largest abs(y) and abs(y_m): a sample beyond is lost; absent: 34.9 rad/s (2000 deg/s, the range of a "
+        "gyro) for p, q, r, 340 m/s for V, else 1e6",
+    )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u then takes to ramp to trim, s")
@@ -241,7 +246,7 @@ class ControllerConfig(NodeConfig):
     @classmethod
     def tunable(cls) -> frozenset[str]:
         """Parameters that may change in flight: those of the law and the guard. Those that name channels or signs may not."""
-        common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew"}
+        common = {"lag", "delay", "max_age", "hold", "ramp", "lower", "upper", "slew", "y_max"}
         return frozenset(common | (set(cls.model_fields) - set(ControllerConfig.model_fields)))
 
     def _check(self) -> None:
@@ -266,6 +271,7 @@ class ControllerConfig(NodeConfig):
             require_length(key, getattr(self, key), self.outputs)
         for key in ("lower", "upper", "slew"):
             require_length(key, getattr(self, key) or self.inputs, self.inputs)
+        require_length("y_max", self.y_max or self.outputs, self.outputs)
         for i, (low, high) in enumerate(zip(self.lower or (), self.upper or (), strict=False)):
             require(low < high, f"lower[{i}]", low, f"less than upper[{i}] = {high:g}")
         for i, low in enumerate(self.lower or ()):
@@ -459,6 +465,12 @@ class ControllerConfig(NodeConfig):
             np.array(self.slew or unlimited),
         )
 
+    def _authority(self) -> FloatArray:
+        """y_dot by the full inputs, (m,), units of y / s."""
+        limits = self._limits()
+        full = np.minimum(np.maximum(-limits.lower, limits.upper), samples.UNLIMITED)
+        return np.asarray(full / np.array(self.input_scale))
+
     def guard(self) -> GuardParams:
         """Times, limits and nominal model of the guard."""
         return GuardParams(
@@ -468,6 +480,7 @@ class ControllerConfig(NodeConfig):
             ramp_ns=nanoseconds(self.ramp),
             deactivation_holds=self.on_deactivate == "hold",
             limits=self._limits(),
+            samples=samples.bounds(self.outputs, self._authority(), self.y_max, period_ns(self.rate, "rate")),
             history=self.history_ticks(),
             allocation=None if self.allocation is None else self.allocation.arrays(self.inputs),
             nominal=self._flown_nominal(),

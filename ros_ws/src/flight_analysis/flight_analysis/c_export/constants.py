@@ -13,6 +13,7 @@ from flight_core.arithmetic import INVERSE_PI, MAX_ANGLE, PI_HIGH, PI_LOW, SINE_
 from flight_core.parameters import require
 from flight_core.rates import seconds
 from flight_core.vectors import FloatArray
+from rise_di_controller import samples
 from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
 from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
 from rise_di_controller.observer import ObserverParams
@@ -82,6 +83,7 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     }
     reals: dict[str, ArrayLike] = {"period": period, "dt_least": DT_RANGE[0] * period, "dt_largest": DT_RANGE[1] * period}
     reals |= {name: getattr(law, name) for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")}
+    reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
     if (allocation := guard.allocation) is not None:
         whole["order"] = allocation.order
@@ -133,7 +135,7 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
 
     members = [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in constants(controller)]
     single = {"MAX_ANGLE": MAX_ANGLE, "INVERSE_PI": INVERSE_PI, "PI_HIGH": PI_HIGH, "PI_LOW": PI_LOW}
-    single |= {"RELAXATION": RELAXATION, "EXCHANGE_LEAST": SMALL}
+    single |= {"RELAXATION": RELAXATION, "EXCHANGE_LEAST": SMALL, "TIMES": samples.TIMES, "MEMORY": samples.MEMORY}
     lines = [
         "/* SPDX-FileCopyrightText: RISE-DI contributors",
         " * SPDX-License-Identifier: Apache-2.0",
@@ -154,6 +156,8 @@ def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
         f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic pressure */",
         f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
         f"#define RISE_DI_SAMPLES {SAMPLE_BUFFER_SIZE} /* samples kept of y and of y_m */",
+        f"#define RISE_DI_AGREEING {samples.AGREEING} /* samples in a row after a jump of y */",
+        f"#define RISE_DI_FIRST_NS {samples.FIRST_NS} /* after the first y, in which it may jump */",
         *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
         f"#define RISE_DI_SWEEPS {SWEEPS}",
         f"#define RISE_DI_HALVINGS {HALVINGS}",

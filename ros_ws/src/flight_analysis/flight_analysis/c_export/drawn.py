@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drawn inputs for the proof: calls of a controller with any timing, and single steps from any state."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -25,7 +25,7 @@ EPOCH_NS = 1_795_000_000_000_000_000  # start of the drawn stamps: float64 does 
 
 
 def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recording:
-    """Drawn samples: jitter, lost, late, early and repeated stamps, small and large errors, new parameters, deactivation."""
+    """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new parameters, deactivation."""
     rng, controller = np.random.default_rng(seed), sets[0]
     m, period_ns = len(controller.outputs), controller.guard().period_ns
     unit = controller.law_params().eps
@@ -33,6 +33,7 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
     airspeed = np.array([0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs])
     recorder, now_ns = Recorder(sets), EPOCH_NS
     y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
+    jumps = _jumps(unit, np.random.default_rng([seed, 1]))
     stamp_m_ns = now_ns
     for k in range(ticks):
         draw = rng.random(10)
@@ -57,7 +58,7 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
                 late = rng.uniform(-0.05, 0.6) if draw[8] < 0.97 else rng.uniform(-300.0, 30.0)
                 stamp_ns = stamp_m_ns if draw[8] < 0.1 else now_ns - round(period_ns * late)
                 y = y_m + size * rng.normal(size=m) + airspeed * rng.uniform(-1.0, 1.0)
-                recorder.take_y(StampedVector(stamp_ns, y), now_ns)
+                recorder.take_y(StampedVector(stamp_ns, y + next(jumps)), now_ns)
         if draw[9] < 0.01:
             recorder.retune_to(int(rng.integers(len(sets))))
         elif draw[9] < 0.02:
@@ -70,6 +71,17 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
         inactive = max(inactive - 1, 0)
         recorder.tick(now_ns, active=not inactive)
     return recorder.recording("drawn calls")
+
+
+def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
+    """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so that they are lost."""
+    m, off = len(unit), np.zeros_like(unit)
+    while True:
+        if rng.random() < 0.02:
+            off = np.where(rng.random(m) < 0.3, unit * 10.0 ** rng.uniform(0.0, 5.0, m), 0.0)
+        elif rng.random() < 0.4:
+            off = np.zeros(m)
+        yield off
 
 
 def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:

@@ -104,25 +104,29 @@ class Recorder(Controller):
         self._refused = 0
         self._add(START)
 
-    def take_y(self, sample: StampedVector, now_ns: int) -> None:
+    def take_y(self, sample: StampedVector, now_ns: int) -> str:
         """As the controller does, unless y is silent."""
-        if "y" not in self.silent:
-            self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
-            self._note_refusal(super().take_y, sample, now_ns)
+        if "y" in self.silent:
+            return ""
+        self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
+        return self._note_refusal(super().take_y, sample, now_ns)
 
-    def take_y_m(self, sample: StampedVector, now_ns: int) -> None:
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
         """As the controller does, unless y_m is silent."""
-        if "y_m" not in self.silent:
-            self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
-            self._note_refusal(super().take_y_m, sample, now_ns)
+        if "y_m" in self.silent:
+            return ""
+        self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
+        return self._note_refusal(super().take_y_m, sample, now_ns)
 
-    def _note_refusal(self, take: Callable[[StampedVector, int], None], sample: StampedVector, now_ns: int) -> None:
+    def _note_refusal(self, take: Callable[[StampedVector, int], str], sample: StampedVector, now_ns: int) -> str:
         self._refused = 2 * self._refused % REFUSALS
         try:
-            take(sample, now_ns)
+            lost = take(sample, now_ns)
         except ChannelError:
             self._refused += 1
             raise
+        self._refused += bool(lost)
+        return lost
 
     def retune_to(self, index: int) -> None:
         """Take the parameters of an index of `sets`."""
@@ -288,6 +292,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
         sample = None
         if log["mode"][k] == Mode.ENGAGED:
             offset_ns = round(float(log["y_m_offset"][k]) * NANOSECONDS)
+            if log["dt"][k] == 0.0 and recorder.mode is Mode.ENGAGED:
+                recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
         equal += recorder.state.command.tobytes() == groups[of_command][k].tobytes()

@@ -12,8 +12,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from flight_analysis.c_export.events import GUARD_TICK, START, Recording
+from flight_analysis.c_export.events import GUARD_TICK, RESTART, START, Recording
 from flight_analysis.c_export.proof import CODE, FLAGS, PARAMETERS, SOURCE, build
+from flight_core.parameters import ParameterError
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
 from rise_di_controller.rise_di import RiseDiConfig
@@ -29,7 +30,10 @@ class CController:
         self._library.library_bytes.restype = ctypes.c_int64
         self._memory = ctypes.create_string_buffer(self._library.library_bytes())
         self._u = np.zeros(p)
-        self._library.library_start(self._memory)
+        if not self._library.library_start(self._memory):
+            raise ParameterError(
+                "the exported code: its compiler does not compute what is written, expected one with its flags"
+            )
 
     def take_y(self, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
         """Take a sample of y; returns rise_di_status, 0 for a sample taken."""
@@ -53,11 +57,10 @@ class CController:
     def replay(self, recording: Recording) -> FloatArray:
         """The u of each tick of a log, `events.run_recording`, shape (T, p)."""
         events = recording.events
-        starts = events["kind"] == START
         ticks = events[events["kind"] == GUARD_TICK]
-        begins = np.zeros(len(events), dtype=np.int64)
-        begins[1:] = 4 * starts[:-1]
-        flags = ticks["flag"] + begins[events["kind"] == GUARD_TICK]
+        before = np.zeros(len(events), dtype=np.int64)  # what the event before a tick is
+        before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
+        flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
         whole = [np.ascontiguousarray(values) for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])]
         reals = [np.ascontiguousarray(ticks[name]) for name in ("y", "y_m")]
         u = np.zeros((len(ticks), self._p))

@@ -9,6 +9,8 @@
 #include "rise_di.c"
 
 enum { Y = 0, Y_M = 100, U = 200, ACTIVE = 300, Y_NEW = 301, Y_M_NEW = 302, MODE = 400 };
+#define LONGEST 9e9 /* s, 285 years: what int64_t holds in ns */
+
 enum { OK = 0, DISCARD = 2, ERROR = 3 };
 
 typedef struct {
@@ -74,11 +76,11 @@ int fmi2SetDebugLogging(unit *u, int on, size_t count, const char *const *catego
 }
 
 int fmi2Reset(unit *u) {
-    rise_di_start(&u->controller, &exported);
+    const bool started = rise_di_start(&u->controller, &exported);
     fill(u->y, RISE_DI_M, ZERO);
     fill(u->y_m, RISE_DI_M, ZERO);
     u->active = u->y_new = u->y_m_new = 1;
-    return OK;
+    return started ? OK : ERROR;
 }
 
 unit *fmi2Instantiate(const char *name, int type, const char *guid, const char *resources, const callbacks *functions, int visible,
@@ -90,7 +92,10 @@ unit *fmi2Instantiate(const char *name, int type, const char *guid, const char *
     }
     if (u != NULL) {
         u->release = functions->release;
-        (void)fmi2Reset(u);
+        if (fmi2Reset(u) != OK) {
+            functions->release(u);
+            u = NULL;
+        }
     }
     return u;
 }
@@ -202,10 +207,14 @@ int fmi2SetString(unit *u, const unsigned *references, size_t count, const char 
 }
 
 int fmi2DoStep(unit *u, double t, double step_size, int no_set_state) {
-    const int64_t now_ns = (int64_t)((t * 1e9) + 0.5);
+    int64_t now_ns;
     rise_di_status of_y = RISE_DI_TAKEN, of_y_m = RISE_DI_TAKEN;
     rise_di_output output;
     (void)step_size, (void)no_set_state;
+    if (!(t > -LONGEST && t < LONGEST)) {
+        return DISCARD;
+    }
+    now_ns = (int64_t)((t * 1e9) + 0.5);
     if (u->y_m_new) {
         of_y_m = rise_di_take_y_m(&u->controller, now_ns, now_ns, u->y_m);
     }

@@ -8,7 +8,7 @@
 static const rise_di_parameters exported = RISE_DI_PARAMETERS;
 
 int64_t library_bytes(void);
-void library_start(rise_di_controller *controller);
+int64_t library_start(rise_di_controller *controller);
 int64_t library_take(rise_di_controller *controller, int64_t is_y, int64_t stamp_ns, int64_t now_ns, const double *value);
 int64_t library_tick(rise_di_controller *controller, int64_t now_ns, int64_t active, double *u);
 void library_replay(rise_di_controller *controller, int64_t ticks, const int64_t *now_ns, const int64_t *stamp_ns,
@@ -29,7 +29,7 @@ static void command_of(const rise_di_controller *controller, double *u) {
 
 int64_t library_bytes(void) { return (int64_t)sizeof(rise_di_controller); }
 
-void library_start(rise_di_controller *controller) { rise_di_start(controller, &exported); }
+int64_t library_start(rise_di_controller *controller) { return (int64_t)rise_di_start(controller, &exported); }
 
 int64_t library_take(rise_di_controller *controller, int64_t is_y, int64_t stamp_ns, int64_t now_ns, const double *value) {
     rise_di_real sample[RISE_DI_M];
@@ -46,7 +46,7 @@ int64_t library_tick(rise_di_controller *controller, int64_t now_ns, int64_t act
     return published ? (int64_t)controller->mode : -1;
 }
 
-/* Ticks with the inputs of a log: flags 1 for active, + 2 with samples, + 4 for a new controller. */
+/* Ticks with the inputs of a log: flags 1 for active, + 2 with samples, + 4 for a new controller, + 8 for a restart. */
 void library_replay(rise_di_controller *controller, int64_t ticks, const int64_t *now_ns, const int64_t *stamp_ns,
                     const int64_t *flags, const int64_t *offset_ns, const double *y, const double *y_m, double *u) {
     for (int64_t k = 0; k < ticks; k++) {
@@ -65,7 +65,10 @@ void library_replay(rise_di_controller *controller, int64_t ticks, const int64_t
             }
         }
         if ((flags[k] & 4) != 0) {
-            rise_di_start(controller, &exported);
+            (void)rise_di_start(controller, &exported);
+        }
+        if ((flags[k] & 8) != 0) {
+            rise_di_restart(controller);
         }
         (void)rise_di_guard_tick(controller, now_ns[k], ((flags[k] & 2) != 0) ? &sample : (const rise_di_sample *)0, &samples,
                                  (flags[k] & 1) != 0, &output);

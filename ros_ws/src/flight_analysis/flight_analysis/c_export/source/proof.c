@@ -160,7 +160,10 @@ int main(int count, char **arguments) {
 #endif
         switch (next.kind) {
         case START:
-            rise_di_start(&controller, set);
+            if (!rise_di_start(&controller, set)) {
+                (void)fputs("rise_di_start returns false: the compiler does not compute what is written\n", stderr);
+                return EXIT_FAILURE;
+            }
             refused = 0;
             break;
         case TAKE_Y:
@@ -188,7 +191,9 @@ int main(int count, char **arguments) {
             return EXIT_FAILURE;
         }
 #ifdef COUNTING
-        end_count();
+        if (next.kind != START) {
+            end_count();
+        }
 #endif
         if (next.kind == TICK || next.kind == GUARD_TICK) {
             write_state(&controller, published, refused, &output);

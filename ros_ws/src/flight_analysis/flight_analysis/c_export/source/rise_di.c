@@ -12,8 +12,21 @@
 #if FLT_EVAL_METHOD != 0
 #error "float and double operations need their own precision: -msse2 -mfpmath=sse on 32-bit x86"
 #endif
-#ifdef __FAST_MATH__
-#error "-ffast-math changes the order of operations"
+/* gcc names these flags; clang names few of them, so rise_di_start computes a test as well. */
+#if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__)
+#error "-ffast-math, -funsafe-math-optimizations and -fassociative-math change the order of operations: -fno-fast-math"
+#endif
+#ifdef __RECIPROCAL_MATH__
+#error "-freciprocal-math changes divisions: add -fno-reciprocal-math"
+#endif
+#if defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ != 0)
+#error "-ffinite-math-only takes NaN for a number: add -fno-finite-math-only"
+#endif
+#ifdef __NO_SIGNED_ZEROS__
+#error "-fno-signed-zeros changes the sign of 0: add -fsigned-zeros"
+#endif
+#ifdef __NO_TRAPPING_MATH__
+#error "-fno-trapping-math is not proved: add -ftrapping-math"
 #endif
 
 #if !RISE_DI_FLOAT32
@@ -39,9 +52,22 @@ static rise_di_real lesser(rise_di_real a, rise_di_real b) { return (a < b) ? a 
 
 static rise_di_real greater(rise_di_real a, rise_di_real b) { return (a > b) ? a : b; }
 
+/* The value within two bounds; NaN stays NaN, as in Python. */
+static rise_di_real clipped(rise_di_real value, rise_di_real low, rise_di_real high) {
+    const rise_di_real raised = (value <= low) ? low : value;
+    return (raised >= high) ? high : raised;
+}
+
+static bool is_equal(rise_di_real a, rise_di_real b) { return (a <= b) && (a >= b); }
+
 static rise_di_real magnitude(rise_di_real a) { return (a < ZERO) ? -a : a; }
 
-static rise_di_real seconds(int64_t time_ns) { return (rise_di_real)time_ns / NANOSECONDS; }
+static rise_di_real seconds(uint64_t time_ns) { return (rise_di_real)time_ns / NANOSECONDS; }
+
+/* Time from a stamp to a later one, for all stamps; 0 for one that is not later. */
+static uint64_t elapsed_ns(int64_t later_ns, int64_t earlier_ns) {
+    return (later_ns > earlier_ns) ? ((uint64_t)later_ns - (uint64_t)earlier_ns) : (uint64_t)0;
+}
 
 static void copy(const rise_di_real *from, rise_di_real *to, int32_t count) {
     for (int32_t i = 0; i < count; i++) {
@@ -64,10 +90,8 @@ static bool is_finite(const rise_di_real *values, int32_t count) {
     return finite;
 }
 
-#if (RISE_DI_N > 0) || (RISE_DI_S > 0)
 /* The nearest integer, half to even, for magnitudes below 2^51 (float: 2^22). */
 static rise_di_real rounded(rise_di_real a) { return (a + ROUNDING) - ROUNDING; }
-#endif
 
 #if (RISE_DI_N > 0) || (RISE_DI_S > 0) || (RISE_DI_P > 0)
 /* result = matrix vector, summed over the columns 0, 1, ... in this order. */
@@ -110,7 +134,7 @@ static rise_di_real largest(rise_di_real upper, rise_di_real before, rise_di_rea
 /* u within the limits of magnitude, and of rate from `before` in dt. */
 static rise_di_real saturate(rise_di_real u, rise_di_real before, rise_di_real dt, const rise_di_limits *limits, int32_t i) {
     const rise_di_real reach = limits->rate[i] * dt;
-    return lesser(greater(u, least(limits->lower[i], before, reach)), largest(limits->upper[i], before, reach));
+    return clipped(u, least(limits->lower[i], before, reach), largest(limits->upper[i], before, reach));
 }
 
 /* ---- the law, equations (20) to (22) ---- */
@@ -155,7 +179,7 @@ static void step_law(const rise_di_parameters *p, const rise_di_law *before, con
             } else {
                 s = e / p->eps[i];
             }
-            s = lesser(greater(s, -ONE), ONE);
+            s = clipped(s, -ONE, ONE);
         }
         after->Pi[i] = before->Pi[i] + ((dt * p->beta[i]) * s);
         after->e[i] = e;
@@ -210,7 +234,7 @@ static void target_scale(const rise_di_parameters *p, const rise_di_real *y, ris
         V = V + (p->airspeed[i] * y[i]);
     }
     V = p->speed + V;
-    ratio = p->speed / lesser(greater(V, p->V_least), p->V_largest);
+    ratio = p->speed / clipped(V, p->V_least, p->V_largest);
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         target[i] = p->airspeed[i] + ((ONE - p->airspeed[i]) * (ratio * ratio));
     }
@@ -295,7 +319,7 @@ static void correct(const rise_di_parameters *p, rise_di_law *law, const rise_di
 static bool same_values(const rise_di_real *a, const rise_di_real *b, int32_t count) {
     bool same = true;
     for (int32_t i = 0; i < count; i++) {
-        same = same && (a[i] == b[i]);
+        same = same && is_equal(a[i], b[i]);
     }
     return same;
 }
@@ -313,7 +337,7 @@ static bool same_model(const rise_di_parameters *a, const rise_di_parameters *b)
 /* Sine with an error below 5e-16 (float: 3e-7) for angles up to 1e6 rad (float: 100 rad). */
 static rise_di_real sine(rise_di_real x) {
     static const rise_di_real coefficient[9] = RISE_DI_SINE_COEFFICIENTS;
-    const rise_di_real angle = lesser(greater(x, -RISE_DI_MAX_ANGLE), RISE_DI_MAX_ANGLE);
+    const rise_di_real angle = clipped(x, -RISE_DI_MAX_ANGLE, RISE_DI_MAX_ANGLE);
     const rise_di_real k = rounded(angle * RISE_DI_INVERSE_PI);
     const rise_di_real odd = k - (TWO * rounded(k / TWO));
     const rise_di_real r = (angle - (k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW);
@@ -482,8 +506,8 @@ static void pass_on(const rise_di_parameters *p, const rise_di_real *low, const 
         inside = true;
         for (int32_t j = 0; j < RISE_DI_P; j++) {
             const rise_di_real own = p->exchange[(j * RISE_DI_P) + j];
-            const rise_di_real excess = u[j] - lesser(greater(u[j], low[j]), high[j]);
-            if ((excess != ZERO) && (magnitude(own) > RISE_DI_EXCHANGE_LEAST)) {
+            const rise_di_real excess = u[j] - clipped(u[j], low[j], high[j]);
+            if ((!is_equal(excess, ZERO)) && (magnitude(own) > RISE_DI_EXCHANGE_LEAST)) {
                 const rise_di_real part = (RISE_DI_RELAXATION * excess) / own;
                 inside = false;
                 for (int32_t i = 0; i < RISE_DI_P; i++) {
@@ -534,7 +558,7 @@ static void towards(const rise_di_parameters *p, const rise_di_real *move, const
             }
         }
         for (int32_t j = 0; j < RISE_DI_P; j++) {
-            u[j] = lesser(greater(u[j] + (last * (target[j] - u[j])), low[j]), high[j]);
+            u[j] = clipped(u[j] + (last * (target[j] - u[j])), low[j], high[j]);
         }
     }
 }
@@ -577,7 +601,7 @@ static void allocate(const rise_di_parameters *p, const rise_di_real *u_before, 
             rise_di_real v_change[RISE_DI_M];
             copy(u, target, RISE_DI_P);
             for (int32_t j = 0; j < RISE_DI_P; j++) {
-                u[j] = lesser(greater(u_before[j], low[j]), high[j]);
+                u[j] = clipped(u_before[j], low[j], high[j]);
                 change[j] = target[j] - u[j];
             }
             product(p->effect, RISE_DI_M, RISE_DI_P, change, v_change);
@@ -642,13 +666,13 @@ static bool align(const rise_di_parameters *p, const rise_di_samples *samples, i
     } else if (newer != (const rise_di_sample *)0) {
         first = older;
         second = newer;
-    } else if ((stamp_ns - older->stamp_ns) > p->period_ns) {
+    } else if (elapsed_ns(stamp_ns, older->stamp_ns) > (uint64_t)p->period_ns) {
         possible = false;
     } else {
         first = older;
         for (back = 1; (back < samples->count) && (second == (const rise_di_sample *)0); back++) {
             const rise_di_sample *sample = sample_at(samples, back);
-            if ((older->stamp_ns - sample->stamp_ns) >= p->slope_ns) {
+            if (elapsed_ns(older->stamp_ns, sample->stamp_ns) >= (uint64_t)p->slope_ns) {
                 first = sample;
                 second = older;
             }
@@ -657,8 +681,9 @@ static bool align(const rise_di_parameters *p, const rise_di_samples *samples, i
     if (possible && (second == (const rise_di_sample *)0)) {
         copy(first->value, value, RISE_DI_M);
     } else if (possible) {
-        const rise_di_real span = (rise_di_real)(second->stamp_ns - first->stamp_ns);
-        const rise_di_real fraction = (rise_di_real)(stamp_ns - first->stamp_ns) / span;
+        const uint64_t span_ns = elapsed_ns(second->stamp_ns, first->stamp_ns);
+        const uint64_t passed_ns = elapsed_ns(stamp_ns, first->stamp_ns);
+        const rise_di_real fraction = (rise_di_real)passed_ns / (rise_di_real)span_ns;
         for (int32_t i = 0; i < RISE_DI_M; i++) {
             value[i] = first->value[i] + (fraction * (second->value[i] - first->value[i]));
         }
@@ -669,7 +694,7 @@ static bool align(const rise_di_parameters *p, const rise_di_samples *samples, i
 }
 
 /* Factor of the failsafe u: 1 up to hold, then linear to 0 over ramp. */
-static rise_di_real failsafe_scale(int64_t silence_ns, int64_t hold_ns, int64_t ramp_ns) {
+static rise_di_real failsafe_scale(uint64_t silence_ns, uint64_t hold_ns, uint64_t ramp_ns) {
     rise_di_real scale;
     if (silence_ns <= hold_ns) {
         scale = ONE;
@@ -706,22 +731,22 @@ static bool failsafe(rise_di_controller *c, int64_t now_ns, bool active, rise_di
             c->ramp_ns = p->ramp_ns;
         }
         if (active || (p->deactivation_holds == 0)) {
-            scale = failsafe_scale(now_ns - c->failsafe_start_ns, c->hold_ns, c->ramp_ns);
+            scale = failsafe_scale(elapsed_ns(now_ns, c->failsafe_start_ns), (uint64_t)c->hold_ns, (uint64_t)c->ramp_ns);
         }
         if (!active) {
             c->mode = RISE_DI_INACTIVE;
-        } else if (scale == ONE) {
+        } else if (is_equal(scale, ONE)) {
             c->mode = RISE_DI_HOLD;
         } else {
             c->mode = (scale > ZERO) ? RISE_DI_RAMP : RISE_DI_TRIM;
         }
         for (int32_t i = 0; i < RISE_DI_M; i++) {
-            c->u[i] = (scale == ONE) ? c->u_failsafe[i] : (scale * c->u_failsafe[i]);
+            c->u[i] = is_equal(scale, ONE) ? c->u_failsafe[i] : (scale * c->u_failsafe[i]);
             c->u_free[i] = c->u[i];
         }
 #if RISE_DI_P > 0
         for (int32_t j = 0; j < RISE_DI_P; j++) {
-            c->effectors[j] = (scale == ONE) ? c->effectors_failsafe[j] : (scale * c->effectors_failsafe[j]);
+            c->effectors[j] = is_equal(scale, ONE) ? c->effectors_failsafe[j] : (scale * c->effectors_failsafe[j]);
         }
 #endif
         log_inputs(output, now_ns, c->y, c->y_m, ZERO, ZERO);
@@ -744,11 +769,11 @@ static void engage(rise_di_controller *c, const rise_di_sample *y, const rise_di
 #endif
 }
 
-/* A step of the law with a new y. Returns dt. */
+/* A step of the law with a new y. Returns dt; 0 where u or a state would not be finite, and the law has to engage again. */
 static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const rise_di_real *y_m) {
     const rise_di_parameters *p = c->parameters;
-    const rise_di_real measured = seconds(y->stamp_ns - c->y_stamp_ns);
-    const rise_di_real dt = lesser(greater(measured, p->dt_least), p->dt_largest);
+    const rise_di_real measured = seconds(elapsed_ns(y->stamp_ns, c->y_stamp_ns));
+    const rise_di_real dt = clipped(measured, p->dt_least, p->dt_largest);
     const rise_di_law *before = &c->law;
     rise_di_law after;
     rise_di_real u_trim[RISE_DI_M];
@@ -756,13 +781,15 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     rise_di_real u[RISE_DI_M];
     const rise_di_limits *limits = &p->limits;
     bool limited = false;
+    bool finite;
 #if RISE_DI_P > 0
     rise_di_real effectors[RISE_DI_P];
     rise_di_limits given;
 #endif
 #if RISE_DI_S > 0
     rise_di_law predicted = c->law;
-    const int32_t missed = (int32_t)rounded(dt / p->period) - 1;
+    const rise_di_real periods = rounded(dt / p->period);
+    const int32_t missed = (int32_t)periods - 1;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
         u_trim[i] = c->u_trim[i] + c->u_ff[i];
     }
@@ -787,7 +814,7 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
     allocate(p, c->effectors, dt, u, effectors);
 #endif
     for (int32_t i = 0; i < RISE_DI_M; i++) {
-        limited = limited || (u[i] != u_free[i]);
+        limited = limited || (!is_equal(u[i], u_free[i]));
     }
     if (limited) {
 #if RISE_DI_P > 0
@@ -799,24 +826,42 @@ static rise_di_real step(rise_di_controller *c, const rise_di_sample *y, const r
         allocate(p, c->effectors, dt, u, effectors);
 #endif
     }
-#if RISE_DI_P > 0
-    copy(effectors, c->effectors, RISE_DI_P);
+    finite = is_finite(u, RISE_DI_M) && is_finite(u_free, RISE_DI_M) && is_finite(c->u_ff, RISE_DI_M) &&
+             is_finite((const rise_di_real *)&after, (int32_t)(sizeof after / sizeof(rise_di_real)));
+#if RISE_DI_N > 0
+    finite = finite && is_finite((const rise_di_real *)&c->feedforward, (int32_t)(sizeof c->feedforward / sizeof(rise_di_real)));
 #endif
-    c->law = after;
-    copy(u, c->u, RISE_DI_M);
-    copy(u_free, c->u_free, RISE_DI_M);
-    return dt;
+#if RISE_DI_P > 0
+    finite = finite && is_finite(effectors, RISE_DI_P);
+#endif
+    if (finite) {
+#if RISE_DI_P > 0
+        copy(effectors, c->effectors, RISE_DI_P);
+#endif
+        c->law = after;
+        copy(u, c->u, RISE_DI_M);
+        copy(u_free, c->u_free, RISE_DI_M);
+    }
+    return finite ? dt : ZERO;
 }
 
 static bool is_fresh(int64_t now_ns, int64_t stamp_ns, int64_t max_age_ns) {
-    const int64_t age_ns = now_ns - stamp_ns;
-    return (age_ns <= max_age_ns) && (age_ns >= -max_age_ns);
+    return (elapsed_ns(now_ns, stamp_ns) <= (uint64_t)max_age_ns) && (elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns);
+}
+
+/* Whether y and y_m are finite: a sample with NaN or infinity is as none. */
+static bool are_numbers(const rise_di_real *y, const rise_di_real *y_m) {
+    rise_di_real sum[RISE_DI_M];
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        sum[i] = y[i] + y_m[i];
+    }
+    return is_finite(sum, RISE_DI_M);
 }
 
 static bool any(const rise_di_real *values) {
     bool result = false;
     for (int32_t i = 0; i < RISE_DI_M; i++) {
-        result = result || (values[i] != ZERO);
+        result = result || (!is_equal(values[i], ZERO));
     }
     return result;
 }
@@ -824,16 +869,18 @@ static bool any(const rise_di_real *values) {
 bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const rise_di_sample *y, const rise_di_samples *y_m,
                         bool active, rise_di_output *output) {
     rise_di_controller *c = controller;
-    const int64_t max_age_ns = c->parameters->max_age_ns;
     rise_di_real reference[RISE_DI_M];
     rise_di_real dt = ZERO;
     bool fresh = false;
     bool published = true;
-    if ((y != (const rise_di_sample *)0) && (y_m->count > 0)) {
+    if ((y != (const rise_di_sample *)0) && (y_m->count > 0) && (c->parameters != (const rise_di_parameters *)0)) {
+        const int64_t max_age_ns = c->parameters->max_age_ns;
         fresh = is_fresh(now_ns, y->stamp_ns, max_age_ns) && is_fresh(now_ns, sample_at(y_m, 0)->stamp_ns, max_age_ns) &&
-                align(c->parameters, y_m, y->stamp_ns, reference);
+                align(c->parameters, y_m, y->stamp_ns, reference) && are_numbers(y->value, reference);
     }
-    if ((!active) && fresh && (!c->has_law) && (!any(c->u))) {
+    if (c->parameters == (const rise_di_parameters *)0) {
+        published = false;
+    } else if ((!active) && fresh && (!c->has_law) && (!any(c->u))) {
         c->mode = RISE_DI_INACTIVE;
         log_inputs(output, now_ns, y->value, reference, ZERO, ZERO);
     } else if ((!active) || (!fresh)) {
@@ -845,12 +892,18 @@ bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const ri
             published = false;
         } else {
             dt = step(c, y, reference);
+            if (is_equal(dt, ZERO)) {
+                engage(c, y, reference);
+            }
         }
         if (published) {
+            const int64_t newest_ns = sample_at(y_m, 0)->stamp_ns;
+            const rise_di_real ahead = seconds(elapsed_ns(newest_ns, y->stamp_ns));
+            const rise_di_real behind = seconds(elapsed_ns(y->stamp_ns, newest_ns));
             c->y_stamp_ns = y->stamp_ns;
             copy(y->value, c->y, RISE_DI_M);
             copy(reference, c->y_m, RISE_DI_M);
-            log_inputs(output, y->stamp_ns, y->value, reference, seconds(sample_at(y_m, 0)->stamp_ns - y->stamp_ns), dt);
+            log_inputs(output, y->stamp_ns, y->value, reference, (newest_ns < y->stamp_ns) ? -behind : ahead, dt);
         }
     }
     return published;
@@ -858,8 +911,66 @@ bool rise_di_guard_tick(rise_di_controller *controller, int64_t now_ns, const ri
 
 /* ---- controller: samples and calls ---- */
 
-void rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters) {
-    controller->parameters = parameters;
+#if RISE_DI_FLOAT32
+typedef float plain;
+typedef uint32_t plain_bits;
+#define NAN_BITS ((plain_bits)0x7FC00000)
+#define INFINITY_BITS ((plain_bits)0x7F800000)
+#define TINY ((plain)1 / (plain)4096) /* 2^-12 */
+#else
+typedef double plain;
+typedef uint64_t plain_bits;
+#define NAN_BITS ((plain_bits)0x7FF80000 << 32)
+#define INFINITY_BITS ((plain_bits)0x7FF00000 << 32)
+#define TINY ((plain)1 / (plain)134217728) /* 2^-27 */
+#endif
+
+#define MILLION ((rise_di_real)1000000)
+#define SINE_OF_PART ((rise_di_real)295520) /* sin(0.3) in millionths, below the part 0.2 */
+
+static rise_di_real from_bits(plain_bits bits) {
+    volatile plain_bits stored = bits;
+    union {
+        plain_bits bits;
+        plain value;
+    } number;
+    number.bits = stored;
+    return (rise_di_real)number.value;
+}
+
+/* Whether each operation is rounded once, in the order written. A compiler cannot know the values of volatile variables. */
+static bool is_rounded_once(void) {
+    volatile plain part = (plain)3 / (plain)10;
+    volatile plain billion = (plain)1000000000;
+    volatile plain near_one = (plain)1 + TINY;
+    volatile plain square = (plain)1 + ((plain)2 * TINY); /* of near_one, without the rest that only a fused operation keeps */
+    volatile plain minus_zero = -(plain)0;
+    volatile int32_t count = 64;
+    const rise_di_real factor = (rise_di_real)near_one;
+    bool exact = is_equal(rounded((rise_di_real)part), ZERO) && is_equal(rounded(ONE - (rise_di_real)part), ONE) &&
+                 is_equal((factor * factor) - (rise_di_real)square, ZERO) && ((ONE / ((rise_di_real)minus_zero + ZERO)) > ZERO);
+    for (int32_t k = 1; k < count; k++) {
+        exact = exact && is_equal(seconds((uint64_t)k), (rise_di_real)k / (rise_di_real)billion);
+    }
+#if RISE_DI_N > 0
+    exact = exact && (magnitude((sine((rise_di_real)part) * MILLION) - SINE_OF_PART) < ONE);
+#endif
+    return exact;
+}
+
+/* Whether NaN and infinity are told from numbers. */
+static bool is_nan_told(void) {
+    const rise_di_real special[3] = {from_bits(NAN_BITS), from_bits(INFINITY_BITS), -from_bits(INFINITY_BITS)};
+    bool told = (!is_equal(special[0], special[0])) && (!is_finite(special, 3));
+    for (int32_t k = 0; k < 3; k++) {
+        told = told && (!is_finite(&special[k], 1));
+    }
+    return told;
+}
+
+bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters) {
+    const bool exact = is_rounded_once() && is_nan_told();
+    controller->parameters = exact ? parameters : (const rise_di_parameters *)0;
     controller->mode = RISE_DI_WAITING;
     controller->has_law = false;
     controller->y_stamp_ns = 0;
@@ -870,6 +981,7 @@ void rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
     controller->y_samples.newest = 0;
     controller->y_m_samples.count = 0;
     controller->y_m_samples.newest = 0;
+    controller->agreeing = 0;
     fill(controller->u, RISE_DI_M, ZERO);
     fill(controller->u_free, RISE_DI_M, ZERO);
     fill(controller->u_trim, RISE_DI_M, ZERO);
@@ -879,42 +991,109 @@ void rise_di_start(rise_di_controller *controller, const rise_di_parameters *par
     fill(controller->effectors, RISE_DI_P, ZERO);
     fill(controller->effectors_failsafe, RISE_DI_P, ZERO);
 #endif
+    return controller->parameters != (const rise_di_parameters *)0;
 }
 
-static rise_di_status take(const rise_di_controller *c, rise_di_samples *samples, int64_t stamp_ns, int64_t now_ns,
-                           const rise_di_real *value) {
+/* Whether a sample can be taken after those before, as far as one sample tells. */
+static rise_di_status checked(const rise_di_controller *c, const rise_di_samples *samples, int64_t stamp_ns, int64_t now_ns,
+                              const rise_di_real *value) {
     rise_di_status status = RISE_DI_TAKEN;
-    if (stamp_ns > (now_ns + c->parameters->max_age_ns)) {
+    if (c->parameters == (const rise_di_parameters *)0) {
+        status = RISE_DI_NOT_STARTED;
+    } else if (elapsed_ns(stamp_ns, now_ns) > (uint64_t)c->parameters->max_age_ns) {
         status = RISE_DI_FUTURE;
     } else if ((samples->count > 0) && (stamp_ns <= sample_at(samples, 0)->stamp_ns)) {
         status = RISE_DI_ORDER;
     } else if (!is_finite(value, RISE_DI_M)) {
         status = RISE_DI_NOT_FINITE;
     } else {
-        rise_di_append(samples, stamp_ns, value);
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            if (magnitude(value[i]) > c->parameters->y_max[i]) {
+                status = RISE_DI_IMPLAUSIBLE;
+            }
+        }
+    }
+    return status;
+}
+
+/* Whether a sample of y is near the one before, and its change in a period. */
+static bool is_near(const rise_di_controller *c, const rise_di_sample *before, int64_t stamp_ns, const rise_di_real *value,
+                    rise_di_real *change) {
+    const rise_di_parameters *p = c->parameters;
+    const uint64_t span_ns = elapsed_ns(stamp_ns, before->stamp_ns);
+    const rise_di_real periods = greater((rise_di_real)span_ns / (rise_di_real)p->period_ns, ONE);
+    bool near = true;
+    for (int32_t i = 0; i < RISE_DI_M; i++) {
+        change[i] = magnitude(value[i] - before->value[i]) / periods;
+        near = near && (change[i] <= greater(RISE_DI_TIMES * c->change[i], p->y_reach[i]));
+    }
+    return near;
+}
+
+/* Whether y has come here as an aircraft moves, or has jumped and stays: three far samples in a row agree. */
+static rise_di_status compared(rise_di_controller *c, int64_t stamp_ns, const rise_di_real *value) {
+    const rise_di_sample *last = sample_at(&c->y_samples, 0);
+    rise_di_status status = RISE_DI_TAKEN;
+    rise_di_real change[RISE_DI_M];
+    if (is_near(c, last, stamp_ns, value, change) || (elapsed_ns(stamp_ns, c->begin_ns) < (uint64_t)RISE_DI_FIRST_NS)) {
+        const rise_di_real faded = ONE - lesser(seconds(elapsed_ns(stamp_ns, last->stamp_ns)) / RISE_DI_MEMORY, ONE);
+        for (int32_t i = 0; i < RISE_DI_M; i++) {
+            const rise_di_real seen = (c->agreeing > 0) ? magnitude(value[i] - last->value[i]) : change[i];
+            c->change[i] = greater(seen, faded * c->change[i]);
+        }
+        c->agreeing = 0;
+    } else {
+        const bool agrees = (c->agreeing > 0) && is_near(c, &c->far, stamp_ns, value, change);
+        c->agreeing = agrees ? (c->agreeing + 1) : 1;
+        if (c->agreeing < RISE_DI_AGREEING) {
+            c->far.stamp_ns = stamp_ns;
+            copy(value, c->far.value, RISE_DI_M);
+            status = RISE_DI_IMPLAUSIBLE;
+        } else {
+            c->agreeing = 0;
+            rise_di_restart(c);
+        }
     }
     return status;
 }
 
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
-    return take(controller, &controller->y_samples, stamp_ns, now_ns, value);
+    rise_di_status status = checked(controller, &controller->y_samples, stamp_ns, now_ns, value);
+    if ((status == RISE_DI_TAKEN) && (controller->y_samples.count > 0)) {
+        status = compared(controller, stamp_ns, value);
+    } else if (status == RISE_DI_TAKEN) {
+        controller->begin_ns = stamp_ns;
+        controller->agreeing = 0;
+        fill(controller->change, RISE_DI_M, ZERO);
+    } else {
+        /* refused */
+    }
+    if (status == RISE_DI_TAKEN) {
+        rise_di_append(&controller->y_samples, stamp_ns, value);
+    }
+    return status;
 }
 
 rise_di_status rise_di_take_y_m(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]) {
-    return take(controller, &controller->y_m_samples, stamp_ns, now_ns, value);
+    const rise_di_status status = checked(controller, &controller->y_m_samples, stamp_ns, now_ns, value);
+    if (status == RISE_DI_TAKEN) {
+        rise_di_append(&controller->y_m_samples, stamp_ns, value);
+    }
+    return status;
 }
 
 bool rise_di_tick(rise_di_controller *controller, int64_t now_ns, bool active, rise_di_output *output) {
     const rise_di_samples *samples = &controller->y_samples;
     const rise_di_samples *y_m = &controller->y_m_samples;
     const rise_di_sample *y = (const rise_di_sample *)0;
-    if (samples->count > 0) {
+    if ((controller->parameters != (const rise_di_parameters *)0) && (samples->count > 0)) {
         y = sample_at(samples, 0);
         if (y_m->count > 0) { /* the newest y up to a period after the newest y_m */
-            const int64_t known_ns = sample_at(y_m, 0)->stamp_ns + controller->parameters->period_ns;
+            const int64_t known_ns = sample_at(y_m, 0)->stamp_ns;
+            const uint64_t period_ns = (uint64_t)controller->parameters->period_ns;
             bool paired = false;
             for (int32_t back = 0; (back < samples->count) && (!paired); back++) {
-                if (sample_at(samples, back)->stamp_ns <= known_ns) {
+                if (elapsed_ns(sample_at(samples, back)->stamp_ns, known_ns) <= period_ns) {
                     y = sample_at(samples, back);
                     paired = true;
                 }
@@ -934,7 +1113,7 @@ const rise_di_real *rise_di_command(const rise_di_controller *controller) {
 
 void rise_di_retune(rise_di_controller *controller, const rise_di_parameters *parameters) {
     rise_di_controller *c = controller;
-    if (parameters->digest != c->parameters->digest) {
+    if ((c->parameters != (const rise_di_parameters *)0) && (parameters->digest != c->parameters->digest)) {
         if (c->has_law) {
             rise_di_real old_scale[RISE_DI_M];
             rise_di_real next_scale[RISE_DI_M];

@@ -6,7 +6,7 @@
  *
  * The caller owns the struct rise_di_controller. Order of calls in a period:
  *
- *   rise_di_start     once, before the first sample
+ *   rise_di_start     once, before the first sample; false: do not fly
  *   rise_di_take_y    for each sample of y; rise_di_take_y_m for each sample of y_m
  *   rise_di_tick      once a period; true: send rise_di_command(controller) with the stamp output.stamp_ns
  *
@@ -14,7 +14,8 @@
  * from trim. Stamps are nanoseconds of the clock of the caller. An interrupt must not call two functions for one controller at once.
  *
  * Every operation is rounded once to rise_di_real. Compile with -ffp-contract=off: a fused multiply-add has a single rounding for
- * two operations and gives different last bits. Never compile with -ffast-math. The equations are those of docs/theory.md.
+ * two operations and gives different last bits. Never compile with -ffast-math or a part of it: rise_di.c stops the compiler, or
+ * rise_di_start returns false. The equations are those of docs/theory.md.
  */
 #ifndef RISE_DI_H
 #define RISE_DI_H
@@ -46,9 +47,11 @@ typedef enum {
 
 typedef enum {
     RISE_DI_TAKEN = 0,
-    RISE_DI_FUTURE = 1,    /* refused: the stamp is ahead of the clock by more than max_age_ns */
-    RISE_DI_ORDER = 2,     /* refused: the stamp is not later than the stamp before */
-    RISE_DI_NOT_FINITE = 3 /* refused: NaN or infinite */
+    RISE_DI_FUTURE = 1,     /* refused: the stamp is ahead of the clock by more than max_age_ns */
+    RISE_DI_ORDER = 2,      /* refused: the stamp is not later than the stamp before */
+    RISE_DI_NOT_FINITE = 3, /* refused: NaN or infinite */
+    RISE_DI_IMPLAUSIBLE = 4, /* lost: beyond y_max, or a jump of y; the third sample in a row after a jump is taken */
+    RISE_DI_NOT_STARTED = 5  /* refused: rise_di_start has not returned true */
 } rise_di_status;
 
 /* Limits of magnitude and rate; the largest number of rise_di_real where there is no limit. */
@@ -94,6 +97,8 @@ typedef struct {
     rise_di_real input_scale[RISE_DI_M]; /* u per scaled input: units of u s / units of y */
     rise_di_real omega[RISE_DI_M];       /* abs(Omega_ii) in scaled inputs; implicit sign */
     rise_di_real eps[RISE_DI_M];         /* half-width of the softened sign, units of y */
+    rise_di_real y_max[RISE_DI_M];       /* largest abs(y) and abs(y_m), units of y */
+    rise_di_real y_reach[RISE_DI_M];     /* change of y in a period that is always possible, units of y */
     rise_di_limits limits;               /* of u */
 #if RISE_DI_P > 0 /* allocation: effectors = T u, u = effect effectors, P effectors; row by row, as every matrix */
     rise_di_real T[RISE_DI_P * RISE_DI_M];
@@ -195,6 +200,10 @@ typedef struct {
 #endif
     rise_di_samples y_samples;
     rise_di_samples y_m_samples;
+    int64_t begin_ns;               /* stamp of the first y taken */
+    rise_di_real change[RISE_DI_M]; /* largest change of y in a period, fading, units of y */
+    rise_di_sample far;             /* the last y that was lost after a jump */
+    int32_t agreeing;               /* number of such y in a row that agree */
 } rise_di_controller;
 
 /* Inputs of a tick, for a log, and the stamp of u. */
@@ -206,8 +215,10 @@ typedef struct {
     rise_di_real dt;             /* step of the law, s; 0 without a step */
 } rise_di_output;
 
-/* Set a controller to u = 0, waiting for the first samples. `parameters` has to outlive the controller. */
-void rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters);
+/* Set a controller to u = 0, waiting for the first samples. `parameters` has to outlive the controller. False where the compiler
+ * does not compute what is written: docs/export.md has its flags. The controller then takes no sample and commands nothing, as
+ * one in memory of zeros that was never started. */
+bool rise_di_start(rise_di_controller *controller, const rise_di_parameters *parameters);
 
 /* Take a sample of y or of y_m. A refused sample changes nothing. */
 rise_di_status rise_di_take_y(rise_di_controller *controller, int64_t stamp_ns, int64_t now_ns, const rise_di_real value[RISE_DI_M]);

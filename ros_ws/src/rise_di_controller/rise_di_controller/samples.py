@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which samples the controller takes. A sample that no aircraft can give is lost, as a sample that did not arrive.
+
+- `beyond`: a value is beyond the bound of its output, as no sensor gives it.
+- `step`: y changes by more than an aircraft can change it. The test compares y with the y before and has no model, so a wrong
+  model locks nothing out. An aircraft that really jumps loses two samples: the third in a row that agrees is taken.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from math import radians
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_core.rates import NANOSECONDS, seconds
+from flight_core.vectors import FloatArray, StampedVector
+
+RATES = ("p", "q", "r")
+LARGEST_RATE = radians(2000.0)
+"""rad/s, full scale of the gyros of autopilots: ICM-42688-P (TDK InvenSense, DS-000347), BMI088 (Bosch, BST-BMI088-DS001)."""
+
+LARGEST_AIRSPEED = 340.0  # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
+LARGEST = 1e6  # SI, of other outputs: `aircraft_sim.plant.DIVERGENCE_LIMIT`, which no state of an aircraft in flight comes near
+
+TIMES = 5.0
+"""Largest possible change over the largest of the last minute. Noise changes by up to four standard deviations in a minute, so
+this is 20 deviations. In the flights of the scenarios no change is above a quarter of the limit."""
+
+MEMORY = 60.0  # s, in which the largest change fades
+FIRST_NS = NANOSECONDS  # after the first sample, in which y shows how it changes
+AUTHORITY = 2.0  # change of y in a period over that by the full inputs: wind moves an aircraft as much as its inputs do
+UNLIMITED = 1.0  # SI, full input where it has no limit: 57 deg, or the weight as thrust
+LEAST = {"V": 1.0}  # m/s a sample, a change that counts as possible: above the knot in which an airspeed may come
+LEAST_RATE = 0.1  # rad/s a sample, the same of other outputs: 20 times the noise of a gyro, 0.005 rad/s
+AGREEING = 3  # samples in a row after a jump that agree
+
+
+class SampleLimits(NamedTuple):
+    """Bounds of the m outputs of y and of y_m."""
+
+    largest: FloatArray  # (m,) of abs(y)
+    reach: FloatArray  # (m,) change of y in a period that is always possible, units of y
+    period_ns: int  # of the ticks
+
+
+class Change(IntEnum):
+    """What a sample of y is beside those before."""
+
+    NEAR = 0  # taken
+    FAR = 1  # lost
+    JUMPED = 2  # taken: y has jumped, and the law engages again
+
+
+class SampleState(NamedTuple):
+    """What the controller knows of the samples of y before."""
+
+    begin_ns: int  # stamp of the first sample
+    last: StampedVector  # the last sample taken
+    change: FloatArray  # (m,) largest change in a period of the samples taken, fading, units of y
+    far: StampedVector  # the last sample; another one than `last` where that one is lost
+    agreeing: int  # samples in a row up to `far` that are lost, and agree with the one before
+
+
+def bounds(names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int) -> SampleLimits:
+    """The limits of outputs by name; `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of parameters."""
+    by_name = {**dict.fromkeys(RATES, LARGEST_RATE), "V": LARGEST_AIRSPEED}
+    of_names = [by_name.get(name, LARGEST) for name in names]
+    least = [LEAST.get(name, LEAST_RATE) for name in names]
+    reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
+    return SampleLimits(np.array(largest or of_names, dtype=np.float64), reach, period_ns)
+
+
+def beyond(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
+    """The first of the m values that is beyond its bound, or NaN, as a sentence; empty for values inside."""
+    inside = np.abs(value) <= limits.largest
+    if inside.all():
+        return ""
+    i = int(np.argmin(inside))
+    return f"{names[i]} = {value[i]:g} is beyond {limits.largest[i]:g}, the bound of {names[i]} (controller.y_max)"
+
+
+def jump(before: StampedVector, sample: StampedVector, names: Sequence[str]) -> str:
+    """The changes from a sample to another, as a sentence."""
+    values = zip(names, before.value.tolist(), sample.value.tolist(), strict=True)
+    moves = ", ".join(f"{name} from {old:g} to {new:g}" for name, old, new in values)
+    return f"a jump of y in {seconds(sample.stamp_ns - before.stamp_ns):g} s: {moves}"
+
+
+def begun(sample: StampedVector) -> SampleState:
+    """The state after the first sample."""
+    return SampleState(sample.stamp_ns, sample, np.zeros_like(sample.value), sample, 0)
+
+
+def step(state: SampleState, sample: StampedVector, limits: SampleLimits) -> tuple[SampleState, Change]:
+    """The state after a sample of y with a later stamp, and what the sample is.
+
+        change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
+        NEAR where change <= max(TIMES largest, reach) in all outputs; then largest = max(change, faded largest)
+
+    The possible change grows with the time since the last sample taken: no sensor is locked out for ever. After samples that
+    were lost, largest takes the whole change, since y may be as noisy as that.
+    """
+    near, change = _compared(state.last, sample, state.change, limits)
+    if near or sample.stamp_ns - state.begin_ns < FIRST_NS:
+        if state.agreeing:
+            change = np.abs(sample.value - state.last.value)
+        fading = 1.0 - min(seconds(sample.stamp_ns - state.last.stamp_ns) / MEMORY, 1.0)
+        return SampleState(state.begin_ns, sample, np.maximum(change, fading * state.change), sample, 0), Change.NEAR
+    agrees = state.agreeing > 0 and _compared(state.far, sample, state.change, limits)[0]
+    agreeing = state.agreeing + 1 if agrees else 1
+    if agreeing < AGREEING:
+        return state._replace(far=sample, agreeing=agreeing), Change.FAR
+    return state._replace(last=sample, far=sample, agreeing=0), Change.JUMPED
+
+
+def _compared(
+    before: StampedVector, sample: StampedVector, largest: FloatArray, limits: SampleLimits
+) -> tuple[bool, FloatArray]:
+    """Whether a sample is near the one before, and the change in a period, (m,)."""
+    periods = max((sample.stamp_ns - before.stamp_ns) / limits.period_ns, 1.0)
+    change = np.abs(sample.value - before.value) / periods
+    return bool((change <= np.maximum(TIMES * largest, limits.reach)).all()), change
