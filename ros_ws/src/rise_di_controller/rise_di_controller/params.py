@@ -217,8 +217,7 @@ class ControllerConfig(NodeConfig):
     delay: NonNegative = Field(description="pure delay from y to the actuators in addition to sampling, s")
     y_max: Positives | None = Field(
         default=None,
-        description="the largest abs(y) and abs(y_m): a sample beyond is lost; absent: 34.9 rad/s (2000 deg/s, the range of a "
-        "gyro) for p, q, r, 340 m/s for V, else 1e6",
+        description="the largest abs(y) and abs(y_m): a sample beyond is lost; absent: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
