@@ -113,9 +113,10 @@ def ways(fence: Fence) -> Ways:
 
 def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
     """Centres of the cells, north and east, m, over all zones, home and the surroundings; and the size of a cell, m."""
-    sides = []
-    for k in (0, 1):
-        reach = [(value, zone.radius) for zone in fence.zones for value in zone[k]] + [(fence.home[k], 0.0)]
+    sides = list[tuple[float, float]]()
+    for axis in ("north", "east"):
+        reach = [(value, zone.radius) for zone in fence.zones for value in getattr(zone, axis)]
+        reach.append((fence.home[len(sides)], 0.0))
         sides.append((min(value - radius for value, radius in reach), max(value + radius for value, radius in reach)))
     longest = max(most - least for least, most in sides)
     around = 2.0 * fence.radius + 0.1 * longest
@@ -133,7 +134,7 @@ def _neighbours(values: FloatArray, fill: float) -> list[FloatArray]:
 
 
 def _largest_neighbour(values: FloatArray) -> FloatArray:
-    return np.max(_neighbours(values, -math.inf), axis=0)
+    return np.asarray(np.max(_neighbours(values, -math.inf), axis=0))
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
