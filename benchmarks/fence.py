@@ -3,22 +3,26 @@
 """Aircraft that fly out of a fence, in wind and turbulence: five shapes, four winds; how many leave the fence, and how far.
 
     .venv/bin/python -m benchmarks.fence [--only osprey c172p f16 737] [--shapes square ell] [--aircraft 2000]
+    .venv/bin/python -m benchmarks.fence --from-outside [--aircraft 1]
 
 The figures go to docs/evidence/guidance-fence-*.csv, where all fences and winds are flown. A row a shape and a wind. Of the
 osprey a fleet flies: every entry of A and B is off by up to 30 % (`aircraft_sim.uncertainty`).
 An aircraft of JSBSim flies as it is, once. The turbulence is light (MIL-F-8785C, 1.5 m/s), the steady wind a share of V0. The
 aircraft starts at the origin to the north, 2 to 3 least radii before the fence. No number belongs to an aircraft. Exit status
 1: an aircraft left the fence, or was lost.
+
+`--from-outside` starts ospreys outside of five fences, in a wind of 0.4 V from four sides; the figures are printed. A flight is
+home that is within HOME_RADII of home at the end. Exit status 1: an aircraft did not come home.
 """
 
 import argparse
 import csv
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from benchmarks import evidence_data
@@ -33,8 +37,8 @@ from flight_bringup.scenarios import find_scenario
 from flight_campaign import fleet, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.outcome import COMPLETED
-from flight_guidance.fence import Fence, Zone
 from flight_guidance.params import GuidanceConfig
+from flight_guidance.zones import Fence, Zone
 
 OSPREY = "osprey"
 AIRCRAFT = (OSPREY, "c172p", "f16", "737")
@@ -54,6 +58,31 @@ SHAPES: Mapping[str, tuple[Zone, ...]] = {
 }
 """Fences in least radii of the aircraft in the wind."""
 
+OUTSIDE: Mapping[str, Fence] = {
+    "square": Fence((Zone((-6.0, -1.0, -1.0, -6.0), (-2.0, -2.0, 3.0, 3.0)),), (-3.5, 0.5)),
+    "slot of a U, home in the other arm": Fence(
+        (Zone((-3.0, 5.5, 5.5, -3.0, -3.0, 2.0, 2.0, -3.0), (-3.3, -3.3, 4.0, 4.0, 0.7, 0.7, -0.3, -0.3)),), (-0.5, 2.3)
+    ),
+    "notch of an L": Fence((Zone((-4.5, 3.5, 3.5, -0.4, -0.4, -4.5), (-5.0, -5.0, -0.4, -0.4, 4.0, 4.0)),), (1.5, -2.7)),
+    "no-fly zone in a circle": Fence(
+        (Zone((0.0,), (0.0,), 6.0), Zone((-0.7, 0.7, 0.7, -0.7), (-1.0, -1.0, 0.4, 0.4), exclude=True)), (-3.0, -2.0)
+    ),
+    "two zones that touch": Fence(
+        (Zone((-1.0, 2.5, 2.5, -1.0), (0.6, 0.6, 5.0, 5.0)), Zone((2.5, 6.0, 6.0, 2.5), (0.6, 0.6, 5.0, 5.0))), (4.2, 2.8)
+    ),
+}
+"""Fences that the origin is outside of, with home, in least radii of the aircraft in the wind."""
+
+OUTSIDE_WINDS: Mapping[str, tuple[float, float]] = {
+    "0.4 V from behind": (0.4, 0.0),
+    "0.4 V from the left": (0.0, 0.4),
+    "0.4 V from ahead": (-0.4, 0.0),
+    "0.4 V from the right": (0.0, -0.4),
+}
+
+HOME_RADII = 1.5
+"""Largest distance from home, in radii of the orbit round home: the orbit, and half a radius to join it."""
+
 WINDS: Mapping[str, tuple[float, float]] = {
     "calm": (0.0, 0.0),
     "0.3 V from behind": (0.3, 0.0),
@@ -62,8 +91,8 @@ WINDS: Mapping[str, tuple[float, float]] = {
 }
 """Where the air moves to: north and east, of V0."""
 
-DURATION = 8.0
-"""Radii at V0: 3 to the fence against the wind, a turn, and the way home."""
+DURATION, HOMEWARD_DURATION = 8.0, 25.0
+"""Radii at V0: 3 to the fence against the wind, a turn, and the way home; 14 round the U against 0.4 V."""
 
 
 class Row(NamedTuple):
@@ -77,6 +106,7 @@ class Row(NamedTuple):
     farthest: float  # m beyond the fence
     turned: int  # flights with a bank of nine tenths of the largest
     lost: int  # flights
+    home: int  # flights within HOME_RADII at the end
 
     def figures(self) -> Iterator[evidence_data.Row]:
         """The rows of evidence."""
@@ -93,21 +123,26 @@ def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
     def scaled(values: tuple[float, ...]) -> tuple[float, ...]:
         return tuple(radius * value for value in values)
 
-    return tuple(Zone(scaled(zone.north), scaled(zone.east), radius * zone.radius, zone.exclude) for zone in zones)
+    return tuple(zone._replace(north=scaled(zone.north), east=scaled(zone.east), radius=radius * zone.radius) for zone in zones)
 
 
-def windy(scenario: Scenario, wind: str) -> tuple[Scenario, GuidanceConfig, float]:
-    """A scenario in a wind, without a route, that flies to the north; its section, and the least radius, m."""
+def windy(
+    scenario: Scenario, wind: tuple[float, float], home: tuple[float, float], radii: float = DURATION
+) -> tuple[Scenario, GuidanceConfig, float]:
+    """A scenario in a wind, share of V0, without a route, that flies to the north; its section, and the least radius, m.
+
+    `home` in radii; `radii`: the duration, at V0.
+    """
     if scenario.guidance is None:
         raise ValueError(f"{scenario.name} has no guidance")
     speed = scenario.guidance.speed
-    north, east = (share * speed for share in WINDS[wind])
+    north, east = (share * speed for share in wind)
     section = scenario.guidance.model_copy(update={"wind": math.hypot(north, east)})
     radius = float(math.ceil(section.least_radius()))
     varied = scenario.vary(
-        flight={"duration": float(math.ceil(DURATION * radius / speed))},
+        flight={"duration": float(math.ceil(radii * radius / speed))},
         aircraft={"wind": [north, east], "turbulence": turbulence(scenario, 1)},
-        guidance={"wind": section.wind, "route": None, "home": dict(zip(("north", "east"), at(HOME, radius), strict=True))},
+        guidance={"wind": section.wind, "route": None, "home": dict(zip(("north", "east"), at(home, radius), strict=True))},
     )
     return varied, section, radius
 
@@ -117,17 +152,19 @@ def at(place: tuple[float, float], radius: float) -> tuple[float, float]:
     return place[0] * radius, place[1] * radius
 
 
-def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
+def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: bool = False) -> Row:
     """The row of uncertain ospreys. The fence is put round the mission afterwards, as guidance refuses a route out of it."""
-    scenario, _, radius = windy(find_scenario("osprey_route"), wind)
+    fence = OUTSIDE[shape] if from_outside else Fence(SHAPES[shape], HOME)
+    share, radii = (OUTSIDE_WINDS[wind], HOMEWARD_DURATION) if from_outside else (WINDS[wind], DURATION)
+    scenario, _, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
     route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario, airframe = scenario.vary(guidance={"route": route}), load_airframe("osprey")
     course, vehicle = build_course(scenario), fleet.vehicle(scenario)
     mission = missions.build(scenario, course)
-    fence = Fence(of_radius(SHAPES[shape], radius), at(HOME, radius))
+    fence = Fence(of_radius(fence.zones, radius), at(fence.home, radius), radius)
     mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
     control_law, params = scenario.controller.tuned_law()
-    beyond, banks, lost = [], [], 0
+    beyond, banks, lost, home = [], [], 0, 0
     for first in range(0, aircraft, CHUNK):
         A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
         directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
@@ -137,12 +174,13 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int) -> Row:
         beyond += np.asarray(figures["max.breach"]).tolist()
         banks += np.asarray(figures["max.phi"]).tolist()
         lost += int(np.sum(np.asarray(result.diverged)))
-    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)
+        home += int(np.sum(np.asarray(figures["home"]) <= HOME_RADII * radius))
+    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)._replace(home=home)
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
     """The row of an aircraft of JSBSim, which flies to the north."""
-    scenario, section, radius = windy(aircraft_of(name), wind)
+    scenario, section, radius = windy(aircraft_of(name), WINDS[wind], HOME)
     zones = of_radius(SHAPES[shape], radius)
     fence = {
         f"zone{k}": {"north": zone.north, "east": zone.east, "radius": zone.radius or None, "exclude": zone.exclude}
@@ -152,13 +190,27 @@ def fly_alone(name: str, shape: str, wind: str) -> Row:
     tape = simulate(scenario.vary(guidance={"fence": fence, "program": program}))
     beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
     bank = float(np.abs(tape["pose"]["phi"]).max())
-    return row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
+    pose, home = tape["pose"], at(HOME, radius)
+    to_home = math.hypot(pose["north"][-1] - home[0], pose["east"][-1] - home[1])
+    row = row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
+    return row._replace(home=int(to_home <= HOME_RADII * radius))
+
+
+def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]:
+    """Whether all ospreys that start outside come home, by fence and wind."""
+    homes = []
+    for number, (shape, wind) in enumerate(product(OUTSIDE, OUTSIDE_WINDS)):
+        row = fly_fleet(shape, wind, aircraft, seed + number, from_outside=True)
+        show(row)
+        sys.stdout.flush()
+        homes.append(row.home == row.flights)
+    return homes
 
 
 def row_of(name: str, shape: str, wind: str, beyond: list[float], banks: list[float], lost: int, largest: float) -> Row:
     """A row from the distances beyond the fence, m, and the largest banks of the flights."""
     outside, turned = sum(distance > 0.0 for distance in beyond), sum(bank > 0.9 * largest for bank in banks)
-    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost)
+    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost, 0)
 
 
 def main() -> int:
@@ -169,9 +221,12 @@ def main() -> int:
     parser.add_argument("--winds", nargs="*", choices=[*WINDS], default=[*WINDS], help="winds; not stored")
     parser.add_argument("--aircraft", type=int, default=2000, help="ospreys in each row")
     parser.add_argument("--seed", type=int, default=7, help="of the ospreys")
+    parser.add_argument("--from-outside", action="store_true", help="start ospreys outside of a fence; not stored")
     chosen = parser.parse_args()
     writer, failed = csv.writer(sys.stdout), False
     writer.writerow(Row._fields)
+    if chosen.from_outside:
+        return int(not all(fly_home(chosen.aircraft, chosen.seed, writer.writerow)))
     for name in chosen.only:
         options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
         begun, flown = evidence_data.origin(f"python -m benchmarks.fence --only {name}{options}"), list[Row]()

@@ -113,6 +113,7 @@ class MissionState(NamedTuple):
     fence: Array  # action of the fence, as in GuidanceState
     home_altitude: Array  # m
     clearance: Array  # m, the least one from the fence
+    from_home: Array  # m
 
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
@@ -235,6 +236,7 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
         velocity,
         *(none,) * 8,
         none + modes.LARGEST,
+        none,
     )
 
 
@@ -329,6 +331,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             fence=escape.action,
             home_altitude=home_altitude,
             clearance=jnp.minimum(state.clearance, escape.clearance),
+            from_home=jnp.hypot(pose["north"] - params.home.north, pose["east"] - params.home.east),
         )
 
     def begin() -> MissionState:
@@ -396,12 +399,15 @@ def _pose(state: MissionState, x: Array, t: Array, mission: Mission) -> dict[str
 
 
 def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
-    """Score, cross-track error and altitude error on the route, largest bank, shapes (N,), SI.
+    """Score, cross-track error and altitude error on the route, largest bank, with a fence the last distance from home.
+
+    Shapes (N,), SI.
 
     The score is the largest cross-track error in half seconds of flight at V0. The orbit round the last waypoint, which
     begins at the centre, is left out.
     """
     samples = jnp.maximum(state.samples, 1.0)
+    fenced = {"max.breach": jnp.maximum(-state.clearance, 0.0), "home": state.from_home}
     return {
         "score": state.xtrack_max / (CAPTURE_TIME * mission.speed),
         "max.xtrack": state.xtrack_max,
@@ -409,5 +415,5 @@ def figures(state: MissionState, mission: Mission) -> dict[str, Array]:
         "rms.altitude": jnp.sqrt(state.altitude_squares / samples),
         "max.phi": state.phi_max,
         "missed": state.missed,
-        **({} if mission.guidance.fence is None else {"max.breach": jnp.maximum(-state.clearance, 0.0)}),
+        **({} if mission.guidance.fence is None else fenced),
     }
