@@ -18,7 +18,7 @@ from flight_core.parameters import ParameterError
 
 pytestmark = pytest.mark.package("flight_bringup")
 
-HEARS_NOTHING: Any = SimpleNamespace(is_ready=lambda *_: False, is_matched=lambda *_: False)  # in place of a FlightMonitor
+SILENT_MONITOR: Any = SimpleNamespace(is_ready=lambda *_: False, is_matched=lambda *_: False)  # in place of a FlightMonitor
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def only_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def start_stage(scenario: Scenario, run: Path) -> None:
-    with FlightProcesses(scenario, run, HEARS_NOTHING, lockstep=False, one_process=False):
+    with FlightProcesses(scenario, run, SILENT_MONITOR, lockstep=False, one_process=False):
         pass
 
 
@@ -100,7 +100,7 @@ def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
     only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
     (tmp_path / "cause").mkdir()
     (tmp_path / "cause" / "main.py").write_text(end, encoding="utf-8")
-    flight = FlightProcesses(osprey_gust, tmp_path, HEARS_NOTHING, lockstep=True, one_process=False)
+    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=True, one_process=False)
     for node in (NodeSpec("fake", "recorder"), NodeSpec("cause", "aircraft")):
         flight.processes.append(processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / f"{node.executable}.log"))
     for process in flight.processes:
@@ -129,7 +129,7 @@ def test_process_that_closes_log_has_time_for_it(
     node = NodeSpec("fake", executable)
     monkeypatch.setattr(processes, executable.upper(), node)
     monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.1)  # of the other nodes
-    flight = FlightProcesses(osprey_gust, tmp_path, HEARS_NOTHING, lockstep=False, one_process=False)
+    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=False, one_process=False)
     process = processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / "node.log")
     flight.processes.append(process)
     until(lambda: "up" in process.lines, "the process is up")

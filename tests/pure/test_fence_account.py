@@ -79,7 +79,7 @@ def test_account_of_summary_has_time_outside() -> None:
 
 
 def test_notices_say_when_an_aircraft_is_outside() -> None:
-    """While the pose is lost, `fence.clearance` is LARGEST, and nobody knows."""
+    """While the pose is lost, `fence.clearance` is LARGEST: unknown."""
     notices, log = Notices(0.0, 0.2, lambda speed: 100.0), dict.fromkeys(Notices.CHANNELS, 0.0)
     texts = [
         notice.text

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The files of a foreign model of JSBSim: those that it names, found as JSBSim finds them, and what the model may not do.
+"""The files of a foreign model of JSBSim, found as JSBSim finds files, and what the model may not do.
 
 JSBSim loads a copy of these files alone. Sources: JSBSim 1.3, FGModelLoader.cpp (a name without ".xml" gets it),
 FindFullPathName of FGModel, FGFCS and FGPropulsion (the folders), FGFDMExec::LoadModel (input and output), FGPropagate.cpp and
@@ -29,21 +29,21 @@ ENGINE_FOLDERS = ("Engines", "engines", "Engine", "engine")
 FOLDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"engine": ENGINE_FOLDERS, "thruster": ENGINE_FOLDERS, "system": ("", "Systems", "systems")}
 )
-"""Folders beside the model in which JSBSim looks for the file of an element; "" is that of the model, where all others are."""
+"""Folders beside the model in which JSBSim looks for the file of an element; "" is the folder of the model itself."""
 ROOT_FOLDERS: Mapping[str, str] = MappingProxyType({"engine": "engine", "thruster": "engine", "system": "systems"})
 """The folder of the root in which JSBSim looks next."""
 SECTIONS = frozenset(
     {"metrics", "mass_balance", "ground_reactions", "external_reactions", "buoyant_forces", "propulsion", "autopilot"}
     | {"flight_control", "aerodynamics", "planet"}
 )
-"""Further elements whose file JSBSim reads; another element with an attribute `file` needs none."""
+"""Further elements whose file JSBSim reads. An element with an attribute `file` beyond these needs no file."""
 
 
 MOST_BYTES = 16 << 20  # of a file: the largest of JSBSim's own has a third of a megabyte
 
 
 class ModelFiles(NamedTuple):
-    """A model and the files it names, as a root of JSBSim."""
+    """A model and the named files, as a root of JSBSim."""
 
     model: str  # its path in the root
     members: Mapping[str, bytes]  # content by path: aircraft/NAME/ has what is beside the model, engine/ and systems/ the rest
@@ -67,7 +67,7 @@ class ModelFiles(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """A file that JSBSim reads: its path in the new root, and where it is."""
+    """A file for JSBSim: the path in the new root, and the place of the source."""
 
     member: str
     path: Path
@@ -119,7 +119,7 @@ def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
 
 
 def _relative(name: str, path: Path) -> str:
-    """The path of a named file with its suffix. Raises ParameterError for one that leaves its folder."""
+    """The path of a named file with the suffix. Raises ParameterError where the path leaves the folder."""
     plain = PurePosixPath(name.replace("\\", "/"))
     inside = not plain.is_absolute() and ".." not in plain.parts
     require(inside, str(path), f"the file {name!r}", "one below the folder of the model, without ..")
@@ -127,7 +127,7 @@ def _relative(name: str, path: Path) -> str:
 
 
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
-    """A sentence on files that are in no folder, by name with the element: those of an element alike the first one's."""
+    """A sentence on missing files, by name with the element: the files of elements like the first."""
     element = next(iter(missing.values()))
     names = sorted({name.removesuffix(SUFFIX) for name, of in missing.items() if FOLDERS.get(of) == FOLDERS.get(element)})
     folders = [str(model.parent / FOLDERS.get(element, ("",))[0])]

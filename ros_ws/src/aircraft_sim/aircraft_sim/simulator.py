@@ -16,6 +16,7 @@ from aircraft_sim import plant, pose, sensors, truth, turbulence, vanes
 from aircraft_sim.dynamics import Forcing
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.sensors import DelayLine
+from flight_core import plausible
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.outcome import FlightEnded
@@ -169,6 +170,7 @@ class Simulator:
         channels = parameters.channels()
         self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
         self.period_ns = period_ns(parameters.rate, "rate")
+        self._largest = plausible.largest(self.outputs)
         self._model: FlightDynamicsModel  # in trim at t = 0
         if parameters.is_jsbsim:
             from aircraft_sim.jsbsim_model import JsbsimModel  # noqa: PLC0415 - other aircraft fly without JSBSim
@@ -219,14 +221,14 @@ class Simulator:
         """Advance to sample `number`, at number periods of flight time, with u held since the last sample, and measure.
 
         Returns the arriving y, the oldest first; their stamps are flight time. Raises FlightEnded where the aircraft
-        has diverged.
+        has diverged: its state, or an output beyond `flight_core.plausible`.
         """
         t_ns = number * self.period_ns
         self._advance(number, u)
         self._number = number
-        if self._model.diverged():
-            raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         true = self._model.y()
+        if self._model.diverged() or not (np.abs(true) <= self._largest[: len(true)]).all():  # false for NaN too
+            raise FlightEnded(f"diverged at t = {seconds(t_ns):.2f} s")
         if self._vanes is not None and self._vane_state is not None:
             angles = self._model.air_angles(t_ns)
             self._vane_state = vanes.turned(seconds(t_ns), angles, self._vane_state, self._vanes)

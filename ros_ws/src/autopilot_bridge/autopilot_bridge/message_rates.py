@@ -47,21 +47,21 @@ class MessageRates:
         return {name: rate.requested for name, rate in self._rates.items() if rate.step(now)}
 
     def slow(self, now: float) -> dict[str, str]:
-        """The messages that are slow, or whose rate was taken less than REMEMBERED ago, each with a sentence."""
+        """Sentences on messages by name: slow now, or slow less than REMEMBERED ago after a granted rate."""
         sentences = {name: rate.sentence(name, now) for name, rate in self._rates.items()}
         return {name: sentence for name, sentence in sentences.items() if sentence}
 
     def lasting(self, now: float) -> str:
-        """The messages that are slow for SLOW_ENDS or longer, as a sentence."""
+        """A sentence on messages that are slow for SLOW_ENDS or longer."""
         lasting = [rate.sentence(name, now) for name, rate in self._rates.items() if rate.lasts(now)]
         return "; ".join([*lasting, f"for {SLOW_ENDS:g} s"]) if lasting else ""
 
     def comes(self, name: str, now: float) -> bool:
-        """Whether a message comes at its rate."""
+        """Whether a message comes at the requested rate."""
         return self._rates[name].is_known(now) and not self._rates[name].sentence(name, now)
 
     def unknown(self, now: float) -> list[str]:
-        """The names of the messages that were not counted for long enough."""
+        """The names of messages without a count of full length."""
         return [name for name, rate in self._rates.items() if not rate.is_known(now)]
 
 
@@ -122,7 +122,7 @@ class _Rate:
             self._instants.popleft()
 
     def _present(self) -> float:
-        """The mean rate of the newest messages, Hz: the count still has those from before a fall."""
+        """The mean rate of the newest messages, Hz: the count still has messages from before a fall."""
         if len(self._instants) <= GAPS:
             return len(self._instants) / self._window
         return GAPS / max(self._instants[-1] - self._instants[-1 - GAPS], 1e-3)

@@ -99,7 +99,7 @@ class _Reader(pickle.Unpickler):
 
 
 class _Writer(pickle.Pickler):
-    """Writes a mapping that cannot be changed, which pickle does not, as a dict."""
+    """Writes a mapping without changes as a dict: pickle refuses a MappingProxyType."""
 
     def reducer_override(self, value: object) -> Any:
         return (dict, (dict(value),)) if isinstance(value, MappingProxyType) else NotImplemented

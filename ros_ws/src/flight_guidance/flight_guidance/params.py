@@ -101,7 +101,7 @@ class ZoneConfig(Config):
     east: Numbers = Field(description="m")
     radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
     exclude: bool = Field(default=False, description="whether the aircraft keeps out of the zone; else the aircraft stays in")
-    group: Annotated[int, Field(ge=0)] | None = Field(
+    group: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
         description="of zones to stay in: the aircraft stays inside every zone of at least one group; none: a group of its own",
     )

@@ -39,7 +39,7 @@ class Ways(NamedTuple):
     straight: NDArray[np.bool_]
 
     def aim(self, fence: Fence, north: Array, east: Array) -> tuple[Array, Array, Array]:
-        """The aim of places, north and east, m, and whether the straight way home is free; beside the map its nearest cell."""
+        """The aim of places, north and east, m, and whether the straight way home is free; beside the map the nearest cell."""
         xp = array_namespace(north)
         rows, columns = self.straight.shape
         row_at, column_at = (north - self.corner[0]) / self.cell, (east - self.corner[1]) / self.cell
@@ -77,12 +77,11 @@ def line_clearance(fence: Fence, north: Array, east: Array, to_north: Array, to_
 def ways(fence: Fence) -> Ways:
     """The map of a fence.
 
-    A cell is open where a circle of half of its size fits inside. Ways lead from open cell to open cell, where the circles that
-    fit round both overlap: the line between them stays inside. A metre counts `radius / clearance`, at least 1.
+    A cell is open where a circle of half a cell fits inside. Ways lead from open cell to open cell where the fitting circles
+    overlap: the line between the cells stays inside. A metre counts `radius / clearance`, at least 1.
 
-    The aim of an open cell is on its way, about a radius ahead; without a way home the way leads to the roomiest cell around,
-    for a hold. From a cell inside that is not open the way leads away from the border. The aim of a cell outside is the
-    nearest cell with a way home.
+    The aim of an open cell is on the way home, about a radius ahead; without a way home, the roomiest cell around, for a hold.
+    From a closed cell inside the way leads away from the border. The aim of a cell outside is the nearest cell with a way home.
     """
     north, east, cell = _cells(fence)
     room = clearance(fence.zones, north, east)
@@ -138,7 +137,7 @@ def _largest_neighbour(values: FloatArray) -> FloatArray:
 
 
 def _uphill(values: FloatArray) -> NDArray[np.intp]:
-    """The neighbour of each cell in the direction in which the values rise, itself where they do not."""
+    """The neighbour of a cell in the direction of rising values; the cell itself at a peak."""
     slopes = np.gradient(values)
     steepness = np.maximum(np.hypot(*slopes), 1e-6)
     last = np.array(values.shape).reshape(2, 1, 1) - 1
@@ -155,8 +154,8 @@ def _shortest(seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell
     costs, rooms = _neighbours(cost, math.inf), _neighbours(room, -math.inf)
     edges = np.array(
         [
-            np.where(room + other > length, length * (cost + dear) / 2.0, math.inf)
-            for length, dear, other in zip(lengths, costs, rooms, strict=True)
+            np.where(room + room_beside > length, length * (cost + cost_beside) / 2.0, math.inf)
+            for length, cost_beside, room_beside in zip(lengths, costs, rooms, strict=True)
         ]
     )
     to_go = np.where(seeds, 0.0, math.inf)
@@ -178,7 +177,7 @@ def _nearest(north: FloatArray, east: FloatArray, to_north: FloatArray, to_east:
 
 
 def _is_straight(fence: Fence, north: FloatArray, east: FloatArray, room: FloatArray, cell: float) -> NDArray[np.bool_]:
-    """Whether the line onto the orbit round home has a cell of clearance, or that of its ends where less."""
+    """Whether the line onto the orbit round home has a cell of clearance, or the clearance of the ends where less."""
     to_north, to_east = onto_orbit(fence, north, east)
     at_end = clearance(fence.zones, to_north, to_east)
     needed = np.minimum(np.minimum(room, at_end), cell)

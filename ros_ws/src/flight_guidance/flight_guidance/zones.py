@@ -87,7 +87,7 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 
 
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
-    """Distance from the border of the group that a place is deepest in, m, negative outside of all groups."""
+    """Distance from the border of the deepest group of a place, m, negative outside of the groups."""
     xp = array_namespace(north)
     depths = [reduce(xp.minimum, [inside(zone, north, east) for zone in group]) for group in groups]
     return reduce(xp.maximum, depths)
@@ -122,7 +122,7 @@ def _polygon(zone: Zone) -> Zone:
 
 
 def _cut(start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where edges cross it or begin on it."""
+    """Starts and ends of the pieces of an edge, shapes (P, 2), cut where further edges cross or begin."""
     edge, edges, to_start = end - start, ends - starts, starts - start
     length = math.hypot(*edge)
     across = edge[0] * edges[:, 1] - edge[1] * edges[:, 0]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a law with a model learned in flight diverges or oscillates: its error beside that of the law of the start."""
+"""Whether a law with a learned model diverges or oscillates: the error beside the error of the law of the start."""
 
 from collections import deque
 from typing import NamedTuple
@@ -23,14 +23,14 @@ HARMLESS = 0.2  # of the rms errors that do not count as a divergence
 
 
 class Errors(NamedTuple):
-    """Mean squares of e = y - y_m, (m,): the running mean, and its largest value under the first law."""
+    """Mean squares of e = y - y_m, (m,): the running mean, and the largest mean under the first law."""
 
     now: FloatArray
     largest: FloatArray
 
 
 def least(outputs: tuple[str, ...]) -> FloatArray:
-    """Mean squares that do not count as a divergence, (m,)."""
+    """Mean squares below a divergence, (m,)."""
     return np.array([LEAST.get(name, LEAST_RATE) for name in outputs]) ** 2
 
 
@@ -43,7 +43,7 @@ def step(errors: Errors, e: FloatArray, dt: float, *, first_law: bool) -> Errors
 def diverging(errors: Errors, least: FloatArray, learned: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Outputs, (m,), whose rms error is above FACTOR times its largest under the first law, and above `least`.
 
-    Only outputs with a model that was learned count, mask (m,): the others fly the first law.
+    Only outputs with a learned model count, mask (m,): further outputs fly the first law.
     """
     return learned & (errors.now > np.maximum(FACTOR**2 * errors.largest, least))
 
@@ -55,7 +55,7 @@ class Oscillations:
     """
 
     def __init__(self, least: FloatArray) -> None:
-        """`least`: mean squares that do not count as a divergence, (m,)."""
+        """`least`: mean squares below a divergence, (m,)."""
         self.periods = np.zeros_like(least)  # s, of the oscillations at the last test, (m,); 0 for none
         self._least, self._largest = HARMLESS**2 * least, np.zeros_like(least)
         self._record = deque[FloatArray](maxlen=round(WINDOW / STEP))

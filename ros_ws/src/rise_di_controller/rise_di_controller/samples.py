@@ -1,28 +1,21 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples the controller takes. A sample that no aircraft can give is lost, as a sample that did not arrive.
+"""Which samples the controller takes. An impossible sample is lost, as a sample that did not arrive.
 
-- `beyond`: a value is beyond the bound of its output, as no sensor gives it.
-- `step`: y changes by more than an aircraft can change it. The test compares y with the y before and has no model, so a wrong
-  model locks nothing out. An aircraft that really jumps loses two samples: the third in a row that agrees is taken.
+- `beyond`: a value is beyond the bound of the output. No sensor gives such a value.
+- `step`: y changes faster than an aircraft can. The test compares y with the y before and has no model, so a wrong model locks
+  nothing out. An aircraft that really jumps loses two samples: the controller takes the third in a row that agrees.
 """
 
 from collections.abc import Sequence
 from enum import IntEnum
-from math import radians
 from typing import NamedTuple
 
 import numpy as np
 
+from flight_core import plausible
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.vectors import FloatArray, StampedVector
-
-RATES = ("p", "q", "r")
-LARGEST_RATE = radians(2000.0)
-"""rad/s, full scale of the gyros of autopilots: ICM-42688-P (TDK InvenSense, DS-000347), BMI088 (Bosch, BST-BMI088-DS001)."""
-
-LARGEST_AIRSPEED = 340.0  # m/s from trim, the speed of sound at sea level: ICAO Doc 7488, standard atmosphere
-LARGEST = 1e6  # SI, of other outputs: `aircraft_sim.plant.DIVERGENCE_LIMIT`, which no state of an aircraft in flight comes near
 
 TIMES = 5.0
 """Largest possible change over the largest of the last minute. Noise changes by up to four standard deviations in a minute, so
@@ -46,7 +39,7 @@ class SampleLimits(NamedTuple):
 
 
 class Change(IntEnum):
-    """What a sample of y is beside those before."""
+    """What a sample of y is beside the samples before."""
 
     NEAR = 0  # taken
     FAR = 1  # lost
@@ -65,11 +58,10 @@ class SampleState(NamedTuple):
 
 def bounds(names: Sequence[str], authority: FloatArray, largest: Sequence[float] | None, period_ns: int) -> SampleLimits:
     """The limits of outputs by name; `authority`: y_dot by the full inputs, (m,), units of y / s; `largest`: of parameters."""
-    by_name = {**dict.fromkeys(RATES, LARGEST_RATE), "V": LARGEST_AIRSPEED}
-    of_names = [by_name.get(name, LARGEST) for name in names]
     least = [LEAST.get(name, LEAST_RATE) for name in names]
     reach = np.maximum(AUTHORITY * authority * seconds(period_ns), least)
-    return SampleLimits(np.array(largest or of_names, dtype=np.float64), reach, period_ns)
+    bound = plausible.largest(names) if largest is None else np.array(largest, dtype=np.float64)
+    return SampleLimits(bound, reach, period_ns)
 
 
 def beyond(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
@@ -99,8 +91,8 @@ def step(state: SampleState, sample: StampedVector, limits: SampleLimits) -> tup
         change = abs(y - last) / periods,  periods = max(stamp - last stamp, period) / period
         NEAR where change <= max(TIMES largest, reach) in all outputs; then largest = max(change, faded largest)
 
-    The possible change grows with the time since the last sample taken: no sensor is locked out for ever. After samples that
-    were lost, largest takes the whole change, since y may be as noisy as that.
+    The possible change grows with the time since the last sample taken: no sensor is locked out for ever. After lost
+    samples, largest takes the whole change, since y may be as noisy.
     """
     near, change = _compared(state.last, sample, state.change, limits)
     if near or sample.stamp_ns - state.begin_ns < FIRST_NS:
