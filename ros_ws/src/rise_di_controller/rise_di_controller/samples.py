@@ -19,7 +19,7 @@ from flight_core.vectors import FloatArray, StampedVector
 
 TIMES = 5.0
 """Largest possible change over the largest of the last minute. Noise changes by up to four standard deviations in a minute, so
-this is 20 deviations. In the flights of the scenarios no change is above a quarter of the limit."""
+this is 20 deviations. In flights of seven of the scenarios no change was above a quarter of the limit."""
 
 MEMORY = 60.0  # s, in which the largest change fades
 FIRST_NS = NANOSECONDS  # after the first sample, in which y shows how it changes
