@@ -22,7 +22,7 @@ SHELL := /bin/bash
 BIN := $(CURDIR)/.venv/bin
 PACKAGES := $(notdir $(patsubst %/package.xml,%,$(wildcard ros_ws/src/*/package.xml)))
 # With symlinks in place only these need another build; Python sources are live.
-BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/*/config/*.yaml ros_ws/src/*/launch/*.py)
+BUILD_INPUTS := $(wildcard ros_ws/src/*/package.xml ros_ws/src/*/setup.* ros_ws/src/*/*/scenarios/*.yaml ros_ws/src/*/launch/*.py)
 
 # The venv and the workspace hold the path of their checkout: after a move or a copy everything is made again.
 MADE_IN := $(shell sed -n 's/^command = .* -m venv --clear //p' .venv/pyvenv.cfg 2> /dev/null)

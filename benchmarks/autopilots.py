@@ -39,17 +39,17 @@ from benchmarks.evidence_page import write_page
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_analysis.design.bridge_identification import channel_pairs, experiment
-from flight_analysis.design.identification import NOISE_SHARE
-from flight_analysis.design.nominal import sizes
-from flight_analysis.design.observer_selection import with_extended_state_observer
-from flight_analysis.design.response_identification import MIN_RATIO, identify_response
-from flight_analysis.design.sign_check import check
 from flight_analysis.metrics import errors_by_part, in_spans
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.summary import transients
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.tape import Signal, Tape
+from flight_design.gains.nominal import sizes
+from flight_design.gains.observer_selection import with_extended_state_observer
+from flight_design.identification.bridge_identification import channel_pairs, experiment
+from flight_design.identification.response_identification import MIN_RATIO, identify_response
+from flight_design.identification.sign_check import check
+from flight_design.identification.step_identification import NOISE_SHARE
 from flight_log.engagements import Engagement
 from flight_log.tape_reader import read_run
 

@@ -19,8 +19,8 @@ from benchmarks.sampling import new_table, true_error_of
 from rich.console import Console
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, define, fly_chunk_figures
 from flight_core.vectors import FloatArray

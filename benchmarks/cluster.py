@@ -21,7 +21,7 @@ import typer
 from benchmarks.sampling import new_table
 from rich.console import Console
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, define
 

@@ -17,12 +17,12 @@ from benchmarks.sampling import new_table, wide_console
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
-from flight_bringup.scenarios import find_scenario
 from flight_campaign.statistics import score, score_units
 from flight_core.outcome import COMPLETED
-from rise_di.gain_design import select_gains
+from flight_design.gains.gain_design import select_gains
 from rise_di_controller.params import ControllerConfig
 
 SCENARIOS = ("osprey_twin", "osprey_vtail", "x8_elevons", "examples/hexarotor/hexarotor_flight.yaml")

@@ -228,7 +228,7 @@ def _run(*command: str) -> subprocess.CompletedProcess[str]:
 
 def replays(seconds: float | None) -> dict[str, Any]:
     """Fly every scenario in lockstep over topics, recorded, and recompute u from the log."""
-    from flight_bringup.scenarios import scenarios  # noqa: PLC0415 - not needed to write the page
+    from flight_analysis.closed_loop.scenario_library import scenarios  # noqa: PLC0415 - not needed to write the page
 
     results = {}
     duration = [] if seconds is None else ["--duration", f"{seconds:g}"]

@@ -13,11 +13,11 @@ import numpy as np
 from benchmarks.sampling import new_table
 from rich.console import Console
 
-from flight_analysis.c_export.constants import exportable
-from flight_analysis.c_export.events import Recorder, Recording
-from flight_analysis.c_export.library import CController, build_library
-from flight_analysis.c_export.proof import compilers, write_code
-from flight_bringup.scenarios import find_scenario
+from c_export.constants import exportable
+from c_export.events import Recorder, Recording
+from c_export.library import CController, build_library
+from c_export.proof import compilers, write_code
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import StampedVector
 from rise_di_controller import guard
 

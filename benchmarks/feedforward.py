@@ -12,11 +12,11 @@ import typer
 from benchmarks.sampling import cells, new_table, wide_console
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import with_feedforward
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.summary import display_units
-from flight_bringup.scenarios import find_scenario
 from flight_campaign.campaign import define, fly_chunk_figures
 from flight_campaign.statistics import Tally
+from flight_design.gains.gain_selection import with_feedforward
 
 LEVELS = (0.3, 0.5)
 

@@ -32,9 +32,9 @@ from benchmarks.guidance import aircraft_of, turbulence
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, missions
+from flight_campaign import batch, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.outcome import COMPLETED
 from flight_guidance.params import GuidanceConfig
@@ -159,7 +159,7 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
     scenario, _, radius = windy(find_scenario("osprey_route"), share, fence.home, radii)
     route = {"north": [0.0, 40.0 * radius], "east": [0.0, 0.0], "altitude": [0.0, 0.0]}
     scenario, airframe = scenario.vary(guidance={"route": route}), load_airframe("osprey")
-    course, vehicle = build_course(scenario), fleet.vehicle(scenario)
+    course, vehicle = build_course(scenario), batch.vehicle(scenario)
     mission = missions.build(scenario, course)
     fence = Fence(of_radius(fence.zones, radius), at(fence.home, radius), radius)
     mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
@@ -168,8 +168,8 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
     for first in range(0, aircraft, CHUNK):
         A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
         directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
-        assembled = fleet.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
-        result = fleet.fly(assembled, vehicle, course, control_law, fleet.shared(params), mission)
+        assembled = batch.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
+        result = batch.fly(assembled, vehicle, course, control_law, batch.shared(params), mission)
         figures = result.mission or {}
         beyond += np.asarray(figures["max.breach"]).tolist()
         banks += np.asarray(figures["max.phi"]).tolist()

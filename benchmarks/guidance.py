@@ -35,9 +35,9 @@ from rich.console import Console
 
 from aircraft_sim.pose import wrapped
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import tracking_error
-from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.outcome import COMPLETED
 from flight_core.rates import seconds
@@ -344,7 +344,7 @@ def aircraft_of(name: str) -> Scenario:
     scenario = prepared(original_of(name))
     if name not in CONDITIONS:
         return scenario
-    from flight_analysis.design.identification import slowest_trim  # noqa: PLC0415 - for these aircraft alone
+    from flight_design.identification.step_identification import slowest_trim  # noqa: PLC0415 - for these aircraft alone
 
     return scenario.vary(guidance={"stall_speed": slowest_trim(scenario.aircraft.flight_condition())})
 
@@ -357,7 +357,7 @@ def original_of(name: str) -> Scenario:
         return find_scenario(name).vary(aircraft=slower, reference_model={"rate": 100.0})
     if name in {"c172p", "f16"}:
         return find_scenario(f"jsbsim_{name}")
-    from flight_analysis.design.identification import identify  # noqa: PLC0415 - for this aircraft alone
+    from flight_design.identification.step_identification import identify  # noqa: PLC0415 - for this aircraft alone
 
     return parse_scenario(identify(name, *CONDITIONS[name]).text.encode(), Path(f"jsbsim_{name}.yaml"))
 

@@ -19,10 +19,10 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, FlightCondition, Trim, WindMode
 from aircraft_sim.jsbsim_model import JsbsimModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.identification import slowest_trim
 from flight_core.outcome import COMPLETED, FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
+from flight_design.identification.step_identification import slowest_trim
 
 GRIDS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "c172p": ((300.0, 1219.2, 2500.0, 4000.0), (30.0, 36.0, 46.3, 55.0, 62.0)),

@@ -15,7 +15,12 @@ import numpy as np
 
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, aircraft_names
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.identification import (
+from flight_analysis.metrics import best_error
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
+from flight_design.identification.step_identification import (
     IdentifiedAircraft,
     ManoeuvreResult,
     fly_all,
@@ -23,13 +28,8 @@ from flight_analysis.design.identification import (
     with_observer,
     without_beta,
 )
-from flight_analysis.metrics import best_error
-from flight_core.outcome import COMPLETED, FlightEnded
-from flight_core.parameters import ParameterError
-from flight_core.rates import NANOSECONDS
-from flight_core.tape import Tape
-from rise_di.learning import learner
-from rise_di_controller.learning import Event
+from flight_design.learning.scenario_learner import learner
+from rise_di_controller.proposals import Event
 
 KNOT, FOOT = 1852.0 / 3600.0, 0.3048  # m/s, m; exact
 

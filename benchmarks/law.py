@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.sampling import new_table
 from rich.console import Console
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import StampedVector
 from rise_di_controller import guard
 from rise_di_controller.law import engage, step, step_with_anti_windup

@@ -17,10 +17,10 @@ from rich.progress import track
 from aircraft_sim.uncertainty import AIR_RELATIVE, WindEffect
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign.law_comparison import TURBULENCE_SEED, LawResult, compare, score_cells
-from flight_campaign.tuned_gains import load, tuned_file
 from flight_campaign.tuning import Benchmark, build_benchmark
+from flight_design.gains.tuned_gains import load, tuned_file
 
 TUNED_ON = "gust_turbulence"
 LEVELS = (0.3, 0.5)

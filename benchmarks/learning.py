@@ -43,29 +43,29 @@ from aircraft_sim.plant import Drift
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, sampled_matrices, wind_factors
 from control_laws.catalogue import LAWS
-from flight_analysis.closed_loop.learning import Learn, Learner, Proposal
-from flight_analysis.closed_loop.margins import law_order
+from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerResult
+from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_bringup.scenarios import find_scenario, written
-from flight_campaign import fleet, tuning
-from flight_campaign.fleet import Fleet
-from flight_campaign.learning import learned
+from flight_campaign import batch, tuning
+from flight_campaign.batch import Fleet
+from flight_campaign.learning_flights import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
-from flight_campaign.tuned_gains import load, tuned_file
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
+from flight_design.gains.gain_design import observed
+from flight_design.gains.tuned_gains import load, tuned_file
+from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import read_run
-from rise_di.gain_design import observed
-from rise_di.learning import learner
-from rise_di_controller.learning import Event
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import Event
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 REPOSITORY = Path(__file__).parents[1]
 IMAGE = REPOSITORY / "docs" / "images" / "learning.png"
@@ -164,7 +164,7 @@ class Timed:
         """Of the learner."""
         self._own.take(stamp_ns, y, u, flown)
 
-    def propose(self, flown: int) -> Proposal:
+    def propose(self, flown: int) -> LearnerResult:
         """Of the learner."""
         begin = time.process_time()
         proposal = self._own.propose(flown)
@@ -570,7 +570,7 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         law = LAWS[name]
         params = law.params(tuning.as_gains(tuned[name][OBJECTIVE]), benchmark.model)
         course = benchmark.courses[tuning.GUST][law.feedforward]
-        flown = fleet.fly(flights, benchmark.vehicle, course, law.control_law(benchmark.model), params)
+        flown = batch.fly(flights, benchmark.vehicle, course, law.control_law(benchmark.model), params)
         in_time, delayed = np.split(tuning.score(flown, benchmark.unit), 2)
         subject = f"rivals, +-{100 * uncertainty:.0f} %"
         yield row(f"{subject}: score, {law.title}", float(np.mean(in_time)))
@@ -593,7 +593,7 @@ def damaged_rival_figures(name: str, numbers: Sequence[int]) -> Iterator[evidenc
         ends = tuple(round(end / benchmark.model.period) for _, end in WINDOWS[:-1])
         for law, (control_law, params) in rivals.items():
             course = benchmark.courses[tuning.GUST][LAWS[law].feedforward]
-            flown = fleet.fly(flights, benchmark.vehicle, course, control_law, params, windows=ends)
+            flown = batch.fly(flights, benchmark.vehicle, course, control_law, params, windows=ends)
             scores_of_law = np.sum(np.asarray(flown.windows)[:, :, 0] / benchmark.unit, axis=1)
             found[law].append(np.where(np.asarray(flown.diverged)[0], math.inf, scores_of_law))
     for law, values in found.items():

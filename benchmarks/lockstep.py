@@ -26,9 +26,9 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_bringup.scenarios import find_scenario, written
 from flight_ros.messages import Encoder
 from flight_ros.rclpy_private import WaitSet
 from flight_ros.subscriptions import PolledSubscription

@@ -36,8 +36,8 @@ from tests.browser import CHROMIUM, Browser
 from aircraft_sim.turbulence import MODERATE
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import write_report
-from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.tape import Tape
 from flight_log.bag import LOST_MESSAGES

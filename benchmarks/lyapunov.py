@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from flight_analysis.design.lyapunov import Evidence, evidence, example, fly, lemma_2
+from flight_design.gains.lyapunov import Evidence, evidence, example, fly, lemma_2
 
 IMAGE = Path(__file__).resolve().parents[1] / "docs" / "images" / "lyapunov.png"
 DT, DURATION = 0.01, 60.0  # s

@@ -20,12 +20,12 @@ import typer
 from aircraft_sim.airframe import load_airframe
 from control_laws.catalogue import LAWS, Law
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.requirement import requirement
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import law_comparison, registered_laws
-from flight_campaign.tuned_gains import TuningResult, load, tuned_file
 from flight_campaign.tuning import GUST, OBJECTIVES, as_gains, build_benchmark, tune
-from rise_di.gain_design import select_gains
+from flight_design.gains.gain_design import select_gains
+from flight_design.gains.requirement import requirement
+from flight_design.gains.tuned_gains import TuningResult, load, tuned_file
 
 LAWS_TUNED = ("rise", "pi", "l1", "lqg", "rise_observer")
 PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg

@@ -25,15 +25,15 @@ from rich.table import Table
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, gust_directions, sampled_matrices
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.innovation_filters import Actuation, recording
-from flight_analysis.design.model_identification import Identification, identify
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet
+from flight_campaign import batch
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.statistics import score, score_units
 from flight_core.parameters import ParameterError
-from rise_di.gain_design import observed
+from flight_design.gains.gain_design import observed
+from flight_design.identification.innovation_filters import Actuation, recording
+from flight_design.identification.model_identification import Identification, identify
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.params import ControllerConfig
 
@@ -80,9 +80,9 @@ FLIGHT_SEED = 77  # of the aircraft of `re_flight`
 
 
 @cache
-def _gust_flight() -> tuple[Course, fleet.Vehicle]:
+def _gust_flight() -> tuple[Course, batch.Vehicle]:
     scenario = find_scenario("osprey_observer")
-    return build_course(scenario), fleet.vehicle(scenario)
+    return build_course(scenario), batch.vehicle(scenario)
 
 
 def gust_flight(controller: ControllerConfig, uncertainty: float, number: int) -> tuple[float, float]:
@@ -92,8 +92,8 @@ def gust_flight(controller: ControllerConfig, uncertainty: float, number: int) -
     A, B = sampled_matrices(nominal, uncertainty, uncertainty, FLIGHT_SEED, number, 1)
     directions = gust_directions(nominal, A, AIR_RELATIVE)
     plant = scenario.aircraft.plant()
-    aircraft = fleet.assemble(A, B, plant, course, gust_directions=directions)
-    flown = fleet.fly(aircraft, vehicle, course, law.control_law, fleet.shared(law.params))
+    aircraft = batch.assemble(A, B, plant, course, gust_directions=directions)
+    flown = batch.fly(aircraft, vehicle, course, law.control_law, batch.shared(law.params))
     columns = [list(nominal.inputs).index(name) for name in controller.inputs]
     C = nominal.matrix_c()[[nominal.outputs.index(name) for name in controller.outputs]]
     loop = Loop(np.array(controller.lag), 0.0, 1.0 / controller.rate)

@@ -10,7 +10,7 @@ import time
 import numpy as np
 from benchmarks.nodes import open_node
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.publisher_lock import PublisherLock
 from flight_core.vectors import FloatArray, StampedVector
 from flight_ros.messages import MAX_SIZE, Decoder, Encoder

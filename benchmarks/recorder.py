@@ -23,8 +23,8 @@ from rclpy.duration import Duration
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_ros.messages import Encoder
 from flight_ros.topics import INTERNALS, PUBLISH, TRUTH, U_M, Y_M, U, Y
 

@@ -24,9 +24,9 @@ from benchmarks.evidence_page import write_page
 from benchmarks.guidance import AIRCRAFT, OTHERS, aircraft_of, turbulence
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import with_route
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import flown_legs
-from flight_bringup.scenarios import with_route
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape

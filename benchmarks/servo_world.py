@@ -30,12 +30,12 @@ from benchmarks import sampling
 from rich.console import Console
 from rich.progress import track
 
-from flight_analysis.closed_loop.margins import law_order
+from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import ErrorMetrics, error_metrics
 from flight_analysis.report.summary import display_units
-from flight_bringup.scenarios import find_scenario
 from flight_campaign.statistics import score_units
 from flight_core.parameters import require
 from flight_core.tape import Signal, Tape

@@ -36,10 +36,10 @@ from rclpy.node import Node
 from rich.console import Console
 from rosbags.rosbag2 import CompressionMode
 
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_bringup.graph import CONTROLLER
 from flight_bringup.monitor import FlightMonitor
 from flight_bringup.processes import FlightProcesses
-from flight_bringup.scenarios import find_scenario, written
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import FloatArray
 from flight_ros import transport

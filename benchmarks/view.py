@@ -34,9 +34,9 @@ from tests.browser import CHROMIUM, Browser
 from tornado.httpclient import HTTPRequest
 from tornado.websocket import WebSocketClientConnection, WebSocketClosedError, websocket_connect
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
-from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray

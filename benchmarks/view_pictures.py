@@ -16,9 +16,9 @@ from PIL import Image
 from tests.browser import Browser
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
-from flight_bringup.scenarios import find_scenario
 from flight_log.tape_writer import write_run
 
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"

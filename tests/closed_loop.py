@@ -13,8 +13,8 @@ from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import Gusts
 from aircraft_sim.dynamics import Aircraft
 from aircraft_sim.plant import AircraftState, PlantParams
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import true_error
-from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from tests.conftest import REPOSITORY
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from rise_di_controller import laws
 from rise_di_controller.params import ControllerConfig
 

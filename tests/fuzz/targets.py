@@ -39,11 +39,11 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
 from autopilot_bridge.bridge import Bridge
 from autopilot_bridge.params import load_map
-from flight_analysis.c_export.constants import exportable, header
-from flight_analysis.c_export.library import model_description
+from c_export.constants import exportable, header
+from c_export.library import model_description
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_bringup.scenarios import LIBRARY, find_scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_core.channels import POSE
 from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError
@@ -64,7 +64,7 @@ from flight_view.control import Control, RefusedError
 from flight_view.flight import Flight
 from flight_view.server import ADDRESS, Server, answer
 from rise_di_controller.controller import Controller
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 MAX_SENTENCE_LENGTH = 2000
 """Characters of an error sentence, however long the input is."""

@@ -21,8 +21,8 @@ from tests.fuzz.targets import SEEDS, TARGETS, log, rejected, write_run
 from tests.joint_states import JOINT_STATE, vector
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import read_flight, write_report
-from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
 CORPUS = REPOSITORY / "tests" / "corpus"

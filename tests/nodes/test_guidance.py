@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 from tests.nodes.world import OUTPUTS, World, diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario import scenario_yaml
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
 from flight_core.parameters import ParameterError

@@ -11,7 +11,7 @@ from tests.nodes.test_controller import Flight
 from tests.nodes.world import world_of
 from tests.other_laws import SECTIONS, example_installed
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.parameters import ParameterError
 from rise_di_controller.node import ControllerNode
 

@@ -12,19 +12,19 @@ from sensor_msgs.msg import JointState
 from tests.nodes.test_controller import Flight, missed
 from tests.nodes.world import diagnostics, world_of
 
-from flight_bringup.scenarios import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
-from flight_learner.node import LearnerNode
+from flight_design.learning.node import LearnerNode
 from flight_ros import reports
 from flight_ros.messages import Encoder
 from flight_ros.reports import Report
 from flight_ros.topics import PROPOSAL
-from rise_di_controller.learning import designed
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import designed
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = pytest.mark.package("flight_learner")
+pytestmark = pytest.mark.package("flight_design")
 
 
 class Proposer:

@@ -11,7 +11,7 @@ from sensor_msgs.msg import JointState
 from tests.nodes.world import OUTPUTS, diagnostics, world_of
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import ATTITUDE
 from flight_ros.messages import Encoder, instant
 from reference_model.node import ReferenceModelNode

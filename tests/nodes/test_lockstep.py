@@ -20,9 +20,9 @@ from tests.ros.test_lockstep import ROUGH
 
 from aircraft_sim.node import AircraftNode
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.graph import ONE_PROCESS, parameter_overrides
-from flight_bringup.scenarios import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_guidance.modes import Lateral
 from flight_guidance.node import GuidanceNode

@@ -15,8 +15,8 @@ from tests.nodes.world import world_of
 from aircraft_sim.node import AircraftNode
 from autopilot_bridge.node import BridgeNode
 from autopilot_bridge.params import load_map
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import AIRCRAFT, CONTROLLER, GUIDANCE, REFERENCE_MODEL, NodeSpec, parameter_overrides
-from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_guidance.node import GuidanceNode

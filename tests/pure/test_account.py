@@ -18,6 +18,7 @@ from tests.recordings import EPOCH
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import (
@@ -33,7 +34,6 @@ from flight_analysis.report.run_folder import SUMMARY, FlightResult, read_flight
 from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
 from flight_bringup.processes import leave_outcome
-from flight_bringup.scenarios import find_scenario, written
 from flight_cli.cli import application
 from flight_cli.replay import replay
 from flight_cli.report import report

@@ -20,8 +20,8 @@ from aircraft_sim.dynamics import x_dot
 from aircraft_sim.plant import AircraftState, PlantParams, advance
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.integrators import rk4
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape

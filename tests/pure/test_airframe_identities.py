@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframe import Airframe, airframes, check_identities, load_airframe
-from flight_analysis.design.airframe_properties import airframe_facts, output_coordinates
 from flight_core.parameters import ParameterError
 from flight_core.units import in_si, quantity, si_per_unit
+from flight_design.gains.airframe_properties import airframe_facts, output_coordinates
 
 NAVION: dict[str, Any] = {
     "name": "plane",

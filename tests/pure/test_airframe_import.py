@@ -16,10 +16,10 @@ from tests.conftest import REPOSITORY
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.airframe_import import import_airframe
 from aircraft_sim.uncertainty import as_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.airframe_import import import_airframe
-from flight_bringup.scenarios import find_scenario
 from flight_cli.airframe import airframe as command
 from flight_cli.gains import gains
 from flight_core.parameters import ParameterError

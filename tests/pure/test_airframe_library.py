@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
-from flight_analysis.design.airframe_properties import (
+from flight_core.units import si_per_unit
+from flight_core.vectors import FloatArray
+from flight_design.gains.airframe_properties import (
     ComplexArray,
     ZeroDynamics,
     airframe_facts,
@@ -19,8 +21,6 @@ from flight_analysis.design.airframe_properties import (
     library,
     zero_dynamics,
 )
-from flight_core.units import si_per_unit
-from flight_core.vectors import FloatArray
 from rise_di_controller.decomposition import coupling
 
 pytestmark = pytest.mark.package("aircraft_sim")

@@ -11,13 +11,13 @@ from tests.conftest import REPOSITORY
 from tests.maps import named_map
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.margins import margins
+from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.sign_check import check_scenario
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from flight_design.identification.sign_check import check_scenario
 from rise_di_controller.allocation import Allocation, allocate, allocation
 from rise_di_controller.saturation import Limits
 

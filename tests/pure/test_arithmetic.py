@@ -15,8 +15,8 @@ from hypothesis.extra.numpy import arrays
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.arithmetic import (
     MAX_ANGLE,
     PI_HIGH,

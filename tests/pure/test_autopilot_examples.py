@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 from tests.conftest import REPOSITORY
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.sign_check import require_signs
 from flight_bringup.graph import find_autopilot, require_limits
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
+from flight_design.identification.sign_check import require_signs
 
 pytestmark = pytest.mark.package("autopilot_bridge")
 

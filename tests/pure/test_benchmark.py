@@ -17,10 +17,10 @@ from tests.conftest import REPOSITORY
 from typer.testing import CliRunner
 
 from aircraft_sim.uncertainty import sampled_matrices
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.benchmark_course import build_course
-from flight_campaign.benchmark_entry import Enter, Entry, Task, find_entry, task_of
+from flight_campaign.benchmark_entry import BenchmarkEntry, Enter, Task, find_entry, task_of
 from flight_campaign.benchmark_scores import CHUNKS, SCORES, Benchmark, Definition, Flights, define, scores_of
 from flight_campaign.benchmark_sets import SCENARIOS, SETS, UNCERTAINTY, VERSION, Sets, seed_of
 from flight_cli.cli import application
@@ -38,8 +38,8 @@ GUST = {"vertical": {"start": 6.0, "speed": 10.12, "length": 15.24}}
 OSPREY = REPOSITORY / "ros_ws" / "src" / "aircraft_sim" / "aircraft_sim" / "airframes" / "osprey.yaml"
 
 
-def entry(enter: Enter) -> Entry:
-    return Entry("own", "y", "nothing", "", enter)
+def entry(enter: Enter) -> BenchmarkEntry:
+    return BenchmarkEntry("own", "y", "nothing", "", enter)
 
 
 @pytest.fixture

@@ -19,9 +19,9 @@ from tests.maps import MAP_FILES, named_map
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
 from autopilot_bridge.channel_map import to_raw
 from autopilot_bridge.params import ChannelMap, load_map
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.fly import _follow_real_time, _Span, interrupt, last
 from flight_bringup.processes import handle_signals
-from flight_bringup.scenarios import find_scenario
 from flight_core.rates import nanoseconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 

@@ -19,9 +19,17 @@ from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws import excitation
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import open_loop_fit
-from flight_analysis.design.bridge_identification import (
+from flight_analysis.metrics import best_error, error_metrics
+from flight_analysis.report.run_folder import attachments_for
+from flight_cli.cli import COMMANDS, application
+from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from flight_design.identification import open_loop_fit
+from flight_design.identification.bridge_identification import (
     Channels,
     channel_models,
     channel_pairs,
@@ -34,20 +42,12 @@ from flight_analysis.design.bridge_identification import (
     require_envelope,
     within_range,
 )
-from flight_analysis.design.open_loop_fit import ChannelModel, fit_channel
-from flight_analysis.design.response_identification import Response, identify_response
-from flight_analysis.metrics import best_error, error_metrics
-from flight_analysis.report.run_folder import attachments_for
-from flight_bringup.scenarios import find_scenario
-from flight_cli.cli import COMMANDS, application
-from flight_core.parameters import ParameterError
-from flight_core.tape import Signal, Tape
-from flight_core.units import GRAVITY
-from flight_core.vectors import FloatArray
+from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
+from flight_design.identification.response_identification import Response, identify_response
 from flight_log.engagements import Engagement
 from flight_log.tape_writer import write_run
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 MAP, SPEED, DELAY = load_map("ardupilot"), 25.0, 0.05  # m/s; s, by which y is late
 OSPREY = load_airframe("osprey")

@@ -18,7 +18,7 @@ from aircraft_sim.applied_input import AppliedInput
 from autopilot_bridge.bridge import Bridge, Phase
 from autopilot_bridge.channel_map import to_channel
 from autopilot_bridge.params import ChannelMap
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector

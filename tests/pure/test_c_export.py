@@ -18,10 +18,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.conftest import REPOSITORY
 
-from flight_analysis.c_export.constants import exportable
-from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
-from flight_analysis.c_export.events import RETUNE, Recorder, Recording, flight_recordings, parameter_sets, run_recording
-from flight_analysis.c_export.proof import (
+from c_export.constants import exportable
+from c_export.drawn import drawn_calls, drawn_steps
+from c_export.events import RETUNE, Recorder, Recording, flight_recordings, parameter_sets, run_recording
+from c_export.proof import (
     CODE,
     FLAGS,
     FLOAT32_BOUND,
@@ -38,8 +38,8 @@ from flight_analysis.c_export.proof import (
 )
 from flight_analysis.closed_loop.replay import vary
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_cli.export import export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
@@ -49,11 +49,11 @@ from flight_log.tape_reader import RecordedRun, StoredFile, read_run
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 GCC = shutil.which("gcc")
 pytestmark = [
-    pytest.mark.package("flight_analysis"),
+    pytest.mark.package("c_export"),
     pytest.mark.slow,
     pytest.mark.skipif(GCC is None, reason="no gcc on this machine, which compiles the exported code"),
 ]
@@ -342,7 +342,7 @@ def test_wrong_code_is_not_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     shutil.copytree(SOURCE, wrong)
     text = (wrong / "rise_di.c").read_text(encoding="utf-8")
     (wrong / "rise_di.c").write_text(text.replace("dt * (e + before->e[i])", "dt * (e - before->e[i])"), encoding="utf-8")
-    monkeypatch.setattr("flight_analysis.c_export.proof.SOURCE", wrong)
+    monkeypatch.setattr("c_export.proof.SOURCE", wrong)
     with pytest.raises(typer.Exit) as status:
         export("osprey_servo", tmp_path / "c", duration=1.0, drawn=100, compiler=["gcc"])
     assert status.value.exit_code == 1

@@ -17,23 +17,23 @@ import pytest
 from tests.conftest import REPOSITORY
 
 import rise_di
-from flight_analysis.c_export.constants import exportable
-from flight_analysis.c_export.events import run_recording
-from flight_analysis.c_export.library import CController, build_fmu, build_library
-from flight_analysis.c_export.proof import FLAGS, build, write_code
+from c_export.constants import exportable
+from c_export.events import run_recording
+from c_export.library import CController, build_fmu, build_library
+from c_export.proof import FLAGS, build, write_code
 from flight_analysis.closed_loop.scenario import scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [
-    pytest.mark.package("flight_analysis"),
+    pytest.mark.package("c_export"),
     pytest.mark.slow,
     pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on this machine, which compiles the exported code"),
 ]

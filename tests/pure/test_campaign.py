@@ -34,13 +34,13 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Spread
-from flight_analysis.closed_loop.learning import Learn, Proposal
-from flight_analysis.closed_loop.margins import linear_loop
+from flight_analysis.closed_loop.learning_loop import Learn, LearnerResult
+from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
-from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines, equipment
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
 from flight_campaign.campaign_report import figure_rows, overview, write_page
@@ -297,7 +297,7 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
 
     def learner(flown: Scenario) -> Learn:
         proposed = model.model_copy(update={"observer": None}) if flown.aircraft.uncertainty.number else model
-        made = SimpleNamespace(take=lambda *_: None, propose=lambda _: Proposal(proposed, "given"))
+        made = SimpleNamespace(take=lambda *_: None, propose=lambda _: LearnerResult(proposed, "given"))
         return lambda _: made
 
     (folder := tmp_path / "learn").mkdir()

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from aircraft_sim.airframe import Airframe
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.change_test import LOSS, change_test
-from flight_analysis.design.innovation_filters import Actuation, Recording, recording
-from flight_analysis.design.learner import changed
-from flight_bringup.scenarios import find_scenario
-from rise_di_controller.learning import with_channels_of
-from rise_di_controller.rise_di import RiseDiConfig
+from flight_design.identification.innovation_filters import Actuation, Recording, recording
+from flight_design.learning.change_test import LOSS, change_test
+from flight_design.learning.learner import changed
+from rise_di_controller.proposals import with_channels_of
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 
 ACTUATION = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)

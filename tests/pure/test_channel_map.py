@@ -37,8 +37,8 @@ from autopilot_bridge.channel_map import (
     to_raw,
     version_faults,
 )
+from autopilot_bridge.map_check import check_map, definitions_below
 from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
-from flight_analysis.design.map_check import check_map, definitions_below
 from flight_cli.cli import application
 from flight_core import installation
 from flight_core.parameters import ParameterError

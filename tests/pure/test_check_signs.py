@@ -16,20 +16,20 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.params import ChannelMap, load_map
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.response_identification import MIN_RATIO, Response, identify_response
-from flight_analysis.design.sign_check import SignCheck, check, recorded_response, through
 from flight_analysis.report.run_folder import attachments_for
-from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.identification.response_identification import MIN_RATIO, Response, identify_response
+from flight_design.identification.sign_check import SignCheck, check, recorded_response, through
 from flight_log.tape_writer import write_run
 from rise_di_controller.laws import AnyLaw
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 app = application([*COMMANDS])
 MAPS = sorted(MAP_FILES)

@@ -16,20 +16,21 @@ from typer.testing import CliRunner
 
 from aircraft_sim.turbulence import MODERATE
 from control_laws.catalogue import LAWS, Gains, initial_gains
-from flight_analysis.closed_loop.margins import margins
+from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import section_yaml
-from flight_analysis.design.requirement import REQUIREMENT, least_fraction
 from flight_analysis.metrics import error_metrics
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, law_comparison, registered_laws, tuned_controller, tuned_gains, tuning
-from flight_campaign.fleet import FleetResult
+from flight_campaign import batch, law_comparison, registered_laws, tuned_controller, tuning
+from flight_campaign.batch import FleetResult
 from flight_campaign.law_margins import has_margins, nominal_margins
-from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
+from flight_design.gains import tuned_gains
+from flight_design.gains.gain_selection import section_yaml
+from flight_design.gains.requirement import REQUIREMENT, least_fraction
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.margins import Margins
@@ -115,7 +116,7 @@ def test_search_is_repeatable_and_lowers_cost_of_initial_gains(short: Benchmark)
         params, total = law.params(gains, short.model), 0.0
         for part in tuning.evaluations(objective, short):
             course = short.courses[part.wind][law.feedforward]
-            result = fleet.fly(part.fleet, short.vehicle, course, control_law, params)
+            result = batch.fly(part.fleet, short.vehicle, course, control_law, params)
             total += float(tuning.cost(result, short) @ part.weight)
         return total
 

@@ -11,8 +11,8 @@ import pytest
 from control_laws import excitation
 from control_laws.excitation import ExcitationConfig, multisine
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_view.control import gains_of

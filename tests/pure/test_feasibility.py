@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from tests.conftest import REPOSITORY
 
-from flight_bringup.scenarios import find_scenario, with_route
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_core.parameters import ParameterError
 from flight_guidance.feasibility import Performance, flyable, speeds
 from flight_guidance.path import Arc, Line, Route, along, route_outline

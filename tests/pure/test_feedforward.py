@@ -15,9 +15,8 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import manoeuvre, study_airframe, with_feedforward
-from flight_bringup.scenarios import find_scenario
 from flight_campaign.campaign import define, fly_chunk_figures
 from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
@@ -25,6 +24,7 @@ from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
+from flight_design.gains.gain_selection import manoeuvre, study_airframe, with_feedforward
 from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal, nominal_model

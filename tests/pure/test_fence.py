@@ -14,10 +14,10 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import sampled_matrices
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import guidance_notices, unflown_legs
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, missions
+from flight_campaign import batch, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
@@ -331,8 +331,8 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
     mission = missions.build(scenario, course)
     mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
     control_law, params = scenario.controller.tuned_law()
-    assembled = fleet.assemble(A, B, scenario.aircraft.plant(), course)
-    result = fleet.fly(assembled, fleet.vehicle(scenario), course, control_law, fleet.shared(params), mission)
+    assembled = batch.assemble(A, B, scenario.aircraft.plant(), course)
+    result = batch.fly(assembled, batch.vehicle(scenario), course, control_law, batch.shared(params), mission)
     assert result.mission is not None
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)
     assert tape["guidance"]["fence.action"][-1] != 0.0

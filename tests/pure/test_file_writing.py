@@ -31,7 +31,7 @@ OWN_WRITERS = {
     "flight_core/flight_core/scheduling.py": "a file of /proc",
     "flight_bringup/flight_bringup/fly.py": "the growing log of the learner, a new file",
     "flight_bringup/flight_bringup/processes.py": "the growing output of a process, a new file",
-    "flight_analysis/flight_analysis/c_export/proof.py": "a program in a temporary folder",
+    "c_export/c_export/proof.py": "a program in a temporary folder",
     "flight_log/flight_log/open_log.py": "an unpacked log in a temporary folder",
     "flight_log/flight_log/vehicle_log.py": "the null device, for what a library prints",
     "rise_di/rise_di/own_airframe.py": "an airframe on trial in a temporary folder",

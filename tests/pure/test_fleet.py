@@ -13,13 +13,13 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import with_feedforward
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet, fleet_allocation
+from flight_campaign import batch, batch_allocation
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
+from flight_design.gains.gain_selection import with_feedforward
 from rise_di_controller.allocation import allocate, allocation
 from rise_di_controller.control_law import ControlLaw, Measurements
 from rise_di_controller.saturation import Limits
@@ -36,7 +36,7 @@ SERVO = find_scenario("osprey_servo").vary(
     },
 )
 CONTROL_LAW, PARAMS = SERVO.controller.tuned_law()
-PARAMS = fleet.shared(PARAMS)
+PARAMS = batch.shared(PARAMS)
 
 
 def sampled(part: float, seed: int, count: int, airframe: str = "osprey") -> tuple[FloatArray, FloatArray]:
@@ -52,11 +52,11 @@ def fly(
     late: Array = 0,
     control_law: ControlLaw = CONTROL_LAW,
     params: Any = PARAMS,
-) -> fleet.FleetResult:
+) -> batch.FleetResult:
     course = build_course(scenario)
     directions = gust_directions(load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
-    return fleet.fly(aircraft, fleet.vehicle(scenario), course, control_law, params)
+    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
+    return batch.fly(aircraft, batch.vehicle(scenario), course, control_law, params)
 
 
 def alone(scenario: Scenario, number: int) -> dict[str, FloatArray]:
@@ -134,7 +134,7 @@ def test_each_aircraft_of_fleet_flies_as_in_single_process_simulation(name: str)
     # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
     # next step, after which u differs: 2e-2.
     scenario = SERVO.vary(**VARIATIONS[name])
-    within, params = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3, fleet.shared(scenario.controller.law_params())
+    within, params = 2e-2 if scenario.aircraft.sensors.quantisation else 1e-3, batch.shared(scenario.controller.law_params())
     together = fly(scenario, *sampled(0.3, 5, 2), params=params)
     for number in range(2) if name == "turbulence" else (1,):  # the second one: what would fly as the first differs
         for key, values in alone(scenario, number).items():
@@ -153,7 +153,7 @@ def test_an_allocation_at_its_stops_flies_as_in_single_process_simulation() -> N
     }
     scenario = twin.vary(controller={"allocation": section}, flight={"duration": 6.0})
     law, params = scenario.controller.tuned_law()
-    together = fly(scenario, *sampled(0.3, 5, 2, "osprey_twin"), control_law=law, params=fleet.shared(params))
+    together = fly(scenario, *sampled(0.3, 5, 2, "osprey_twin"), control_law=law, params=batch.shared(params))
     for key, values in alone(scenario, 1).items():
         assert np.asarray(getattr(together, key))[:, 1] == pytest.approx(values, rel=1e-3), key
 
@@ -166,7 +166,7 @@ def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
     params = allocation(T, effect, (2, 0, 3, 1), Limits(-stops, stops, np.full(7, 20.0)))
     of_effectors, before = (stops[:, None] * generator.uniform(-1.0, 1.0, (7, 40)) for _ in range(2))
     v = effect @ of_effectors * generator.choice([0.05, 0.9, 3.0, 30.0], 40)
-    u, given = jax.jit(fleet_allocation.allocate)(v, before, DT, fleet_allocation.of_fleet(params))
+    u, given = jax.jit(batch_allocation.allocate)(v, before, DT, batch_allocation.of_fleet(params))
     for k in range(40):
         alone_u, alone_given = allocate(v[:, k], before[:, k], DT, params)
         assert np.asarray(u)[:, k] == pytest.approx(alone_u, abs=1e-9)  # sums in another order
@@ -198,13 +198,13 @@ def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
     course, plant = build_course(SERVO), SERVO.aircraft.plant()
     A, B = sampled(0.3, 5, 2)
     directions = gust_directions(load_airframe("osprey"), A, "air_relative")
-    assembled = fleet.assemble(A, B, plant, course, gust_directions=directions)
+    assembled = batch.assemble(A, B, plant, course, gust_directions=directions)
     assert [list(load_airframe("osprey").gusts)[axis] for axis in course.axes] == ["vertical", "lateral"]
     C = plant.aircraft.C[course.order]
     for k in range(2):
         assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(C @ directions[k][:, course.axes], rel=1e-14)
     # Without directions the plant's own act on all.
-    shared = np.asarray(fleet.assemble(A, B, plant, course).forced_rate)
+    shared = np.asarray(batch.assemble(A, B, plant, course).forced_rate)
     assert (shared == (C @ plant.aircraft.gust_direction[:, course.axes])[..., None]).all()
 
 
@@ -232,14 +232,14 @@ def test_late_u_acts_that_many_ticks_later() -> None:
 
 
 def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
-    course, vehicle = build_course(SERVO), fleet.vehicle(SERVO)
+    course, vehicle = build_course(SERVO), batch.vehicle(SERVO)
     A, B = sampled(0.0, 1, 2)
     B = B * np.array([1.0, -1.0])[:, None, None]  # every sign is wrong: the loop is unstable
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
     infinite = np.full((4, 1), np.inf)
     vehicle = vehicle._replace(limits=Limits(-infinite, infinite, infinite))
-    aircraft = fleet.assemble(A, B, SERVO.aircraft.plant(), course)
-    both = fleet.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS)
+    aircraft = batch.assemble(A, B, SERVO.aircraft.plant(), course)
+    both = batch.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS)
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()
 

@@ -20,24 +20,24 @@ from typer.testing import CliRunner, Result
 from aircraft_sim.airframe import LIBRARY, load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import gain_conditions
-from flight_analysis.design import gain_selection as selection
-from flight_analysis.design.gain_conditions import Bounds, Condition, GainSet
-from flight_analysis.design.gain_selection import ChannelPairing, GainAssessment, LoopSetting, Manoeuvre, Study
-from flight_bringup.scenarios import find_scenario
 from flight_cli.airframes import airframes
 from flight_cli.gains import gains as gains_command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from rise_di.gain_design import select_gains
+from flight_design.gains import gain_conditions
+from flight_design.gains import gain_selection as selection
+from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
+from flight_design.gains.gain_design import select_gains
+from flight_design.gains.gain_selection import ChannelPairing, GainAssessment, LoopSetting, Manoeuvre, Study
 from rise_di_controller.decomposition import decompose, unit_diagonal
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop, delay_margin, linear_law
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 AIRFRAME = load_airframe("osprey")
 SERVOS: LoopSetting = selection.loop_setting(find_scenario("osprey_servo"))._replace(delay=0.0, rate_limit={})

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
 from rise_di_controller import guard, internals

@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.scenario import Scenario, guidance_by_rule, load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided_figures import flown_routes
 from flight_bringup.graph import GUIDANCE, second_stage
-from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds

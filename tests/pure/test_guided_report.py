@@ -14,6 +14,7 @@ from rich.console import Console
 from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import part_masks
 from flight_analysis.report import guided_figures
@@ -23,7 +24,6 @@ from flight_analysis.report.html import write_page
 from flight_analysis.report.plotting import Figure
 from flight_analysis.report.summary import RecordedFlight, summarise, transients
 from flight_analysis.report.tables import flight_tables
-from flight_bringup.scenarios import find_scenario
 from flight_cli.output import show_flight
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray

@@ -19,9 +19,18 @@ from typer.testing import CliRunner, Result
 
 from aircraft_sim.jsbsim_trim import trim_solution
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import identification
-from flight_analysis.design.identification import (
+from flight_cli import identify as identify_command
+from flight_cli.cli import application
+from flight_core.outcome import COMPLETED, FlightEnded
+from flight_core.parameters import ParameterError
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from flight_design.gains.requirement import Requirement
+from flight_design.identification import step_identification
+from flight_design.identification.step_identification import (
     AUTHORITY_FRACTION,
     HEIGHTS,
     SIZES,
@@ -40,20 +49,11 @@ from flight_analysis.design.identification import (
     step_responses,
     that_learns,
 )
-from flight_analysis.design.requirement import Requirement
-from flight_bringup.scenarios import find_scenario
-from flight_cli import identify as identify_command
-from flight_cli.cli import application
-from flight_core.outcome import COMPLETED, FlightEnded
-from flight_core.parameters import ParameterError
-from flight_core.tape import Signal, Tape
-from flight_core.units import GRAVITY
-from flight_core.vectors import FloatArray
 from reference_model.params import ReferenceModelConfig
 from reference_model.reference import Reference
 from rise_di_controller.internals import Saturation
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 DT = 0.005
 THROTTLE = 1  # its place among the inputs of an identified aircraft
@@ -266,7 +266,7 @@ def identified_by(name: str, speed: float, altitude: float, flight: str, **optio
         return {flight: manoeuvre_result(simulate(scenario.vary(aircraft={"gusts": {}} | turbulence)))}
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(identification, "fly_all", fly_one)
+        patch.setattr(step_identification, "fly_all", fly_one)
         return identify(name, speed, altitude, **options)
 
 

@@ -25,8 +25,8 @@ from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core import isolated
 from flight_core.outcome import FlightEnded, exit_status
 from flight_core.parameters import ParameterError

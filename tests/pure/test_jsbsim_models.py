@@ -27,7 +27,7 @@ from aircraft_sim.jsbsim_aircraft import (
 from aircraft_sim.jsbsim_files import model_files
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import trim_solution
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray

@@ -22,12 +22,12 @@ from control_laws.pi import PiConfig
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import with_feedforward
-from flight_analysis.design.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from flight_analysis.report import layouts
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from rise_di_controller import guard, laws
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller

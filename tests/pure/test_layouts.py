@@ -17,9 +17,9 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.layouts import MAP_TOPICS, channels_of, foxglove, plotjuggler
-from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.tape import Tape
 

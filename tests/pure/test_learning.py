@@ -14,35 +14,35 @@ import pytest
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from flight_analysis.closed_loop.learning import Proposal
+from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import learner as design_learner
-from flight_analysis.design.change_test import Change
-from flight_analysis.design.learner import Known, Learner
-from flight_analysis.design.model_identification import Entry, Part, Prediction
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.figures import learned_figure, plot_context
 from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
-from flight_bringup.scenarios import find_scenario, written
 from flight_cli.cli import application
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.identification.model_identification import Part, Prediction
+from flight_design.learning import learner as design_learner
+from flight_design.learning.change_test import Change
+from flight_design.learning.learner import Known, Learner
+from flight_design.learning.scenario_learner import learn_again, learner
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from flight_view.flight import Flight
-from rise_di.learning import learn_again, learner
-from rise_di_controller.learning import acting_inputs, authority, authority_names, changes, given_up
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.observer import PastTick, estimates_after
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import acting_inputs, authority, authority_names, changes, given_up
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = [pytest.mark.package("rise_di"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 SWITCH = 15.0  # s, when the model of the first 14 s flies
 NAMES = ("q", "V", "p", "r")
@@ -107,9 +107,9 @@ class Fixed:
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Nothing is learned."""
 
-    def propose(self, flown: int) -> Proposal:
+    def propose(self, flown: int) -> LearnerResult:
         """The next one."""
-        return Proposal(self._proposals.pop(0), "given")
+        return LearnerResult(self._proposals.pop(0), "given")
 
 
 def test_replay_of_learning_flight_is_equal_to_the_bit(flown: Flown) -> None:
@@ -214,10 +214,10 @@ def test_lost_ticks_are_unknown_in_record() -> None:
 
 def test_short_record_is_refused() -> None:
     made = made_learner(scenario())
-    assert made.propose(0) == Proposal(None, "record: found 0 s, expected 10 s")
+    assert made.propose(0) == LearnerResult(None, "record: found 0 s, expected 10 s")
     for t in (0, 5):  # the ticks between them are lost
         made.take(t * NANOSECONDS, np.zeros(4), np.zeros(4), 0)
-    assert made.propose(0) == Proposal(None, "record: found 5.01 s, expected 10 s")
+    assert made.propose(0) == LearnerResult(None, "record: found 5.01 s, expected 10 s")
 
 
 def test_record_without_motion_and_noise_is_refused() -> None:
@@ -225,7 +225,7 @@ def test_record_without_motion_and_noise_is_refused() -> None:
     for k in range(1001):
         made.take(k * 10_000_000, np.array([0.0, 0.01 * (k % 3), 0.0, 0.0]), np.zeros(4), 0)
     expected = "record: found a constant q, V, r, expected outputs that move, or the noise of their sensors"
-    assert made.propose(0) == Proposal(None, expected)
+    assert made.propose(0) == LearnerResult(None, expected)
 
 
 def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,7 +288,9 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     fallen = given_up(start, model, ["q", "V"])
     learned = copy.deepcopy(flown.learner)
     # all but this part is as proposed
-    assert learned.propose(fallen.digest()) == Proposal(None, "no identification is due, and no part is tested for a change")
+    assert learned.propose(fallen.digest()) == LearnerResult(
+        None, "no identification is due, and no part is tested for a change"
+    )
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
     learned._proposed, learned._last = 0, start  # a later proposal, which lost the race with the fallback
@@ -413,7 +415,7 @@ def test_model_that_leaves_out_what_the_aircraft_does_is_refused_for_its_whitene
 ) -> None:
     """White innovations have 1 with a deviation of 0.3; the bound is 3."""
     refused = learner_that_finds(lateral(whiteness=3.1), monkeypatch).propose(0)
-    assert refused == Proposal(None, "innovations of r: found a whiteness of 3.1, expected at most 3, 1 being white")
+    assert refused == LearnerResult(None, "innovations of r: found a whiteness of 3.1, expected at most 3, 1 being white")
     assert learner_that_finds(lateral(whiteness=2.9), monkeypatch).propose(0).controller is not None
 
 
@@ -474,7 +476,7 @@ def test_start_with_less_margin_keeps_what_it_leaves_beyond_its_own_delay() -> N
 def test_part_whose_inputs_are_later_than_the_search_looks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Four deviations of 15 ms: the delay may be any longer one."""
     refused = learner_that_finds(lateral(delay=0.06), monkeypatch).propose(0)
-    assert refused == Proposal(None, "aileron and rudder: found u 60 ms late or later, expected less than 60 ms")
+    assert refused == LearnerResult(None, "aileron and rudder: found u 60 ms late or later, expected less than 60 ms")
 
 
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY

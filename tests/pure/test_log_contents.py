@@ -20,10 +20,10 @@ from tests.joint_states import vector
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
 from flight_bringup.graph import AIRCRAFT, ONE_PROCESS, RECORDER, parameter_overrides
-from flight_bringup.scenarios import find_scenario, scenarios
 from flight_core.parameters import ParameterError
 from flight_log import columns
 from flight_log.bag import BagWriter, LogAttachments, read_metadata_records

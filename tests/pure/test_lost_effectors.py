@@ -13,7 +13,7 @@ from aircraft_sim import plant
 from aircraft_sim.actuators import move
 from aircraft_sim.airframe import airframes, load_airframe
 from aircraft_sim.params import AircraftConfig
-from flight_bringup.scenarios import find_scenario, scenarios
+from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray

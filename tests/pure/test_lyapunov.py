@@ -16,8 +16,9 @@ import pytest
 from tests.closed_loop import law_params
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.lyapunov import (
+from flight_design.gains.lyapunov import (
     Evidence,
     Example,
     KnownPlant,
@@ -30,11 +31,10 @@ from flight_analysis.design.lyapunov import (
     largest_rise,
     lemma_2,
 )
-from flight_bringup.scenarios import find_scenario
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 PERIODS = (0.02, 0.01, 0.005, 0.0025)
 TOO_SMALL = 0.05  # times beta: 0.25 and 0.15, where (29), (30) require 1.7 and 1.7

@@ -12,10 +12,10 @@ from tests.plots import drawn as plotted
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import nominal_and_sampled
-from flight_analysis.closed_loop.margins import law_order, loop_of, margins, scenario_loop
+from flight_analysis.closed_loop.loop_margins import law_order, loop_of, margins, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report.margins import MARGIN_COLUMNS, bode_figure, margin_rows, margins_as_json, nyquist_figure
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.margin_figures import MARGIN_COLUMNS, bode_figure, margin_rows, margins_as_json, nyquist_figure
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di_controller.laws import AnyLaw
@@ -31,7 +31,7 @@ from rise_di_controller.margins import (
     slow_modes,
 )
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.package("flight_analysis")
 

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.account import account
-from flight_bringup.scenarios import find_scenario
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 

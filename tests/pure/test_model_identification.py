@@ -18,21 +18,22 @@ from aircraft_sim.uncertainty import as_yaml
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import Names
 from control_laws.riccati import correction_of, corrections_near
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import innovation_filters, model_identification
-from flight_analysis.design.gain_selection import ChannelPairing
-from flight_analysis.design.innovation_filters import Actuation, Recording
-from flight_analysis.design.model_identification import Entry, Identification, identify, whiteness
-from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
+from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.identification import innovation_filters, model_identification
+from flight_design.identification.innovation_filters import Actuation, Recording
+from flight_design.identification.model_identification import Identification, identify, whiteness
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 OSPREY = load_airframe("osprey")
 ACTUATORS = Actuation(np.array([0.02, 0.1, 0.02, 0.02]), 0.0)  # those of osprey_servo; a flight in one process has no delay

@@ -15,24 +15,24 @@ from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import observer_selection
-from flight_analysis.design.observer_selection import (
+from flight_cli.cli import application
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from flight_design.gains import observer_selection
+from flight_design.gains.gain_design import observed
+from flight_design.gains.observer_selection import (
     gains_by_rule,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
 )
-from flight_analysis.design.requirement import Requirement
-from flight_bringup.scenarios import find_scenario
-from flight_cli.cli import application
-from flight_core.parameters import ParameterError
-from flight_core.vectors import FloatArray
-from rise_di.gain_design import observed
+from flight_design.gains.requirement import Requirement
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 OSPREY = load_airframe("osprey")
 SERVO = PROTOTYPE_SERVO

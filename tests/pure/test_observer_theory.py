@@ -4,7 +4,7 @@
 """The observer of docs/theory.md in continuous time: the Proposition, Lemma A, Lemma B and the error inside the softened sign.
 
 Observers here are designed with the Riccati solver of scipy, in this file. Plants are random, with stable zero dynamics, or
-the osprey. Loops are those of `flight_analysis.design.lyapunov.fly`: the extended plant is a plant (1), so it flies like one.
+the osprey. Loops are those of `flight_design.gains.lyapunov.fly`: the extended plant is a plant (1), so it flies like one.
 """
 
 from typing import NamedTuple
@@ -17,16 +17,16 @@ from tests.closed_loop import law_params
 
 from aircraft_sim.airframe import Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.airframe_properties import invariant_zeros
-from flight_analysis.design.gain_selection import manoeuvre, study_airframe
-from flight_analysis.design.lyapunov import KnownPlant, fly
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import law_comparison, tuning
-from flight_campaign.tuned_gains import TuningResult
 from flight_core.vectors import FloatArray
+from flight_design.gains.airframe_properties import invariant_zeros
+from flight_design.gains.gain_selection import manoeuvre, study_airframe
+from flight_design.gains.lyapunov import KnownPlant, fly
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law import LawParams, Sign
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 N, M = 4, 2  # states and channels of a random plant
 ZERO_LEAK = 0.01  # 1/s, decay of angles and disturbances in a model, so that the Riccati equations have a solution

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 import rise_di
 from aircraft_sim.simulator import Simulator
-from flight_analysis.closed_loop.margins import scenario_loop
+from flight_analysis.closed_loop.loop_margins import scenario_loop
 from flight_core.modes import Mode
 from flight_core.outcome import FlightEnded
 from flight_core.tape import Tape

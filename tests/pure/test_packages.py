@@ -22,7 +22,7 @@ EXECUTABLES = {
     "autopilot_bridge": "bridge",
     "reference_model": "reference_model",
     "flight_guidance": "guidance",
-    "flight_learner": "learner",
+    "flight_design": "learner",
     "rise_di_controller": "controller",
     "flight_recorder": "recorder",
     "flight_cli": "rise-di",

@@ -21,9 +21,9 @@ from tests.closed_loop import law_params, reference_outputs
 
 from aircraft_sim import dynamics
 from aircraft_sim.params import AircraftConfig, Gust
-from flight_analysis.design.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
+from flight_design.gains.lyapunov import KnownPlant, decay_matrix, evidence, example, fly
 from reference_model.command import Profile
 from reference_model.model import Model, second_order
 from rise_di_controller.decomposition import DecompositionError, decompose
@@ -342,7 +342,7 @@ def test_V1_dot_of_32_has_gain_22(loop: Loop) -> None:
 @pytest.mark.equation(24, 32, 46, 48)
 def test_V2_dot_is_quadratic_form(loop: Loop) -> None:
     """V2_dot is a quadratic form without beta and N_d."""
-    # The sum of (32) and -L (46), as in `flight_analysis.design.lyapunov.decay_matrix`, on a plant of this test.
+    # The sum of (32) and -L (46), as in `flight_design.gains.lyapunov.decay_matrix`, on a plant of this test.
     Q = decay_matrix(loop.p.plant(), loop.p.law())
     for t in INSTANTS:
         N_d, _, term = loop.split(t)

@@ -10,11 +10,11 @@ import pytest
 from tests.maps import named_map
 
 from autopilot_bridge.params import ChannelMap
-from flight_analysis.design.parameter_agreement import Servo, Stick, changes, require_agreement, servo_of, stick_of
 from flight_core.parameters import ParameterError
+from flight_design.identification.parameter_agreement import Servo, Stick, changes, require_agreement, servo_of, stick_of
 from flight_log.vehicle_log import ParameterRecord
 
-pytestmark = pytest.mark.package("flight_analysis")
+pytestmark = pytest.mark.package("flight_design")
 
 MAPS = ("ardupilot", "ardupilot_mavlink")
 AXES = {"elevator": "PITCH", "thrust": "THROTTLE", "aileron": "ROLL", "rudder": "YAW"}

@@ -17,7 +17,7 @@ from tools.parameters import SECTIONS
 
 from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign.campaign import Definition
 from flight_core.files import read_yaml, writing
 from flight_core.parameters import Config, ParameterError, flatten, nest

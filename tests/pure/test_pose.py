@@ -14,8 +14,8 @@ from tests.builders import aircraft_parameters
 from aircraft_sim import dynamics, pose
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.simulator import Simulator
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import LEARNER, parameter_overrides, second_stage
-from flight_bringup.scenarios import find_scenario
 from flight_core.channels import UNKNOWN
 from flight_core.modes import Mode
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import StampedVector
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import (
+from rise_di_controller.proposals import (
     DESIGNED,
     Event,
     Learning,
@@ -35,7 +35,7 @@ from rise_di_controller.learning import (
     outputs_without,
     with_channels_of,
 )
-from rise_di_controller.rise_di import LearnConfig, RiseDiConfig
+from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.package("rise_di_controller")
 

@@ -23,21 +23,21 @@ from typer.testing import CliRunner, Result
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.replay import OPEN_LOOP, ReplayResult, replay, vary
 from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.gain_selection import with_feedforward
-from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_design.gains.gain_selection import with_feedforward
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.stored_messages import PARAMETER_EVENT, parameter_changes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
 

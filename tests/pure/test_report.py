@@ -17,6 +17,7 @@ from tests.plots import drawn
 from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report import comparison, figures, html, plotting, summary
@@ -25,7 +26,6 @@ from flight_analysis.report.html import Page, TableGroup, page_html, write_page
 from flight_analysis.report.plotting import Figure, Interval, PlotContext, SampleStore
 from flight_analysis.report.summary import DisplayUnit, RecordedFlight, mode_notes, summarise
 from flight_analysis.report.tables import events
-from flight_bringup.scenarios import find_scenario
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED
 from flight_core.tape import Signal, Tape

@@ -11,11 +11,11 @@ from tests.joint_states import JOINT_STATE, vector
 from tests.recordings import EPOCH, MS
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report import run_folder
 from flight_analysis.report.run_folder import new_run, read_flight, write_empty_summary, write_report
 from flight_analysis.report.summary import empty_summary
 from flight_bringup.fly import fly_in_process
-from flight_bringup.scenarios import find_scenario
 from flight_cli.report import report
 from flight_core.parameters import ParameterError
 from flight_log.bag import BagWriter

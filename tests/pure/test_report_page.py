@@ -13,11 +13,11 @@ import pytest
 from tests.browser import CHROMIUM, Browser
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report import plotting
 from flight_analysis.report.html import write_page
 from flight_analysis.report.summary import RecordedFlight, summarise
-from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 
 pytestmark = [

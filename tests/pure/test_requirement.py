@@ -15,24 +15,24 @@ import yaml
 from typer.testing import CliRunner, Result
 
 from aircraft_sim.airframe import Airframe
-from flight_analysis.closed_loop.margins import LinearLoop, margins
+from flight_analysis.closed_loop.loop_margins import LinearLoop, margins
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import gain_selection
-from flight_analysis.design.gain_selection import Manoeuvre
-from flight_analysis.design.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
-from flight_analysis.design.trade import linear_error, trade
 from flight_analysis.metrics import best_error, error_metrics
-from flight_bringup.scenarios import find_scenario
 from flight_cli.gains import gains as gains_command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from flight_design.gains import gain_selection
+from flight_design.gains.gain_design import select_gains
+from flight_design.gains.gain_selection import Manoeuvre
+from flight_design.gains.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
+from flight_design.gains.trade import linear_error, trade
 from reference_model.params import ReferenceModelConfig
-from rise_di.gain_design import select_gains
 from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
 from rise_di_controller.margins import loop_margins
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 SERVO = find_scenario("osprey_servo")
 T = 0.01  # s, of the law

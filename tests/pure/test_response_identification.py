@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from flight_analysis.design.response_identification import Response, begins_with_Omega, identify_response
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
+from flight_design.identification.response_identification import Response, begins_with_Omega, identify_response
 
-pytestmark = pytest.mark.package("flight_analysis")
+pytestmark = pytest.mark.package("flight_design")
 
 OUTPUTS, INPUTS = ("p", "r"), ("aileron", "rudder")
 OMEGA: FloatArray = np.array([[40.0, 3.0], [-2.0, 8.0]])  # rad/s^2 per rad

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from control_laws import l1, lqi, observed, observer_design, riccati, self_tuner
 from control_laws.catalogue import LAWS, initial_gains
 from control_laws.nominal_model import NominalModel, conditional_integration
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import tuning
 from flight_core.vectors import FloatArray
 from rise_di_controller.control_law import ControlLaw, Measurements

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.other_laws import SECTIONS
 
 import rise_di
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector

@@ -17,8 +17,8 @@ import pytest
 from tests.closed_loop import CALM_SERVO, error
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 

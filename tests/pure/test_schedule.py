@@ -10,9 +10,9 @@ import pytest
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import fleet
+from flight_campaign import batch
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
@@ -155,7 +155,7 @@ def test_schedule_of_airspeed_alone_refused() -> None:
 
 def test_many_aircraft_have_each_their_scale() -> None:
     control_law, params = law()
-    many, V = fleet.shared(params), np.array([[-10.0, 0.0, FASTER]])
+    many, V = batch.shared(params), np.array([[-10.0, 0.0, FASTER]])
     y: Any = np.concatenate([np.zeros((3, 3)), V])
     found = target_scale(y, many)
     assert found.shape == (4, 3)

@@ -10,11 +10,11 @@ import pytest
 from tests.conftest import REPOSITORY
 from tests.other_laws import example_installed
 
-from flight_analysis.closed_loop.margins import margins
+from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import LIBRARY, find_scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from rise_di_controller.law import Sign
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_bringup"), pytest.mark.slow]
 

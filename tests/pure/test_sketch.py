@@ -5,14 +5,14 @@
 import numpy as np
 import pytest
 
-from flight_analysis.design.innovation_filters import Actuation, Recording, blocks, filter_model
-from flight_analysis.design.learner import Learner
-from flight_analysis.design.sketch import sketch, sketched
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.parameters import ParameterError
-from rise_di.learning import learner
+from flight_design.identification.innovation_filters import Actuation, Recording, blocks, filter_model
+from flight_design.identification.sketch import sketch, sketched
+from flight_design.learning.learner import Learner
+from flight_design.learning.scenario_learner import learner
 
-pytestmark = pytest.mark.package("flight_analysis")
+pytestmark = pytest.mark.package("flight_design")
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "throttle", "aileron", "rudder")
 STEPS = {  # Omega_ii of the steps of docs/experiments.md, and true airspeed, m/s: a light aircraft, a fighter, an airliner

@@ -12,25 +12,25 @@ import rise_di
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.airspeed import at_speed, level_flight
 from aircraft_sim.uncertainty import as_yaml
-from flight_analysis.c_export.constants import exportable
-from flight_analysis.closed_loop.margins import law_order
+from c_export.constants import exportable
+from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.innovation_filters import Recording
-from flight_analysis.design.learner import Learner, about, steady_end
-from flight_analysis.design.model_identification import best_known
-from flight_bringup.scenarios import find_scenario
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
-from rise_di.gain_design import observed
+from flight_design.gains.gain_design import observed
+from flight_design.identification.innovation_filters import Recording
+from flight_design.identification.model_identification import best_known
+from flight_design.learning.learner import Learner, about, steady_end
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import Event, Learning, Proposal, acting_inputs, authority, designed, fallen_back
 from rise_di_controller.linear_loop import LinearPlant, Loop, delay_margin, linear_law
 from rise_di_controller.observer import estimates_after
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import Event, Learning, Proposal, acting_inputs, authority, designed, fallen_back
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
 

@@ -11,14 +11,14 @@ import yaml
 from tests.conftest import REPOSITORY
 
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops, load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import gain_selection
 from flight_analysis.metrics import best_error
-from flight_bringup.scenarios import find_scenario
 from flight_core.vectors import FloatArray
-from rise_di.gain_design import select_gains
+from flight_design.gains import gain_selection
+from flight_design.gains.gain_design import select_gains
 
-pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
+pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
 PAGE = (REPOSITORY / "docs/tutorials/theorem.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"^cat > (\S+) <<'EOF'\n(.*?)^EOF$", PAGE, re.MULTILINE | re.DOTALL))

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller.controller import Controller

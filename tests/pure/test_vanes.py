@@ -14,23 +14,23 @@ from tests.builders import aircraft_parameters, rms, truth_of
 from aircraft_sim import vanes
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
+from c_export.constants import exportable
 from control_laws.observer_design import Names, Weights, aircraft_correction, aircraft_model, vane_correction
-from flight_analysis.c_export.constants import exportable
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.observer_selection import model_for
 from flight_analysis.report.summary import vane_notes
 from flight_analysis.report.tables import events
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
+from flight_design.gains.observer_selection import model_for
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller
 from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.observer import VaneObserverState, correct, without_frozen
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.package("aircraft_sim")
 

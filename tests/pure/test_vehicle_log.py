@@ -21,14 +21,14 @@ from tests.vehicle_logs import Changes, write_dataflash, write_tlog, write_ulog
 from typer.testing import CliRunner
 
 from autopilot_bridge.params import ChannelMap
-from flight_analysis.design.log_import import require_map_of_import
-from flight_analysis.design.response_identification import MIN_RATIO
-from flight_analysis.design.sign_check import recorded_response
 from flight_cli.cli import COMMANDS, application
 from flight_cli.log_options import warn_of_lacks_in
 from flight_core import installation
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
+from flight_design.identification.log_import import require_map_of_import
+from flight_design.identification.response_identification import MIN_RATIO
+from flight_design.identification.sign_check import recorded_response
 from flight_log.tape_reader import read_run
 from flight_log.vehicle_log import read_vehicle_log
 from flight_view.flight import Flight as View

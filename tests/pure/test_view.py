@@ -28,7 +28,7 @@ from tests.joint_states import JOINT_STATE, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance.path import route_outline

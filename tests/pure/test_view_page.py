@@ -17,11 +17,11 @@ from tests.browser import CHROMIUM, Browser
 from tests.joint_states import JOINT_STATE, vector
 from tests.view_link import NodesInMemory, in_the_air
 
-from flight_analysis.closed_loop.margins import delay_margins
+from flight_analysis.closed_loop.loop_margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
-from flight_bringup.scenarios import find_scenario
 from flight_core.tape import Signal, Tape
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.disk import try_lock

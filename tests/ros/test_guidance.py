@@ -20,8 +20,8 @@ from tests.ros.peer import OUTPUTS, Peer
 from tests.ros.test_lockstep import FIRST_CHUNKS, ROUGH, fly, scenario_file
 
 from flight_analysis.closed_loop.scenario import load_scenario, scenario_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
 from flight_core.outcome import STATUS_INCOMPLETE

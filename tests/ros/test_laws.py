@@ -18,8 +18,8 @@ from tests.ros.test_lockstep import TOPICS, payloads
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.scenarios import find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_log.tape_reader import read_run
 from rise_di_controller import laws

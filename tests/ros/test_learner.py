@@ -11,16 +11,16 @@ from tests.ros.conftest import Start
 from flight_analysis.closed_loop.guidance_replay import replay_guidance
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_bringup.scenarios import find_scenario, written
 from flight_core.channels import UNKNOWN
 from flight_core.rates import nanoseconds
+from flight_design.learning.scenario_learner import learner
 from flight_log.tape_reader import read_run
-from rise_di.learning import learner
-from rise_di_controller.learning import Event
+from rise_di_controller.proposals import Event
 
-pytestmark = pytest.mark.package("flight_learner")
+pytestmark = pytest.mark.package("flight_design")
 
 
 def scenario(folder: Path, **learn: object) -> Scenario:
@@ -66,14 +66,14 @@ def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_pa
     chosen = scenario(tmp_path, updates=[1.0, 2.5])
     command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
     command.wait_for("no model: record: found")
-    learning = command.child("flight_learner.main")
+    learning = command.child("flight_design.main")
     learning.suspend()
     logged = sum(path.stat().st_size for path in (tmp_path / "runs").rglob("*.mcap"))
     command.wait_for_log(tmp_path / "runs", logged + 100_000)  # the flight goes on beside the stopped learner: half a second
     learning.kill()
     command.wait_for("learner was killed by SIGKILL: the law flies on with the model that it has")
     said = command.output.count("no model: record")
-    start("flight_learner.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
+    start("flight_design.main", "--ros-args", "-p", f"scenario_file:={chosen.path}").wait_for("no model: record")
     command.until(lambda: command.output.count("no model: record") > said, "an identification of another learner")
     # no byte more, as on a full disk: the write fails, and Python ignores SIGXFSZ
     command.child("flight_recorder.main").rlimit(psutil.RLIMIT_FSIZE, (0, 0))

@@ -19,9 +19,9 @@ from tests.ros.conftest import Process, Start
 from tests.ros.waiting import HostDelays
 
 from flight_analysis.closed_loop.scenario import load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.fly import fly_over_topics
-from flight_bringup.scenarios import find_scenario
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.package("flight_bringup")

@@ -16,9 +16,9 @@ from tests.ros.peer import Peer
 
 from autopilot_bridge.params import MAVLINK
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, NodeSpec, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
-from flight_bringup.scenarios import find_scenario
 
 pytestmark = pytest.mark.package("flight_bringup")
 

@@ -18,11 +18,11 @@ from tests.ros.waiting import HostDelays
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.design.gain_selection import with_feedforward
 from flight_core.modes import Mode
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import flatten, nest
 from flight_core.rates import NANOSECONDS, period_ns
+from flight_design.gains.gain_selection import with_feedforward
 from flight_log.tape_reader import read_run
 from flight_ros.topics import publisher_qos
 

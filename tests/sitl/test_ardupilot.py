@@ -15,9 +15,9 @@ from tests.ros.conftest import Process
 from tests.sitl.kit import ALTITUDE, MAX_AGE, OWN_MAP, OWN_SCENARIO, ArduPlane, burn, guided_scenario
 
 from autopilot_bridge.params import load_map
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import in_spans
 from flight_analysis.report.guided import BANDS, control_errors
-from flight_bringup.scenarios import find_scenario
 from flight_log.stored_messages import stored_messages
 from flight_log.tape_reader import read_run
 

@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 from tests.sitl.kit import OVERRIDE_TIME, ArduPlane, guided_scenario
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_log.tape_reader import read_run
 
 SCENARIO = find_scenario(str(REPOSITORY / "examples" / "arduplane" / "scenario.yaml"))

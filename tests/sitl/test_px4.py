@@ -13,7 +13,7 @@ from tests.conftest import REPOSITORY
 from tests.ros.conftest import Process
 from tests.sitl.kit import HOLD, MAX_AGE, OFFBOARD, OWN_MAP, OWN_SCENARIO, Px4, burn, followed
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_log.tape_reader import read_run
 
 EXAMPLE = REPOSITORY / "examples" / "px4_airplane"

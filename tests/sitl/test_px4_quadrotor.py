@@ -8,7 +8,7 @@ import pytest
 from tests.conftest import REPOSITORY
 from tests.sitl.kit import HOLD, OFFBOARD, Quadrotor, followed
 
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_log.tape_reader import read_run
 
 EXAMPLE = REPOSITORY / "examples" / "px4_quadrotor"

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
+from glob import glob
 from xml.etree import ElementTree
 
 from setuptools import setup
@@ -7,20 +8,18 @@ from setuptools import setup
 setup(
     name="flight_analysis",
     version=ElementTree.parse("package.xml").findtext("version"),
-    description="Flights without ROS: the closed loop in one process, metrics, gain design, the report page.",
+    description="Flights without ROS: scenarios, the closed loop in one process, metrics, the report page.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=[
         "flight_analysis",
-        "flight_analysis.c_export",
         "flight_analysis.closed_loop",
-        "flight_analysis.design",
         "flight_analysis.report",
     ],
     package_data={
         "flight_analysis": [
             "py.typed",
-            "c_export/source/*",
+            "scenarios/*.yaml",
             "report/*.jinja",
             "report/*.js",
             "report/scene/*",
@@ -30,5 +29,6 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_analysis"]),
         ("share/flight_analysis", ["package.xml"]),
+        ("share/flight_analysis/scenarios", sorted(glob("flight_analysis/scenarios/*.yaml"))),
     ],
 )

@@ -11,7 +11,7 @@ setup(
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     packages=["flight_campaign"],
-    package_data={"flight_campaign": ["py.typed", "tuned/*.yaml"]},
+    package_data={"flight_campaign": ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/flight_campaign"]),
         ("share/flight_campaign", ["package.xml"]),

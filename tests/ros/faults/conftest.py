@@ -14,7 +14,7 @@ from tests.ros.faults.draws import Draw, draw, found
 from tests.ros.faults.flight import Flight, Kind
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 
 Row = dict[str, str | int | float | bool | None]
 LINES = 12  # of an error in a row: what failed, and the first output of a process that did not answer

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di, self_tuner, super_twisting
+from control_laws import indi, inversion, l1, lqg, lqi, mackunis, mrac, observed, pi, rise_di_law, self_tuner, super_twisting
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from rise_di_controller import law as rise
@@ -116,23 +116,23 @@ FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, Nom
 """Title, law, parameters and tuned gains of the laws of the full state; these laws also fly with vanes, relative to the air."""
 
 LAWS: dict[str, Law] = {
-    "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di.params_of, _rise_gains),
+    "rise": Law("RISE-DI, softened sign", "y", "Omega_ii", _soft, rise_di_law.params_of, _rise_gains),
     "rise_implicit": Law(
         "RISE-DI, implicit sign",
         "y",
         "Omega_ii",
         _implicit,
-        rise_di.params_of,
+        rise_di_law.params_of,
         ("K", "Lambda", "beta", "omega"),
         linear=False,
     ),
-    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di.params_of, _rise_gains, AIRCRAFT),
+    "rise_ff": Law("RISE-DI + feedforward", "y", _model, _soft, rise_di_law.params_of, _rise_gains, AIRCRAFT),
     "rise_observer": Law(
         "RISE-DI + feedforward + observer",
         "y",
         _wind,
         _fixed(with_observer(rise.CONTROL_LAWS[Sign.SOFT])),
-        _over(rise_di.params_of),
+        _over(rise_di_law.params_of),
         _rise_gains + _observer_gains,
         AIRCRAFT,
     ),

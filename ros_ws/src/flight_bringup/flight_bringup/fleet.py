@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from flight_analysis.closed_loop.scenario import Scenario, require_guidable
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import POLL_PERIOD, Steps, as_file, follow, interrupt
 from flight_bringup.graph import FIRST_STAGE, LEAD, absolute_namespace, second_stage
 from flight_bringup.processes import FlightProcesses, handle_signals, start_instants
-from flight_bringup.scenarios import find_scenario, with_route
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import MAX_PARTICIPANTS, require_ros_environment
 from flight_core.fields import Field

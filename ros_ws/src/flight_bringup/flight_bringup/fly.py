@@ -14,14 +14,14 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from flight_analysis.closed_loop.learning import Learn
+from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, load_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import fly
 from flight_analysis.report.run_folder import FlightResult, attachments_for, new_run, write_report
 from flight_analysis.report.summary import display_units
 from flight_bringup.graph import CONTROLLER, Autopilot
 from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, SEARCH_TIMEOUT, FlightProcesses, NotReadyError, handle_signals
-from flight_bringup.scenarios import find_scenario, written
 from flight_core.arguments import FilePath, as_path
 from flight_core.environment import require_ros_environment
 from flight_core.files import writing
@@ -31,7 +31,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.signals import handle_shutdown
 from flight_core.tape import Signal
 from flight_log.tape_writer import EXPECTED, TapeWriter
-from rise_di_controller.learning import Event
+from rise_di_controller.proposals import Event
 
 if TYPE_CHECKING:
     from flight_bringup.monitor import FlightMonitor

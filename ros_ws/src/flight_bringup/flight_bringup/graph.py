@@ -13,7 +13,7 @@ from autopilot_bridge.params import ChannelMap, find_map, load_map
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_guidable
 from flight_analysis.report.run_folder import attachments_for
 from flight_core.parameters import require
-from rise_di_controller.learning import AUTHORITY_TICKS
+from rise_di_controller.proposals import AUTHORITY_TICKS
 
 
 class NodeSpec(NamedTuple):
@@ -33,7 +33,7 @@ AIRCRAFT = NodeSpec("aircraft_sim", "aircraft")
 REFERENCE_MODEL = NodeSpec("reference_model", "reference_model")
 GUIDANCE = NodeSpec("flight_guidance", "guidance")
 CONTROLLER = NodeSpec("rise_di_controller", "controller")
-LEARNER = NodeSpec("flight_learner", "learner")
+LEARNER = NodeSpec("flight_design", "learner")
 BRIDGE = NodeSpec("autopilot_bridge", "bridge")
 
 # All nodes in one process. Each reads its own section of the scenario.

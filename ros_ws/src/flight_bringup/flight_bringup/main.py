@@ -15,7 +15,7 @@ def main() -> None:
         "reference_model.node:ReferenceModelNode",
         *(["flight_guidance.node:GuidanceNode"] if guided else []),
         "rise_di_controller.node:ControllerNode",
-        *(["flight_learner.node:LearnerNode"] if learns else []),
+        *(["flight_design.learning.node:LearnerNode"] if learns else []),
         "flight_recorder.node:RecorderNode",
     )
 

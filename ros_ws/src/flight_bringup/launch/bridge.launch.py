@@ -17,7 +17,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
 from autopilot_bridge.params import maps
-from flight_analysis.design.sign_check import require_signs
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     CONTROLLER,
@@ -44,7 +44,7 @@ from flight_bringup.launch.stages import (
     watch_argument,
     watch_page,
 )
-from flight_bringup.scenarios import find_scenario
+from flight_design.identification.sign_check import require_signs
 from launch import LaunchContext, LaunchDescription
 
 

@@ -15,6 +15,7 @@ from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import new_run
 from flight_bringup.graph import (
     AIRCRAFT,
@@ -44,7 +45,6 @@ from flight_bringup.launch.stages import (
     watch_argument,
     watch_page,
 )
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import require
 from flight_ros.topics import NodeState
 from launch import LaunchContext, LaunchDescription

@@ -17,6 +17,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
 from autopilot_bridge.params import maps
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import new_run, recorded_scenario
 from flight_bringup.graph import (
     AIRCRAFT,
@@ -42,7 +43,6 @@ from flight_bringup.launch.stages import (
     start_in_stages,
 )
 from flight_bringup.player import unsendable
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import require
 from flight_log.playback import read_playback
 from launch import LaunchContext, LaunchDescription

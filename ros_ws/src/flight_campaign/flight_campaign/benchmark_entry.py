@@ -16,12 +16,12 @@ from numpy.typing import ArrayLike
 
 from control_laws.catalogue import LAWS
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign import tuned_gains
 from flight_campaign.benchmark_sets import Sets, frame
 from flight_campaign.tuned_controller import REGISTERED, tuned_controller
 from flight_campaign.tuning import build_benchmark
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray, as_array
+from flight_design.gains import tuned_gains
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 
@@ -48,7 +48,7 @@ Enter = Callable[[Task], Mapping[str, Any] | Step | None]
 """A law for a task: a section `controller`, or a function that keeps the state of one aircraft; None takes no part."""
 
 
-class Entry(NamedTuple):
+class BenchmarkEntry(NamedTuple):
     """An entry."""
 
     name: str
@@ -65,7 +65,7 @@ def task_of(name: str, sets: Sets) -> Task:
     return Task(name, scenario.aircraft.airframe, controller.outputs, controller.inputs, controller.rate, frame(scenario))
 
 
-def entered(entry: Entry, task: Task) -> ControllerConfig | Step | None:
+def entered(entry: BenchmarkEntry, task: Task) -> ControllerConfig | Step | None:
     """What flies a task. Raises ParameterError for a function that raises, a section that is none or changes the frame."""
     try:
         law = entry.enter(task)
@@ -107,7 +107,7 @@ def find_entry(
     name: str | None = None,
     sees: str | None = None,
     knows: str | None = None,
-) -> Entry:
+) -> BenchmarkEntry:
     """The entry that words name: MODULE:FUNCTION, a law of the comparison, or scenarios, one for each airframe.
 
     `find` reads a scenario. Raises ParameterError for an unknown word.
@@ -116,18 +116,18 @@ def find_entry(
     if ":" in first and not first.endswith(".yaml"):
         require(len(words) == 1, "ENTRY", " ".join(words), "one MODULE:FUNCTION")
         enter, source = _function(first)
-        return Entry(name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter)
+        return BenchmarkEntry(name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter)
     if first in REGISTERED:
         require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
         law, own = LAWS[first], _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
-        return Entry(name or first, sees or law.measurements, knows or law.model_data, *own)
+        return BenchmarkEntry(name or first, sees or law.measurements, knows or law.model_data, *own)
     scenarios = [find(word) for word in words]
     by_airframe = {scenario.aircraft.airframe: scenario.controller for scenario in scenarios}
     require(len(by_airframe) == len(words), "ENTRY", " ".join(words), "one scenario for each airframe")
     known = sets.airframes()
     for airframe in by_airframe:
         require(airframe in known, "ENTRY", f"a scenario of {airframe}", f"one of {', '.join(known)}")
-    return Entry(name or Path(first).stem, sees or "y", knows or NOT_STATED, *_of_airframes(by_airframe))
+    return BenchmarkEntry(name or Path(first).stem, sees or "y", knows or NOT_STATED, *_of_airframes(by_airframe))
 
 
 def _of_airframes(controllers: Mapping[str, ControllerConfig]) -> tuple[str, Enter]:

@@ -15,12 +15,12 @@ from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
-from flight_campaign import fleet, missions
+from flight_campaign import batch, missions
+from flight_campaign.batch import FleetResult, Stepper
 from flight_campaign.benchmark_course import Course, build_course
-from flight_campaign.benchmark_entry import Entry, Step, Task, entered, stepped, task_of
+from flight_campaign.benchmark_entry import BenchmarkEntry, Step, Task, entered, stepped, task_of
 from flight_campaign.benchmark_sets import AFTER, BEFORE, SETS, UNCERTAINTY, VERSION, Sets, seed_of
 from flight_campaign.engines import Engine, Job
-from flight_campaign.fleet import FleetResult, Stepper
 from flight_campaign.missions import Mission
 from flight_campaign.rows import Chunk, encode
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score, score_units
@@ -151,7 +151,7 @@ class _Prepared(NamedTuple):
 class Flights:
     """The flights of an entry."""
 
-    def __init__(self, entry: Entry, sets: Sets) -> None:
+    def __init__(self, entry: BenchmarkEntry, sets: Sets) -> None:
         self.entry, self.sets = entry, sets
         self._prepared: dict[str, _Prepared] = {}
 
@@ -190,7 +190,7 @@ class Flights:
         return encode(_fly_fleet(self.entry, prepared, seed, first, size), seed, 1.0)
 
 
-def _fly_fleet(entry: Entry, of: _Prepared, seed: int, first: int, size: int) -> Chunk:
+def _fly_fleet(entry: BenchmarkEntry, of: _Prepared, seed: int, first: int, size: int) -> Chunk:
     """Fly uncertain aircraft first, first + 1, ..., as in a campaign."""
     scenario, course = of.scenario, of.course
     assert course is not None  # noqa: S101 - for the type checker
@@ -198,18 +198,18 @@ def _fly_fleet(entry: Entry, of: _Prepared, seed: int, first: int, size: int) ->
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
     directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
     late = round(SETS[of.task.set].late / course.period)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
-    vehicle = fleet.vehicle(scenario)
+    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    vehicle = batch.vehicle(scenario)
     if isinstance(of.law, ControllerConfig):
         law = of.law.tuned_law()
-        params = fleet.shared(law.params)
-        result = fleet.fly(aircraft, vehicle, course, law.control_law, params, of.mission, of.windows)
+        params = batch.shared(law.params)
+        result = batch.fly(aircraft, vehicle, course, law.control_law, params, of.mission, of.windows)
     else:
         result = _stepped(Stepper(aircraft, vehicle, course, of.mission, of.windows), entry, of, size)
     return Chunk(first, np.asarray(result.diverged), _figures(result, of), {})
 
 
-def _stepped(flights: Stepper, entry: Entry, of: _Prepared, size: int) -> FleetResult:
+def _stepped(flights: Stepper, entry: BenchmarkEntry, of: _Prepared, size: int) -> FleetResult:
     """Fly a function, one for each aircraft. That of a diverged aircraft is not called any more."""
     steps = [entered(entry, of.task) for _ in range(size)]
     u = np.zeros((len(of.task.inputs), size))
@@ -255,7 +255,7 @@ class _FunctionController(Controller):
         return ControlOutput(y.stamp_ns, u, inputs, lambda: np.zeros(0))
 
 
-def _fly_alone(entry: Entry, of: _Prepared) -> Chunk:
+def _fly_alone(entry: BenchmarkEntry, of: _Prepared) -> Chunk:
     """Fly the aircraft of the scenario in one process."""
     law = of.law if isinstance(of.law, ControllerConfig) else entered(entry, of.task)
     if isinstance(law, ControllerConfig) or law is None:

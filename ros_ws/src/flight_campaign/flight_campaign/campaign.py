@@ -15,13 +15,13 @@ import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import Distribution, Spread, WindEffect, drawn_entries, gust_directions, sampled_matrices
-from flight_analysis.closed_loop.margins import LoopMargins, margins
+from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
 from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, scenario_of
-from flight_campaign import equipment, learning
+from flight_campaign import equipment, learning_flights
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.engines import Engine, Job
 from flight_campaign.influence import RANKED, influence
-from flight_campaign.learning import Learned, MakeLearner
+from flight_campaign.learning_flights import LearningOutcome, MakeLearner
 from flight_campaign.rows import Chunk, encode, tally_of
 from flight_campaign.statistics import Tally, score, score_units
 from flight_core.fields import Field
@@ -34,7 +34,7 @@ from rise_di_controller.params import ControllerConfig
 if TYPE_CHECKING:
     import polars as pl
 
-    from flight_campaign.fleet import Vehicle
+    from flight_campaign.batch import Vehicle
     from flight_campaign.missions import Mission
 
 DEFINITION, CHUNKS = "campaign.json", "chunks"
@@ -176,7 +176,7 @@ def define(
     if sweep is not None:
         sweep.scaled(scenario.controller, 1.0)
     if scenario.learns():
-        learning.require_flyable(scenario)
+        learning_flights.require_flyable(scenario)
     else:
         course = build_course(scenario)
         if scenario.guidance is not None:
@@ -237,7 +237,7 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
     """Fly a chunk of a campaign. One of a guided scenario flies missions."""
-    from flight_campaign import fleet  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
@@ -249,9 +249,9 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, definition.chunk)
     late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
-    aircraft = fleet.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
-    vehicle = fleet.with_equipment(vehicle, scenario, equipped)
-    result = fleet.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
+    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    vehicle = batch.with_equipment(vehicle, scenario, equipped)
+    result = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
     outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
     if result.mission is None:
@@ -272,14 +272,14 @@ def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chun
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
     entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
-    flown = [learning.fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
+    flown = [learning_flights.fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
     outputs = scenario.controller.outputs
     rms = np.array([[flight.rms[name] for flight in flown] for name in outputs])
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
     for kind in ("rms", "max", "slew"):
         values = [getattr(flight, kind) for flight in flown]
         figures |= {f"{kind}.{name}": np.array([of[name] for of in values]) for name in values[0]}
-    for name in Learned._fields:
+    for name in LearningOutcome._fields:
         figures[name] = np.array([float(getattr(flight.learned, name)) for flight in flown])
     return Chunk(first, np.array([flight.diverged for flight in flown]), figures, entries)
 
@@ -297,12 +297,12 @@ class _Shared(NamedTuple):
 @lru_cache(maxsize=8)
 def _prepare(text: str, case: int) -> _Shared:
     """Data that all chunks of a case share."""
-    from flight_campaign import fleet, missions  # noqa: PLC0415 - as above
+    from flight_campaign import batch, missions  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
     law, course = scenario.controller.tuned_law(), build_course(scenario)
     mission = None if scenario.guidance is None else missions.build(scenario, course)
-    return _Shared(scenario, course, fleet.vehicle(scenario), law._replace(params=fleet.shared(law.params)), mission)
+    return _Shared(scenario, course, batch.vehicle(scenario), law._replace(params=batch.shared(law.params)), mission)
 
 
 class Campaign:

@@ -12,13 +12,13 @@ import numpy as np
 
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import WindEffect, as_yaml, with_entries
-from flight_analysis.closed_loop.margins import LoopMargins
+from flight_analysis.closed_loop.loop_margins import LoopMargins
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.metrics import CAPTURE_TIME
 from flight_analysis.report import plotting
 from flight_analysis.report.comparison import COLOURS
 from flight_analysis.report.html import Line, Page, Section, TableGroup, page_html
-from flight_analysis.report.margins import LEAST_MARGINS, least_margins, margins_as_json
+from flight_analysis.report.margin_figures import LEAST_MARGINS, least_margins, margins_as_json
 from flight_analysis.report.plotting import SampleStore, set_layout
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_analysis.report.summary import NO_UNIT, NO_VALUE, QUANTITY_UNITS, Column, DisplayUnit, display_units, finite_or_null

@@ -11,12 +11,12 @@ import numpy as np
 
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.catalogue import LAWS, Law
-from flight_campaign import fleet
+from flight_campaign import batch
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE
-from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import GUST, TURBULENCE, Benchmark, as_gains, benchmark_fleet, score
 from flight_core.vectors import FloatArray
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.margins import Margins
 
 DELAY_TICKS = (1, 2, 3, 4, 6)  # delays of u: 10 to 60 ms at 100 Hz
@@ -85,7 +85,7 @@ def compare(
         for objective, gains in tuned[name].items():
             params = law.params(as_gains(gains), benchmark.model)
             flown = {
-                wind: fleet.fly(disturbed, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
+                wind: batch.fly(disturbed, benchmark.vehicle, benchmark.courses[wind][law.feedforward], control_law, params)
                 for wind, disturbed in flights.items()
             }
             scores = {wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()}

@@ -13,14 +13,14 @@ from control_laws.catalogue import LAWS, NONE, Gains, Law
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_campaign.benchmark_course import build_course
-from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import Benchmark
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller import laws
 from rise_di_controller.law import Sign
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:

@@ -16,19 +16,19 @@ from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import gust_directions, nominal_and_sampled
 from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, initial_gains
 from control_laws.nominal_model import NominalModel
-from flight_analysis.closed_loop.margins import law_order
+from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import with_feedforward
-from flight_analysis.design.nominal import nominal_model
-from flight_analysis.design.observer_selection import integrator_model
-from flight_analysis.design.requirement import REQUIREMENT, Requirement, least_fractions
-from flight_campaign import fleet, statistics
+from flight_campaign import batch, statistics
+from flight_campaign.batch import Fleet, FleetResult, Vehicle
 from flight_campaign.benchmark_course import Course, build_course
-from flight_campaign.fleet import Fleet, FleetResult, Vehicle
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import score_units
-from flight_campaign.tuned_gains import TuningResult
 from flight_core.vectors import Array, FloatArray
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.nominal import nominal_model
+from flight_design.gains.observer_selection import integrator_model
+from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.linear_loop import Loop
 
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
@@ -128,7 +128,7 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
         unit,
         np.array([ACTIVITY_UNIT[airframe.inputs[name].unit] for name in controller.inputs]),
         scenario.aircraft.plant(),
-        fleet.vehicle(scenario),
+        batch.vehicle(scenario),
         {GUST: with_model, TURBULENCE: turbulent},
         {GUST: _courses(with_model), TURBULENCE: _courses(turbulent)},
         DELAY_TICKS if any(controller.lag) else 1,
@@ -168,7 +168,7 @@ def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchm
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
-    return fleet.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
+    return batch.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
 
 
 class Evaluation(NamedTuple):
@@ -257,7 +257,7 @@ def tune(
         """Costs of a part of the candidates in one wind, (together,)."""
         params, flown = job
         course = benchmark.courses[flown.wind][law.feedforward]
-        result = fleet.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
+        result = batch.fly(flown.fleet, benchmark.vehicle, course, control_law, params)
         return cost(result, benchmark).reshape(together, each) @ flown.weight
 
     def lacking(part: FloatArray) -> FloatArray:

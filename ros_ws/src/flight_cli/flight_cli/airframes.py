@@ -8,8 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.design.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
 from flight_cli.output import new_table, print_json
+from flight_design.gains.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
 
 
 def airframes(

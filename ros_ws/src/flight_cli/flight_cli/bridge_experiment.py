@@ -14,7 +14,17 @@ from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.design.bridge_identification import (
+from flight_analysis.report.run_folder import link_latest, new_run
+from flight_bringup.fly import fly_over_topics
+from flight_bringup.graph import find_autopilot
+from flight_cli.log_options import warn_of_lacks
+from flight_cli.output import flight_progress, new_table, print_json
+from flight_core.files import display_path, write_file, writing
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
+from flight_design.gains.requirement import Requirement
+from flight_design.identification.bridge_identification import (
     Channels,
     Experiment,
     Flyable,
@@ -30,20 +40,10 @@ from flight_analysis.design.bridge_identification import (
     require_envelope,
     within_range,
 )
-from flight_analysis.design.log_import import COMMANDS, median_trims, require_map_of_import
-from flight_analysis.design.open_loop_fit import FASTEST_ZERO, ChannelModel
-from flight_analysis.design.requirement import Requirement
-from flight_analysis.design.response_identification import Response, identify_response
-from flight_analysis.design.sign_check import OPEN_LOOP
-from flight_analysis.report.run_folder import link_latest, new_run
-from flight_bringup.fly import fly_over_topics
-from flight_bringup.graph import find_autopilot
-from flight_cli.log_options import warn_of_lacks
-from flight_cli.output import flight_progress, new_table, print_json
-from flight_core.files import display_path, write_file, writing
-from flight_core.parameters import ParameterError, require
-from flight_core.rates import NANOSECONDS
-from flight_core.tape import Tape
+from flight_design.identification.log_import import COMMANDS, median_trims, require_map_of_import
+from flight_design.identification.open_loop_fit import FASTEST_ZERO, ChannelModel
+from flight_design.identification.response_identification import Response, identify_response
+from flight_design.identification.sign_check import OPEN_LOOP
 from flight_log.tape_reader import read_run
 
 

@@ -15,10 +15,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from aircraft_sim.uncertainty import Distribution, WindEffect
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import REPORT, new_run
 from flight_analysis.report.summary import QUANTITY_UNITS, display_units
 from flight_analysis.report.tables import Table
-from flight_bringup.scenarios import find_scenario
 from flight_campaign import engines
 from flight_campaign.campaign import CHUNK, Campaign, Definition, Sweep, define
 from flight_campaign.campaign_report import FIGURE_HEADINGS, WIND_EFFECTS, figure_rows, influence_table, write_results
@@ -36,7 +36,7 @@ from flight_cli.output import (
 from flight_core.files import display_path, writing
 from flight_core.installation import require_package
 from flight_core.parameters import require
-from rise_di.learning import learner
+from flight_design.learning.scenario_learner import learner
 
 OF_DEFINITION = (
     *("aircraft", "uncertainty", "entry", "distribution", "score", "wind", "seed", "sweep", "duration", "chunk", "runs"),

@@ -10,9 +10,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from autopilot_bridge.map_check import CheckedRow, definitions_below, installed_definitions, is_known
+from autopilot_bridge.map_check import check_map as checked_rows
 from autopilot_bridge.params import MAVLINK, load_map
-from flight_analysis.design.map_check import CheckedRow, definitions_below, installed_definitions, is_known
-from flight_analysis.design.map_check import check_map as checked_rows
 from flight_cli.output import new_table, print_json
 
 DOES_NOT_HOLD = 1

@@ -12,11 +12,11 @@ from rich.console import Console
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import version_faults
 from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
-from flight_analysis.design.response_identification import MIN_RATIO
-from flight_analysis.design.sign_check import SignCheck, check_scenario, motion_as_channel_grows
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
+from flight_design.identification.response_identification import MIN_RATIO
+from flight_design.identification.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 
 CONTRADICTS = 1
 

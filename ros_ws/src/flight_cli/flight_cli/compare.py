@@ -15,21 +15,22 @@ from rich.table import Table
 
 from aircraft_sim.uncertainty import WindEffect
 from control_laws.catalogue import LAWS, Law
-from flight_analysis.closed_loop.margins import loop_assessment, scenario_loop
+from flight_analysis.closed_loop.loop_margins import loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.design.gain_selection import section_yaml
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.summary import display_units, finite_or_null
-from flight_bringup.scenarios import find_scenario
-from flight_campaign import law_comparison, registered_laws, tuned_controller, tuned_gains
+from flight_campaign import law_comparison, registered_laws, tuned_controller
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
 from flight_campaign.law_margins import has_margins
-from flight_campaign.tuned_gains import TuningResult
 from flight_campaign.tuning import Benchmark
 from flight_cli.output import COUNT_COLUMNS, LICENCE, new_table, parse_numbers, progress_bar, write_text
 from flight_core.files import display_path
 from flight_core.parameters import require
+from flight_design.gains import tuned_gains
+from flight_design.gains.gain_selection import section_yaml
+from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig
 

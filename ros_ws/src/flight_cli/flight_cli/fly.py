@@ -10,12 +10,12 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from flight_analysis.closed_loop.learning import Learn
+from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
+from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.report.run_folder import new_run, remove_empty, write_empty_summary, write_report
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits, second_stage
-from flight_bringup.scenarios import find_scenario, with_route, written
 from flight_cli.output import (
     flight_progress,
     print_json,
@@ -169,7 +169,7 @@ def _require_flyable(scenario: Scenario, autopilot: Autopilot | None, *, in_proc
         require_ros_environment()
     second_stage(scenario, bridge=autopilot is not None)
     if autopilot is not None:
-        from flight_analysis.design.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
+        from flight_design.identification.sign_check import require_signs  # noqa: PLC0415 - loads SciPy, which few flights need
 
         require_signs(autopilot.channel_map, scenario)
         require_limits(autopilot, scenario)
@@ -179,6 +179,6 @@ def _learner(scenario: Scenario) -> Learn | None:
     """The learner of a scenario, for a flight in one process. Raises ParameterError for one that cannot learn."""
     if not scenario.learns():
         return None
-    from rise_di.learning import learner  # noqa: PLC0415 - loads SciPy, which few flights need
+    from flight_design.learning.scenario_learner import learner  # noqa: PLC0415 - loads SciPy, which few flights need
 
     return learner(scenario)

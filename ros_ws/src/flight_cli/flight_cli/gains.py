@@ -11,22 +11,22 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_analysis.closed_loop.margins import linear_loop
-from flight_analysis.design import gain_selection
-from flight_analysis.design.airframe_properties import airframe_facts, marginal_sentence
-from flight_analysis.design.gain_conditions import Condition, failing
-from flight_analysis.design.gain_selection import GainAssessment, Selection, Study
-from flight_analysis.design.requirement import PHASE_MARGIN
-from flight_analysis.design.trade import trade
+from flight_analysis.closed_loop.loop_margins import linear_loop
 from flight_analysis.report.html import write_loop_page
-from flight_analysis.report.margins import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
+from flight_analysis.report.margin_figures import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import LICENCE, new_table, options, parse_numbers, print_json, write_text
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
-from rise_di.gain_design import check_gains, select_gains
+from flight_design.gains import gain_selection
+from flight_design.gains.airframe_properties import airframe_facts, marginal_sentence
+from flight_design.gains.gain_conditions import Condition, failing
+from flight_design.gains.gain_design import check_gains, select_gains
+from flight_design.gains.gain_selection import GainAssessment, Selection, Study
+from flight_design.gains.requirement import PHASE_MARGIN
+from flight_design.gains.trade import trade
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1

@@ -18,14 +18,6 @@ from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STA
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design.bridge_identification import AMPLITUDE
-from flight_analysis.design.gain_selection import ChannelPairing
-from flight_analysis.design.identification import IdentifiedAircraft, manoeuvre_result
-from flight_analysis.design.identification import identify as identify_aircraft
-from flight_analysis.design.innovation_filters import Actuation, recording
-from flight_analysis.design.model_identification import Identification, model_yaml
-from flight_analysis.design.model_identification import identify as identify_model
-from flight_analysis.design.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_analysis.metrics import mask_spans
 from flight_analysis.report.figures import ERROR, GUST, PLANT
 from flight_analysis.report.html import Line, Page, Section, page_html
@@ -50,8 +42,16 @@ from flight_core.parameters import ParameterError, require, require_channels
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import si_per_unit
+from flight_design.gains.gain_design import observed
+from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
+from flight_design.identification.bridge_identification import AMPLITUDE
+from flight_design.identification.innovation_filters import Actuation, recording
+from flight_design.identification.model_identification import Identification, model_yaml
+from flight_design.identification.model_identification import identify as identify_model
+from flight_design.identification.step_identification import IdentifiedAircraft, manoeuvre_result
+from flight_design.identification.step_identification import identify as identify_aircraft
 from flight_log.tape_reader import read_run
-from rise_di.gain_design import observed
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3

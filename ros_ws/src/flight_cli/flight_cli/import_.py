@@ -11,12 +11,12 @@ import typer
 from rich.console import Console
 
 from autopilot_bridge.params import UNITS, find_map, load_map
-from flight_analysis.design.log_import import PARAMETERS, Window, imported
 from flight_analysis.report.run_folder import PROVENANCE
 from flight_cli.output import new_table, options
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
+from flight_design.identification.log_import import PARAMETERS, Window, imported
 from flight_log.bag import CHANNEL_UNITS, COMPARED, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
 from flight_log.tape_writer import write_run

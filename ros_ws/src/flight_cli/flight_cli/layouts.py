@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler, rviz, urdf
 from flight_bringup.fleet import read_fleet
-from flight_bringup.scenarios import find_scenario
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
 

@@ -16,8 +16,8 @@ from flight_cli.output import LATEST, entries_as_json, entry_table, model_table,
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_core.text import printable
+from flight_design.learning.scenario_learner import learn_again, learned_yaml
 from flight_log.tape_reader import read_run
-from rise_di.learning import learn_again, learned_yaml
 
 NOTHING_LEARNED = 1
 

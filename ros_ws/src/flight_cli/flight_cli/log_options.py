@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
-from flight_bringup.scenarios import find_scenario
 from flight_core.parameters import ParameterError
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from flight_analysis.closed_loop.learning import Entry
+from flight_analysis.closed_loop.learning_loop import Entry
 from flight_analysis.report.guided import leg_results
 from flight_analysis.report.summary import (
     ERROR_COLUMNS,

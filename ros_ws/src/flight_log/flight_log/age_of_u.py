@@ -10,7 +10,7 @@ from rosbags.serde.errors import SerdeError
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_log.learning import DIAGNOSTIC_ARRAY
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY
 from flight_log.named_vectors import typestore
 
 DIAGNOSTICS = "/diagnostics"

@@ -21,6 +21,7 @@ from flight_core.arithmetic import ARITHMETIC
 STACK = (
     "aircraft_sim",
     "autopilot_bridge",
+    "c_export",
     "control_laws",
     "flight_analysis",
     "flight_bringup",
@@ -32,7 +33,7 @@ STACK = (
     "flight_ros",
     "flight_view",
     "flight_guidance",
-    "flight_learner",
+    "flight_design",
     "reference_model",
     "rise_di",
     "rise_di_controller",

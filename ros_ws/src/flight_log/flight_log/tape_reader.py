@@ -20,7 +20,7 @@ from flight_core.files import is_file, is_folder, parse_yaml, read_file
 from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
-from flight_core.scenario import A_SCENARIO
+from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
@@ -31,7 +31,7 @@ from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagement
 from flight_log.flight_processes import INSTANCE, LOG, READY, ROSOUT, UNNAMED, Span, flight_processes, ready_times
 from flight_log.latency import TOPICS as TIMED_TOPICS
 from flight_log.latency import Times, latency
-from flight_log.learning import DIAGNOSTIC_ARRAY
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY
 from flight_log.named_vectors import (
     JOINT_STATE,
     PATH,

@@ -12,7 +12,7 @@ from flight_core.files import writing
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_log.bag import OUTCOME, BagChannel, BagWriter, LogAttachments
-from flight_log.learning import DIAGNOSTIC_ARRAY, LEARNING, learning_message
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, learning_message
 from flight_log.named_vectors import JOINT_STATE, Samples, encoded
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_event
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from flight_core.rates import NANOSECONDS
-from flight_view.flight import POSE, Event, Flight
+from flight_view.flight import POSE, Flight, PageEvent
 from flight_view.series import Series
 
 
@@ -15,7 +15,7 @@ class Fleet:
 
     def __init__(self, flights: Sequence[Flight]) -> None:
         self.flights = flights
-        self.events: list[Event] = []
+        self.events: list[PageEvent] = []
         self.bands: Mapping[str, float] = {}
         self.models: Mapping[str, Any] = {}
 

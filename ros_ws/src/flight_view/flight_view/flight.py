@@ -35,7 +35,7 @@ from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
-from flight_log.learning import DIAGNOSTIC_ARRAY, LEARNING, told
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, told
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
@@ -85,7 +85,7 @@ MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
 SILENT = 1.0  # s without a sample after which the state is "no data"
 
 
-class Event(NamedTuple):
+class PageEvent(NamedTuple):
     """An event of the flight. `stamp_ns` as in the samples, or by the clock of the host."""
 
     stamp_ns: int
@@ -130,7 +130,7 @@ class Flight:
         self.run = run
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
-        self.events: list[Event] = []
+        self.events: list[PageEvent] = []
         modes = {"": Mode, "mode": guidance.Mode, "mode.lateral": guidance.Lateral, "mode.vertical": guidance.Vertical}
         # What a page shows beside the samples, ready for JSON: the names of modes; `_described` once the scenario is read.
         self.description: dict[str, Any] = {
@@ -407,7 +407,7 @@ class Flight:
         for k in changes.tolist():
             number = modes[k]
             known = number in set(Mode)
-            self._add_event(Event(int(stamp_ns[k]), "mode", Mode(int(number)).name if known else f"mode {number:g}"))
+            self._add_event(PageEvent(int(stamp_ns[k]), "mode", Mode(int(number)).name if known else f"mode {number:g}"))
         self._mode = modes[-1]
 
     def _take_events(self, messages: Messages) -> None:
@@ -424,9 +424,9 @@ class Flight:
             if messages.type_name == LOG_TYPE:
                 if message.level >= WARN:
                     kind = "warning" if message.level == WARN else "error"
-                    self._add_event(Event(sent_ns, kind, f"{message.name}: {message.msg}"))
+                    self._add_event(PageEvent(sent_ns, kind, f"{message.name}: {message.msg}"))
                 elif message.name.rpartition(".")[2] == CONTROL:
-                    self._add_event(Event(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: ")))
+                    self._add_event(PageEvent(sent_ns, CONTROL, message.msg.removeprefix(f"{CONTROL}: ")))
             elif messages.type_name == PARAMETER_EVENT:
                 # Before the first sample, starting nodes declare parameters.
                 new = message.new_parameters if self._first_ns is not None else []
@@ -434,17 +434,17 @@ class Flight:
                 text = ", ".join(f"{name} = {_shown(value)}" for name, value in changed.items())
                 namespace, _, node = message.node.rpartition("/")
                 if text and self._shows(namespace):
-                    self._add_event(Event(sent_ns, "parameter", f"{node}: {text}"))
+                    self._add_event(PageEvent(sent_ns, "parameter", f"{node}: {text}"))
             elif messages.type_name == DIAGNOSTIC_ARRAY:
                 stamp_ns, sentence = told(message)
-                self._add_event(Event(stamp_ns, LEARNING, sentence))
+                self._add_event(PageEvent(stamp_ns, LEARNING, sentence))
             elif messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
                     continue
                 places = [stamped.pose.position for stamped in message.poses]
                 self._take_route(sent_ns, [Waypoint(place.y, place.x, place.z) for place in places])
             else:
-                self._add_event(Event(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
+                self._add_event(PageEvent(sent_ns, "bridge", f"{message.key} {message.value}".strip()))
 
     def _take_route(self, sent_ns: int, waypoints: Sequence[Waypoint]) -> None:
         """A route received in flight replaces the route before, unless guidance refuses the new route."""
@@ -456,9 +456,9 @@ class Flight:
         except ParameterError:
             return  # guidance says so in the log
         self.described += 1
-        self._add_event(Event(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
+        self._add_event(PageEvent(sent_ns, ROUTE, f"{len(waypoints)} waypoints"))
 
-    def _add_event(self, event: Event) -> None:
+    def _add_event(self, event: PageEvent) -> None:
         if len(self.events) < MAX_EVENTS:
             self.events.append(event._replace(text=_text(event.text)))
         else:

@@ -90,30 +90,30 @@ __all__ = [
 
 if TYPE_CHECKING:  # for type checkers and completion; a test compares these imports with HOMES
     from aircraft_sim.airframe import Airframe, airframes, load_airframe
-    from flight_analysis.closed_loop.margins import LoopMargins, margins
+    from flight_analysis.closed_loop.loop_margins import LoopMargins, margins
     from flight_analysis.closed_loop.replay import ReplayResult, recorded_scenario, replay
     from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
+    from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
     from flight_analysis.closed_loop.simulate import simulate
-    from flight_analysis.design.airframe_properties import airframe_facts
-    from flight_analysis.design.gain_selection import GainAssessment, Selection
-    from flight_analysis.design.gain_selection import as_yaml as gains_yaml
     from flight_analysis.metrics import best_error, error_metrics
     from flight_analysis.report.data_frame import data_frame
     from flight_analysis.report.report import Report, report
     from flight_analysis.report.run_folder import FlightResult
     from flight_analysis.report.summary import RecordedFlight, summarise
     from flight_bringup.fly import fly_and_report as fly
-    from flight_bringup.scenarios import find_scenario, scenarios
     from flight_core.fields import Field
     from flight_core.parameters import NonNegatives, ParameterError, Positives, require_length
     from flight_core.tape import Signal, Tape
     from flight_core.vectors import Array, StampedVector, array_namespace
+    from flight_design.gains.airframe_properties import airframe_facts
+    from flight_design.gains.gain_design import check_gains, select_gains
+    from flight_design.gains.gain_selection import GainAssessment, Selection
+    from flight_design.gains.gain_selection import as_yaml as gains_yaml
+    from flight_design.learning.scenario_learner import learner
     from flight_log.tape_reader import RecordedRun, read_run
     from rise_di.c_code import Exported, export
     from rise_di.campaigns import CampaignResult, fly_campaign, resume_campaign
     from rise_di.flight_env import FlightEnv, FlightVectorEnv
-    from rise_di.gain_design import check_gains, select_gains
-    from rise_di.learning import learner
     from rise_di.own_airframe import NewAirframe, new_airframe
     from rise_di.own_loop import Loop, as_control, fly_plant
     from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, without_limits
@@ -123,26 +123,26 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from rise_di_controller.laws import names as laws
     from rise_di_controller.laws import schema as law_schema
     from rise_di_controller.params import ControllerConfig
-    from rise_di_controller.rise_di import RiseDiConfig
+    from rise_di_controller.rise_di_config import RiseDiConfig
     from rise_di_controller.saturation import Limits, limited_integral, saturate
 
     __version__: str
 else:  # type checkers would take a module with __getattr__ to have any name
     HOMES = {
         "aircraft_sim.airframe": ("Airframe", "airframes", "load_airframe"),
-        "flight_analysis.closed_loop.margins": ("LoopMargins", "margins"),
+        "flight_analysis.closed_loop.loop_margins": ("LoopMargins", "margins"),
         "flight_analysis.closed_loop.replay": ("ReplayResult", "recorded_scenario", "replay"),
         "flight_analysis.closed_loop.scenario": ("Scenario", "scenario_yaml"),
         "flight_analysis.closed_loop.simulate": ("simulate",),
-        "flight_analysis.design.airframe_properties": ("airframe_facts",),
-        "flight_analysis.design.gain_selection": ("GainAssessment", "Selection", "as_yaml as gains_yaml"),
+        "flight_design.gains.airframe_properties": ("airframe_facts",),
+        "flight_design.gains.gain_selection": ("GainAssessment", "Selection", "as_yaml as gains_yaml"),
         "flight_analysis.metrics": ("best_error", "error_metrics"),
         "flight_analysis.report.data_frame": ("data_frame",),
         "flight_analysis.report.report": ("Report", "report"),
         "flight_analysis.report.run_folder": ("FlightResult",),
         "flight_analysis.report.summary": ("RecordedFlight", "summarise"),
         "flight_bringup.fly": ("fly_and_report as fly",),
-        "flight_bringup.scenarios": ("find_scenario", "scenarios"),
+        "flight_analysis.closed_loop.scenario_library": ("find_scenario", "scenarios"),
         "flight_core.fields": ("Field",),
         "flight_core.parameters": ("NonNegatives", "ParameterError", "Positives", "require_length"),
         "flight_core.tape": ("Signal", "Tape"),
@@ -151,8 +151,8 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "rise_di.c_code": ("Exported", "export"),
         "rise_di.campaigns": ("CampaignResult", "fly_campaign", "resume_campaign"),
         "rise_di.flight_env": ("FlightEnv", "FlightVectorEnv"),
-        "rise_di.gain_design": ("check_gains", "select_gains"),
-        "rise_di.learning": ("learner",),
+        "flight_design.gains.gain_design": ("check_gains", "select_gains"),
+        "flight_design.learning.scenario_learner": ("learner",),
         "rise_di.own_airframe": ("NewAirframe", "new_airframe"),
         "rise_di.own_loop": ("Loop", "as_control", "fly_plant"),
         "rise_di_controller.control_law": ("ControlLaw", "Measurements", "TunedLaw", "without_limits"),
@@ -161,7 +161,7 @@ else:  # type checkers would take a module with __getattr__ to have any name
         "rise_di_controller.law": ("LawParams", "LawState", "Sign", "engage", "step"),
         "rise_di_controller.laws": ("names as laws", "schema as law_schema"),
         "rise_di_controller.params": ("ControllerConfig",),
-        "rise_di_controller.rise_di": ("RiseDiConfig",),
+        "rise_di_controller.rise_di_config": ("RiseDiConfig",),
         "rise_di_controller.saturation": ("Limits", "limited_integral", "saturate"),
     }
     """The names by the module that holds each, as an import statement has them."""

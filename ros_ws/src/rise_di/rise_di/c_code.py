@@ -6,19 +6,19 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from flight_analysis.c_export.constants import exportable
-from flight_analysis.c_export.drawn import drawn_calls, drawn_steps
-from flight_analysis.c_export.events import Recording, flight_recordings, parameter_sets, run_recording
-from flight_analysis.c_export.library import build_fmu
-from flight_analysis.c_export.proof import FMU, REPORT, Proof, compilers, prove, report, write_code
+from c_export.constants import exportable
+from c_export.drawn import drawn_calls, drawn_steps
+from c_export.events import Recording, flight_recordings, parameter_sets, run_recording
+from c_export.library import build_fmu
+from c_export.proof import FMU, REPORT, Proof, compilers, prove, report, write_code
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_bringup.scenarios import find_scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.parameters import require
 from flight_core.text import printable
 from flight_log.tape_reader import RecordedRun, read_run
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 PART = 50_000  # drawn steps of a recording
 LONGEST = 20.0  # s, of a flight without a duration

@@ -185,13 +185,13 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
 
     def __init__(self, scenario: Scenario, num_envs: int, uncertainty: float = 0.3) -> None:
-        from flight_campaign import fleet  # noqa: PLC0415 - JAX, a second to load
+        from flight_campaign import batch  # noqa: PLC0415 - JAX, a second to load
 
         self.scenario = as_scenario(scenario)
         self.num_envs = as_count(num_envs, "num_envs", 1)
         self._uncertainty = as_number(uncertainty, "uncertainty", 0.0, 1.0)
         plain = _without_models(self.scenario)
-        self._course, self._vehicle, self._fleet = build_course(plain), fleet.vehicle(plain), fleet
+        self._course, self._vehicle, self._fleet = build_course(plain), batch.vehicle(plain), batch
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)

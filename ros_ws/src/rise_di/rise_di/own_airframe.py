@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 from numpy.typing import ArrayLike
 
 from aircraft_sim.airframe import Airframe
+from aircraft_sim.airframe_import import Named, import_airframe
 from aircraft_sim.uncertainty import as_yaml
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.design import first_flight, gain_selection
-from flight_analysis.design.airframe_import import Named, import_airframe
 from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError, require
-from rise_di.gain_design import lags_by_input, select_gains
+from flight_design.gains import first_flight, gain_selection
+from flight_design.gains.gain_design import lags_by_input, select_gains
 
 SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
 CLEAR = 0.9  # part of an end stop that u reaches at most

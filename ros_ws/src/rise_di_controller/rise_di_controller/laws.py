@@ -14,7 +14,7 @@ from typing import Any
 
 from flight_core.parameters import ParameterError, require
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 GROUP = "rise_di_controller.laws"
 DEFAULT = "rise_di"

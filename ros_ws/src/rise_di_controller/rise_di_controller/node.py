@@ -26,9 +26,9 @@ from flight_ros.ticker import Tick
 from flight_ros.topics import AUTHORITY, INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
-from rise_di_controller.learning import AUTHORITY_TICKS, REFUSED, Event, Learning, Proposal, authority_names
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import AUTHORITY_TICKS, REFUSED, Event, Learning, Proposal, authority_names
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 BEHIND_NS = 1_000_000
 """From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have

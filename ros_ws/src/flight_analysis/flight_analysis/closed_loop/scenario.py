@@ -16,14 +16,14 @@ from flight_core.fields import Field, short_repr
 from flight_core.files import dump_yaml, read_file
 from flight_core.parameters import Config, ParameterError, one_of, require, require_channels
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
-from flight_core.scenario import A_SCENARIO, Sections, parse_sections
+from flight_core.scenario_file import A_SCENARIO, Sections, parse_sections
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.zones import described
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 RECORDER_RATE = 100.0  # Hz, of a scenario without the section `recorder`: that of the shipped scenarios
 STOP_TOLERANCE = 1e-3  # relative: files hold limits and end stops with few digits

@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 
 from aircraft_sim.simulator import Simulator
-from flight_analysis.closed_loop.learning import Learn, LearningLoop
+from flight_analysis.closed_loop.learning_loop import Learn, LearningLoop
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario, require_guidable
 from flight_core.channels import ATTITUDE, POSE
 from flight_core.outcome import COMPLETED, INTERRUPTED, FlightEnded
@@ -21,9 +21,9 @@ from flight_guidance.guidance import Guidance
 from flight_guidance.params import GuidanceConfig
 from reference_model.reference import Reference
 from rise_di_controller.controller import Controller
-from rise_di_controller.learning import AUTHORITY_TICKS, Event, authority_names
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.rise_di import RiseDiConfig
+from rise_di_controller.proposals import AUTHORITY_TICKS, Event, authority_names
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 Record = Callable[[Mapping[str, Signal]], None]
 """Takes the samples of a part of a flight, by topic."""

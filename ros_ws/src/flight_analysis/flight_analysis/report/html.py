@@ -13,11 +13,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from flight_analysis.closed_loop.margins import LinearLoop, loop_assessment, scenario_loop
+from flight_analysis.closed_loop.loop_margins import LinearLoop, loop_assessment, scenario_loop
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.report import comparison, figures, guided_figures, margins, plotting, tables
+from flight_analysis.report import comparison, figures, guided_figures, margin_figures, plotting, tables
 from flight_analysis.report.plotting import Curve, Figure, SampleStore, pack, time_series_figure
-from flight_analysis.report.replay import Replay, replay
+from flight_analysis.report.replay_scene import Replay, replay
 from flight_analysis.report.summary import (
     INPUT_COLUMNS,
     QUANTITY_UNITS,
@@ -94,7 +94,7 @@ def _write(path: Path, page: Page) -> None:
 
 def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
     """Write a page of a linear loop that need not have flown: margins, Bode and Nyquist plot."""
-    table = margins.margin_table(loop_assessment(loop))
+    table = margin_figures.margin_table(loop_assessment(loop))
     _write(path, Page(title, [], [TableGroup([table])], _loop_sections(loop), SampleStore()))
 
 
@@ -135,7 +135,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
                 flight.summary["outcome"],
             )
         ],
-        [TableGroup([*of_flight, *([] if loop is None else [margins.margin_table(loop_assessment(loop))])])],
+        [TableGroup([*of_flight, *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))])])],
         [*_sections(flight, scenario, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,
         flight.summary["notes"],
@@ -232,11 +232,11 @@ def _linear_loop(scenario: Scenario) -> LinearLoop | None:
 def _loop_sections(loop: LinearLoop) -> list[Section]:
     hint = f"L at each input, the other inputs closed: the sampled loop with actuators, delay and hold; {loop.model}"
     return [
-        Section("Bode plot of the loop", hint, margins.bode_figure(loop), over_time=False),
+        Section("Bode plot of the loop", hint, margin_figures.bode_figure(loop), over_time=False),
         Section(
             "Nyquist plot of the loop",
             "Inside the circle around -1 the sensitivity is above 2.",
-            margins.nyquist_figure(loop),
+            margin_figures.nyquist_figure(loop),
             over_time=False,
         ),
     ]

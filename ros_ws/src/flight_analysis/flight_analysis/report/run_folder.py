@@ -21,7 +21,7 @@ from flight_core.files import dump_yaml, read_file, write_file, writing
 from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
-from flight_core.scenario import A_SCENARIO
+from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Tape
 from flight_core.text import bounded, printable
 from flight_log.bag import CHANNEL_UNITS, IMPORTED, OUTCOME_FILE, LogAttachments

@@ -208,7 +208,7 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     controller = scenario.controller
     if age is None or age.mean - controller.delay < 1.0 / controller.rate:
         return []
-    from flight_analysis.closed_loop.margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
+    from flight_analysis.closed_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
     try:
         of = scenario_loop(scenario, controller)

@@ -76,7 +76,7 @@ class Table(NamedTuple):
         return [not group or group != before for group, before in zip(groups, [None, *groups], strict=False)]
 
 
-class Event(NamedTuple):
+class Interval(NamedTuple):
     """A gust, a failsafe mode, a saturation or a still vane, from the first to the last instant in s."""
 
     name: str
@@ -95,7 +95,7 @@ def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.b
     return still
 
 
-def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Event]:
+def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list[Interval]:
     """Gusts, modes but ENGAGED, saturations of the inputs, and still vanes, in order of the start.
 
     The scenario comes from the tape; the tape of a log has no scenario and needs the argument.
@@ -106,7 +106,7 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
     for label, group in groupby(intervals, key=lambda interval: interval.label):
         spans = [(interval.start, interval.stop) for interval in group]
         times = f", {len(spans)} times" if len(spans) > 1 else ""
-        listed.append(Event(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
+        listed.append(Interval(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
     if "internals" in tape:
         limited, t = tape["internals"].group("limited"), tape.time("internals")
         for name, kind in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
@@ -114,18 +114,20 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
             if saturated.any():
                 first, last = t[saturated][[0, -1]]
                 extent = f"{saturated.sum()} of {len(saturated)} ticks"
-                listed.append(Event(f"{name} saturated: {kind.name.lower()}", first, last, extent))
+                listed.append(Interval(f"{name} saturated: {kind.name.lower()}", first, last, extent))
         measures = tape["internals"].group("vane_measures")
         observer = flown.controller.observer if isinstance(flown, Scenario) else None
         time = 0.0 if observer is None or observer.vanes is None else observer.vanes.time
         for name in measures.names:
             if (still := _stands_still(measures[name], tape, time)).any():
                 first, last = t[still][[0, -1]]
-                listed.append(Event(f"vane {name} stands still: left out", first, last, f"{still.sum()} of {len(still)} ticks"))
+                listed.append(
+                    Interval(f"vane {name} stands still: left out", first, last, f"{still.sum()} of {len(still)} ticks")
+                )
     return sorted(listed, key=lambda event: event.start)
 
 
-def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Event]) -> list[Table]:
+def flight_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit], event_list: Sequence[Interval]) -> list[Table]:
     """Tables of the error, the inputs, the events and the ticks; a table without rows is left out."""
     inputs = (*columns_of(INPUT_COLUMNS, summary["inputs"]), SATURATION_COLUMN)
     times = [Column("", head) for head in ("from (s)", "to (s)", "")]

@@ -32,9 +32,9 @@ from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario
+from flight_analysis.closed_loop.scenario_library import scenarios
 from flight_bringup.graph import AIRCRAFT, LEAD, LEARNER, NodeSpec, start_instant, start_lead
 from flight_bringup.processes import FIRST_U, LOG_TIMEOUT, READY_TIMEOUT, end_with_parent, leave_outcome
-from flight_bringup.scenarios import scenarios
 from flight_core.outcome import COMPLETED, INTERRUPTED, NEVER_FLEW, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import BagWriter, LogAttachments

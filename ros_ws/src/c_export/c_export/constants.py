@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of a controller as constants of C: the header rise_di_parameters.h, and the bytes of struct rise_di_parameters."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from flight_core.arithmetic import INVERSE_PI, MAX_ANGLE, PI_HIGH, PI_LOW, SINE_COEFFICIENTS
+from flight_core.parameters import require
+from flight_core.rates import seconds
+from flight_core.vectors import FloatArray
+from rise_di_controller import samples
+from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS
+from rise_di_controller.guard import DT_RANGE, MIN_SLOPE_SPAN, SAMPLE_BUFFER_SIZE
+from rise_di_controller.observer import ObserverParams
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.saturation import Limits
+from rise_di_controller.schedule import ScheduleParams, airspeed_range
+
+SCALARS = frozenset({"period", "dt_least", "dt_largest", "speed", "time", "V_least", "V_largest", "fade_rate"})
+"""Reals that are no list."""
+
+
+class Constant(NamedTuple):
+    """A member of struct rise_di_parameters: whole numbers (int, tuple) or reals (array), of a matrix row by row."""
+
+    name: str
+    value: int | tuple[int, ...] | FloatArray
+
+
+class Sizes(NamedTuple):
+    """Dimensions of the exported controller; 0 without an allocation, a feedforward or an observer."""
+
+    m: int  # channels
+    p: int  # effectors of the allocation
+    n: int  # states of the nominal model
+    s: int  # estimates
+    schedule: bool
+
+
+def exportable(controller: ControllerConfig) -> RiseDiConfig:
+    """The controller, under RISE-DI. Raises ParameterError for a different law, and for models that are learned or off."""
+    require(isinstance(controller, RiseDiConfig), "controller.law", controller.law, "rise_di: C code exists for this law alone")
+    assert isinstance(controller, RiseDiConfig)  # noqa: S101 - for the type checker
+    require(not controller.vanes, "controller.observer.vanes", "a section", "none: the C code has the observer of y alone")
+    require(controller.learn is None, "controller.learn", "a section", "none: C code replaces no model in flight")
+    at_trim = controller.schedule is None or not controller.schedule.models
+    require(at_trim, "controller.schedule", "models at other speeds", "none: the C code has those of the trim speed")
+    flies = controller.observer is None or controller.observer.part > 0.0
+    require(flies, "controller.observer.part", 0.0, "more than 0, or no feedforward and no observer")
+    some = controller.feedforward is not None and controller.feedforward.inputs is not None
+    require(not some, "controller.feedforward.inputs", "a list", "none: the C code has a feedforward of all inputs")
+    return controller
+
+
+def sizes(controller: RiseDiConfig) -> Sizes:
+    """Dimensions of a controller."""
+    n = 0 if controller.feedforward is None else len(controller.feedforward.states)
+    s = 0 if controller.observer is None else len(controller.observer.states)
+    p = 0 if controller.allocation is None else len(controller.allocation.effectors)
+    return Sizes(len(controller.outputs), p, n, s, controller.schedule is not None)
+
+
+def constants(controller: RiseDiConfig) -> list[Constant]:
+    """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no limit."""
+    guard, law = controller.guard(), controller.law_params()
+    of_law = controller.tuned_law().params
+    period = seconds(guard.period_ns)
+    whole: dict[str, int | tuple[int, ...]] = {
+        "digest": controller.digest(),
+        "period_ns": guard.period_ns,
+        "max_age_ns": guard.max_age_ns,
+        "hold_ns": guard.hold_ns,
+        "ramp_ns": guard.ramp_ns,
+        "slope_ns": math.ceil(MIN_SLOPE_SPAN * guard.period_ns),
+        "deactivation_holds": int(guard.deactivation_holds),
+        "sign": int(controller.sampled_sign()[0]),
+    }
+    reals: dict[str, ArrayLike] = {"period": period, "dt_least": DT_RANGE[0] * period, "dt_largest": DT_RANGE[1] * period}
+    reals |= {name: getattr(law, name) for name in ("K", "Lambda", "beta", "D", "input_scale", "omega", "eps")}
+    reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
+    reals |= _limits("limits", guard.limits)
+    if (allocation := guard.allocation) is not None:
+        whole["order"] = allocation.order
+        reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
+        reals |= _limits("stops", allocation.limits)
+    if isinstance(of_law, ScheduleParams):
+        least, largest = airspeed_range(of_law)
+        reals |= {"speed": of_law.speed, "airspeed": of_law.airspeed, "time": of_law.time}
+        reals |= {"V_least": least, "V_largest": largest}
+    if guard.nominal is not None:
+        names = ("A", "B", "C", "gravity", "inverse", "path_A", "path_gravity", "lead")
+        reals |= {name: getattr(guard.nominal, name) for name in names}
+        reals["has_sine"] = guard.nominal.gravity.any(axis=0)
+    if isinstance(of_law, ObserverParams):
+        reals |= {name: getattr(of_law, name) for name in ("Phi", "Gamma", "H", "L", "F")}
+        reals |= _limits("observer_limits", of_law.limits) | {"fade_rate": of_law.fade_rate}
+    arrays = [Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()]
+    return [*(Constant(name, value) for name, value in whole.items()), *arrays]
+
+
+def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:
+    return {f"{name}.{key}": getattr(limits, key) for key in ("lower", "upper", "rate")}
+
+
+def packed(controller: RiseDiConfig, *, float32: bool) -> bytes:
+    """The bytes of struct rise_di_parameters: whole numbers of 64 bits, then the reals without a gap, filled to 8 bytes."""
+    real = np.float32 if float32 else np.float64
+    content = b"".join(
+        _finite(value, real).astype(real).tobytes() if isinstance(value, np.ndarray) else np.array(value, np.int64).tobytes()
+        for _, value in constants(controller)
+    )
+    return content + bytes(-len(content) % 8)
+
+
+def _finite(values: FloatArray, real: type[np.floating]) -> FloatArray:
+    """The values, with the largest number of the type in place of infinity."""
+    largest = float(np.finfo(real).max)
+    return np.clip(values, -largest, largest)
+
+
+def header(controller: RiseDiConfig, scenario: str, *, float32: bool) -> str:
+    """The text of rise_di_parameters.h."""
+    m, p, n, s, schedule = sizes(controller)
+    suffix = "F" if float32 else ""
+    real = np.float32 if float32 else np.float64
+
+    def numbers(value: FloatArray) -> str:
+        return ", ".join(f"{float(real(x)).hex()}{suffix}" for x in _finite(value, real))
+
+    members = [f"    /* {name} */ {_initialiser(name, value, numbers)}" for name, value in constants(controller)]
+    single = {"MAX_ANGLE": MAX_ANGLE, "INVERSE_PI": INVERSE_PI, "PI_HIGH": PI_HIGH, "PI_LOW": PI_LOW}
+    single |= {"RELAXATION": RELAXATION, "EXCHANGE_LEAST": SMALL, "TIMES": samples.TIMES, "MEMORY": samples.MEMORY}
+    lines = [
+        "/* SPDX-FileCopyrightText: RISE-DI contributors",
+        " * SPDX-License-Identifier: Apache-2.0",
+        " *",
+        f" * Parameters of the controller of {scenario}, written by `rise-di export`. rise_di.h has units and meaning.",
+        f" * y and y_m: {_comment(controller.outputs)}; u: {_comment(controller.effectors)}; {controller.rate:g} Hz.",
+        " */",
+        "#ifndef RISE_DI_PARAMETERS_H",
+        "#define RISE_DI_PARAMETERS_H",
+        "",
+        f"#define RISE_DI_OUTPUTS {_strings(controller.outputs)}",
+        f"#define RISE_DI_INPUTS {_strings(controller.inputs)}",
+        *([f"#define RISE_DI_EFFECTORS {_strings(controller.effectors)}"] if p else []),
+        f"#define RISE_DI_M {m} /* channels */",
+        f"#define RISE_DI_P {p} /* effectors of the allocation, 0: no allocation */",
+        f"#define RISE_DI_N {n} /* states of the feedforward's model, 0: no feedforward */",
+        f"#define RISE_DI_S {s} /* estimates of the observer, 0: no observer */",
+        f"#define RISE_DI_SCHEDULE {int(schedule)} /* 1: input_scale follows the dynamic pressure */",
+        f"#define RISE_DI_FLOAT32 {int(float32)} /* 0: rise_di_real is double, 1: float */",
+        f"#define RISE_DI_SAMPLES {SAMPLE_BUFFER_SIZE} /* samples kept of y and of y_m */",
+        f"#define RISE_DI_AGREEING {samples.AGREEING} /* samples in a row after a jump of y */",
+        f"#define RISE_DI_FIRST_NS {samples.FIRST_NS} /* after the first y, in which it may jump */",
+        *(f"#define RISE_DI_{name} {numbers(np.array([value]))}" for name, value in single.items()),
+        f"#define RISE_DI_SWEEPS {SWEEPS}",
+        f"#define RISE_DI_HALVINGS {HALVINGS}",
+        f"#define RISE_DI_SINE_COEFFICIENTS {{{numbers(np.array(SINE_COEFFICIENTS))}}}",
+        "",
+        "#define RISE_DI_PARAMETERS { \\",
+        ", \\\n".join(members) + " \\",
+        "}",
+        "",
+        "#endif",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: Callable[[FloatArray], str]) -> str:
+    """A number, a list in braces; the first and the last list of a nested struct open and close the braces of the struct."""
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, tuple):
+        return f"{{{', '.join(map(str, value))}}}"
+    if name in SCALARS:
+        return numbers(value)
+    begin, end = name.endswith(".lower"), name.endswith(".rate")
+    return f"{'{' * begin}{{{numbers(value)}}}{'}' * end}"
+
+
+def _strings(names: tuple[str, ...]) -> str:
+    """String literals of C; a character other than a letter, a digit or one of "_. " as the octal escape of each of its bytes.
+
+    Of names from a parameter set none has such a character.
+    """
+    return ", ".join(f'"{"".join(map(_octal, name))}"' for name in names)
+
+
+def _octal(character: str) -> str:
+    plain = character.isascii() and (character.isalnum() or character in "_. ")
+    return character if plain else "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "surrogatepass"))
+
+
+def _comment(names: tuple[str, ...]) -> str:
+    """Names in a comment of C, with the escapes of `_strings`: none ends the comment."""
+    return ", ".join("".join(map(_octal, name)) for name in names)

@@ -1,0 +1,203 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Drawn inputs for the proof: calls of a controller with any timing, and single steps from any state."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from c_export.events import GUARD_TICK, LOAD, START, Recorder, Recording, event_type, real_groups
+from flight_core.modes import Mode
+from flight_core.rates import NANOSECONDS, seconds
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from rise_di_controller import feedforward
+from rise_di_controller.allocation import Allocation, allocate, reached
+from rise_di_controller.control_law import Measurements, fields, restored
+from rise_di_controller.feedforward import FeedforwardState
+from rise_di_controller.guard import DT_RANGE
+from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.saturation import saturate
+
+EPOCH_NS = 1_795_000_000_000_000_000  # start of the drawn stamps: float64 does not resolve 1 ns there
+
+
+def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recording:
+    """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new parameters, deactivation."""
+    rng, controller = np.random.default_rng(seed), sets[0]
+    m, period_ns = len(controller.outputs), controller.guard().period_ns
+    unit = controller.law_params().eps
+    schedule = controller.schedule
+    airspeed = np.array([0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs])
+    recorder, now_ns = Recorder(sets), EPOCH_NS
+    y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
+    jumps = _jumps(unit, np.random.default_rng([seed, 1]))
+    stamp_m_ns = now_ns
+    for k in range(ticks):
+        draw = rng.random(10)
+        if draw[0] < 0.9:
+            now_ns += round(period_ns * (1.0 + 0.2 * (draw[1] - 0.5)))
+        elif draw[0] < 0.99:
+            now_ns += round(period_ns * 10.0 ** (2.4 * draw[1] - 1.2))
+        else:
+            now_ns += round(period_ns * 300.0 * draw[1])
+        if k % 50 == 0:
+            size = unit * 10.0 ** rng.uniform(-3.0, 2.5, m) * (rng.random(m) < 0.9)
+        silence = int(draw[2] * 100.0) if draw[3] < 0.005 else max(silence - 1, 0)
+        y_m = 0.98 * y_m + size * rng.normal(size=m)
+        with suppress(ChannelError):
+            if draw[4] < 0.92 and not silence:
+                late = rng.uniform(-0.1, 0.4 * draw[6])
+                for distance in (0.3, 0.02, 0.0)[2 - int(3.0 * draw[5]) :]:  # closer than a slope of y_m takes, too
+                    stamp_m_ns = now_ns - round(period_ns * (late + distance))
+                    recorder.take_y_m(StampedVector(stamp_m_ns, y_m * rng.uniform(0.9, 1.1)), now_ns)
+        with suppress(ChannelError):
+            if draw[7] < 0.95 and not 0 < silence < 30:
+                late = rng.uniform(-0.05, 0.6) if draw[8] < 0.97 else rng.uniform(-300.0, 30.0)
+                stamp_ns = stamp_m_ns if draw[8] < 0.1 else now_ns - round(period_ns * late)
+                y = y_m + size * rng.normal(size=m) + airspeed * rng.uniform(-1.0, 1.0)
+                recorder.take_y(StampedVector(stamp_ns, y + next(jumps)), now_ns)
+        if draw[9] < 0.01:
+            recorder.retune_to(int(rng.integers(len(sets))))
+        elif draw[9] < 0.02:
+            recorder.restart()
+        elif draw[9] < 0.023:
+            recorder.begin()
+            inactive = int(rng.integers(2)) * 5
+        elif draw[9] < 0.03:
+            inactive = int(rng.integers(1, 60))
+        inactive = max(inactive - 1, 0)
+        recorder.tick(now_ns, active=not inactive)
+    return recorder.recording("drawn calls")
+
+
+def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
+    """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so that they are lost."""
+    m, off = len(unit), np.zeros_like(unit)
+    while True:
+        if rng.random() < 0.02:
+            off = np.where(rng.random(m) < 0.3, unit * 10.0 ** rng.uniform(0.0, 5.0, m), 0.0)
+        elif rng.random() < 0.4:
+            off = np.zeros(m)
+        yield off
+
+
+def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int) -> Recording:
+    """Single steps of an engaged controller from drawn states, with the parameters of an index, all computed at once.
+
+    Errors from 0.001 to 300 widths of the softened sign. dt from 0.2 to 10 periods, so with up to 9 missed samples.
+    """
+    rng = np.random.default_rng(seed)
+    period_ns = sets[index].guard().period_ns
+    factor = 10.0 ** (rng.choice([0.0, 0.0, 0.3, 1.0, -1.0], steps) + rng.uniform(-0.05, 0.05, steps))
+    dt_ns = np.round(period_ns * factor).astype(np.int64)
+    before, y, y_m = _drawn_states(sets[index], rng, dt_ns)
+    after = _stepped(sets[index], before, y, y_m, dt_ns)
+    groups = list(real_groups(sets[index]))
+    zero = np.zeros((steps, 9), dtype=np.int64)
+    integers = zero + np.array([1, 0, Mode.ENGAGED, 1, 0, 0, 0, 0, 0])
+    integers[:, 4] = integers[:, 8] = EPOCH_NS + dt_ns
+    events = np.zeros(2 * steps + 1, dtype=event_type(len(y)))
+    events[0]["kind"], events[0]["flag"] = START, index
+    load, tick = events[1::2], events[2::2]
+    load["kind"], load["stamp_ns"] = LOAD, EPOCH_NS
+    tick["kind"], tick["flag"], tick["y"], tick["y_m"] = GUARD_TICK, 3, y.T, y_m.T
+    tick["now_ns"] = tick["stamp_ns"] = EPOCH_NS + dt_ns
+    reals, loaded = (np.ascontiguousarray(np.vstack([values[name] for name in groups]).T) for values in (after, before))
+    return Recording(f"drawn steps, parameters {index}", events, integers, reals, loaded)
+
+
+def _drawn_states(
+    controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
+) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
+    """States by group, y and y_m, of shape (values, steps)."""
+    m, steps = len(controller.outputs), len(dt_ns)
+    eps, scale = controller.law_params().eps[:, None], np.array(controller.input_scale)[:, None]
+    size = eps * 10.0 ** rng.uniform(-3.0, 2.5, (1, steps)) * 10.0 ** rng.uniform(-1.0, 0.0, (m, steps))
+    u_size = 10.0 * scale * size
+    of_groups = {
+        "u": u_size, "u_free": u_size, "u_trim": 0.1 * u_size, "y": eps, "y_m": eps, "e_0": size, "e": size, "integral_e": size,
+        "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1], "feedforward.u": u_size,
+        "feedforward.u_0": u_size, "u_ff": 0.3 * u_size * (controller.feedforward is not None),
+    }  # fmt: skip
+    if controller.allocation is not None:
+        stops = controller.effector_limits()
+        of_groups["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
+    drawn = {
+        name: of_groups.get(name, 0.0) * rng.normal(size=(count, steps)) for name, count in real_groups(controller).items()
+    }
+    drawn |= {"sigma": rng.random((1, steps)), "scale": rng.uniform(0.3, 3.0, (m, steps))}
+    drawn |= {"feedforward.dt": dt_ns[None] / NANOSECONDS * rng.random((1, steps))}
+    drawn |= {"feedforward.ticks": rng.integers(0, 5, (1, steps)).astype(np.float64)}
+    drawn["y"] = drawn["y_m"] + drawn["e"]
+    y_m = drawn["y_m"] + 0.1 * size * rng.normal(size=(m, steps))
+    y = y_m + drawn["e"] + 0.1 * size * rng.normal(size=(m, steps))
+    if controller.schedule is not None:
+        y[list(controller.outputs).index("V")] += controller.schedule.speed * rng.uniform(-1.0, 1.0, steps)
+    return drawn, y, y_m
+
+
+def _stepped(
+    controller: RiseDiConfig, before: Mapping[str, FloatArray], y: FloatArray, y_m: FloatArray, dt_ns: NDArray[np.int64]
+) -> dict[str, FloatArray]:
+    """States after a step of the guard, by the functions of the guard over all columns."""
+    guard, law = controller.guard(), controller.tuned_law()
+    period = seconds(guard.period_ns)
+    dt = np.minimum(np.maximum(dt_ns / NANOSECONDS, DT_RANGE[0] * period), DT_RANGE[1] * period)
+    params, limits, zero = _columns(law.params), _columns(guard.limits), np.zeros_like(y)
+    state, u_before = restored(law.control_law, before), before["u"]
+    held = Measurements(before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before)
+    missed = np.round(dt / period) - 1.0
+    for k in range(round(DT_RANGE[1])):
+        state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
+    u_trim, u_ff, of_model = before["u_trim"], before["u_ff"], {}
+    if guard.nominal is not None:
+        x, u, dt_before, ticks, u_0 = (before[f"feedforward.{name}"] for name in FeedforwardState._fields)
+        now, u_ff = feedforward.step(FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal))
+        u_trim = u_trim + u_ff
+        of_model = {f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()}
+    measured = Measurements(y, y_m, zero, u_trim, u_before)
+    of_step, u_free = law.control_law.step(state, measured, dt, params)
+    last = before.get("effectors")
+    u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
+    limited = (u != u_free).any(axis=0)
+    limits = limits if guard.allocation is None else reached(u_free, u)
+    of_limits, u_free_limited, u_limited = law.control_law.limited(state, measured, dt, params, limits)
+    u, effectors = _given(np.where(limited, u_limited, u), last, dt, guard.allocation)
+    after = {
+        **before,
+        "u": u,
+        "u_free": np.where(limited, u_free_limited, u_free),
+        "u_ff": u_ff,
+        **({} if effectors is None else {"effectors": effectors}),
+        **fields(_chosen(limited, of_limits, of_step)),
+        **of_model,
+    }
+    of_output = {"output.y": y, "output.y_m": y_m, "output.y_m_offset": np.zeros((1, len(dt))), "output.dt": dt[None]}
+    return after | {"y": y, "y_m": y_m} | of_output
+
+
+def _given(
+    u: FloatArray, before: FloatArray | None, dt: FloatArray, params: Allocation | None
+) -> tuple[FloatArray, FloatArray | None]:
+    """The u that the effectors give for a u, and the effectors, both by column; u and None without an allocation."""
+    if params is None or before is None:
+        return u, None
+    pairs = [allocate(v, last, step, params) for v, last, step in zip(u.T, before.T, dt, strict=True)]
+    return np.array([v for _, v in pairs]).T, np.array([effectors for effectors, _ in pairs]).T
+
+
+def _columns(params: Any) -> Any:
+    """Parameters of a controller with columns in place of vectors, for many steps at once."""
+    if hasattr(params, "_asdict"):
+        return type(params)(*map(_columns, params))
+    return params[:, None] if isinstance(params, np.ndarray) and params.ndim == 1 else params
+
+
+def _chosen(mask: NDArray[np.bool_], chosen: Any, otherwise: Any) -> Any:
+    """The state `chosen` where the mask is true, by step."""
+    if hasattr(chosen, "_asdict"):
+        return type(chosen)(*(_chosen(mask, *pair) for pair in zip(chosen, otherwise, strict=True)))
+    return np.where(mask, chosen, otherwise)

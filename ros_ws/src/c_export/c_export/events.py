@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Calls of a controller in order, as events, with the state after each tick: in flights with faults, and of a log."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from c_export.constants import exportable, sizes
+from flight_analysis.closed_loop.replay import recorded_changes, recorded_parameters, vary
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_core.modes import Mode
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.text import printable
+from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_log.tape_reader import RecordedRun
+from rise_di_controller import guard, internals
+from rise_di_controller.control_law import fields
+from rise_di_controller.controller import Controller, ControlOutput
+from rise_di_controller.guard import TickInputs
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+START, TAKE_Y, TAKE_Y_M, TICK, RETUNE, RESTART, GUARD_TICK, LOAD = range(8)
+REFUSALS = 1 << 20  # 20 samples since the last tick, a bit a sample
+INTEGERS = ("published", "refused", "mode", "has_law", "y_stamp_ns", "failsafe_start_ns", "hold_ns", "ramp_ns", "stamp_ns")
+
+
+NOTHING = np.zeros(0)
+
+
+class Recording(NamedTuple):
+    """Events, and the state of the Python controller after each of the T ticks."""
+
+    name: str
+    events: NDArray[np.void]  # of `event_type`
+    integers: NDArray[np.int64]  # (T, 9), INTEGERS
+    reals: FloatArray  # (T, w), `real_groups`
+    loaded: FloatArray = NOTHING  # reals of the states before the ticks, for LOAD
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks."""
+        return len(self.integers)
+
+
+def event_type(m: int) -> np.dtype[np.void]:
+    """The struct `event` of proof.c."""
+    whole = [(name, np.int64) for name in ("kind", "now_ns", "stamp_ns", "flag", "offset_ns")]
+    return np.dtype([*whole, ("y", np.float64, m), ("y_m", np.float64, m)])
+
+
+def real_groups(controller: RiseDiConfig) -> dict[str, int]:
+    """Groups of reals in a state and their numbers of values, in the order of proof.c."""
+    m, p, n, s, schedule = sizes(controller)
+    groups = dict.fromkeys(("u", "u_free", "u_trim", "u_ff", "u_failsafe"), m)
+    groups |= {"effectors": p, "effectors_failsafe": p} if p else {}
+    groups |= dict.fromkeys(("y", "y_m", "e_0", "e", "integral_e", "Pi"), m)
+    groups |= {"scale": m} if schedule else {}
+    groups |= {"z": s, "u_o": m, "sigma": 1} if s else {}
+    groups |= {"feedforward.x": n, "feedforward.u": m, "feedforward.dt": 1, "feedforward.ticks": 1} if n else {}
+    groups |= {"feedforward.u_0": m} if n else {}
+    return groups | {"output.y": m, "output.y_m": m, "output.y_m_offset": 1, "output.dt": 1}
+
+
+def real_names(controller: RiseDiConfig) -> list[str]:
+    """Names of the reals in a state."""
+    return [f"{name}[{i}]" for name, count in real_groups(controller).items() for i in range(count)]
+
+
+class Recorder(Controller):
+    """A controller that records its calls and its states. `sets` are the parameters that `retune` may take, the first at first.
+
+    `before_tick` is called with the recorder and the instant before each tick, and returns whether the controller is active.
+    """
+
+    def __init__(
+        self, sets: Sequence[RiseDiConfig], before_tick: Callable[["Recorder", int], bool] = lambda recorder, now_ns: True
+    ) -> None:
+        super().__init__(sets[0])
+        self.sets, self._before_tick = sets, before_tick
+        self.silent: frozenset[str] = frozenset()  # samples that get lost: y, y_m
+        self._events: list[tuple[Any, ...]] = []
+        self._integers: list[tuple[int, ...]] = []
+        self._reals: list[FloatArray] = []
+        self._refused = 0
+        self._none = np.zeros(len(sets[0].outputs))
+        self._width = len(real_names(sets[0]))
+        self._add(START)
+
+    def _add(
+        self, kind: int, now_ns: int = 0, stamp_ns: int = 0, flag: int = 0, offset_ns: int = 0, y: Any = None, y_m: Any = None
+    ) -> None:
+        values = (self._none if value is None else value for value in (y, y_m))
+        self._events.append((kind, now_ns, stamp_ns, flag, offset_ns, *values))
+
+    def begin(self) -> None:
+        """A new controller with the first parameters."""
+        super().__init__(self.sets[0])
+        self._refused = 0
+        self._add(START)
+
+    def take_y(self, sample: StampedVector, now_ns: int) -> str:
+        """As the controller does, unless y is silent."""
+        if "y" in self.silent:
+            return ""
+        self._add(TAKE_Y, now_ns, sample.stamp_ns, y=sample.value)
+        return self._note_refusal(super().take_y, sample, now_ns)
+
+    def take_y_m(self, sample: StampedVector, now_ns: int) -> str:
+        """As the controller does, unless y_m is silent."""
+        if "y_m" in self.silent:
+            return ""
+        self._add(TAKE_Y_M, now_ns, sample.stamp_ns, y_m=sample.value)
+        return self._note_refusal(super().take_y_m, sample, now_ns)
+
+    def _note_refusal(self, take: Callable[[StampedVector, int], str], sample: StampedVector, now_ns: int) -> str:
+        self._refused = 2 * self._refused % REFUSALS
+        try:
+            lost = take(sample, now_ns)
+        except ChannelError:
+            self._refused += 1
+            raise
+        self._refused += bool(lost)
+        return lost
+
+    def retune_to(self, index: int) -> None:
+        """Take the parameters of an index of `sets`."""
+        self._add(RETUNE, flag=index)
+        self.retune(self.sets[index])
+
+    def restart(self) -> None:
+        """As the controller does."""
+        self._add(RESTART)
+        super().restart()
+
+    def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
+        """A tick, after `before_tick`."""
+        active = self._before_tick(self, now_ns) and active
+        self._add(TICK, now_ns, flag=int(active))
+        output = super().tick(now_ns, late_ns, active=active)
+        self._note_state(None if output is None else output.inputs)
+        return output
+
+    def guard_tick(self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool) -> None:
+        """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns; None without samples."""
+        y, y_m = None, []
+        if sample is None:
+            self._add(GUARD_TICK, now_ns, flag=int(active))
+        else:
+            stamp_ns, y_value, y_m_value, offset_ns = sample
+            self._add(GUARD_TICK, now_ns, stamp_ns, int(active) + 2, offset_ns, y_value, y_m_value)
+            y, y_m = StampedVector(stamp_ns, y_value), [StampedVector(stamp_ns, y_m_value)]
+            if offset_ns > 0:
+                y_m.append(StampedVector(stamp_ns + offset_ns, y_m_value))
+        self._state, inputs = guard.tick(self._state, now_ns, y, y_m, self._guard, self._law, active)
+        self._note_state(inputs)
+
+    def _note_state(self, inputs: TickInputs | None) -> None:
+        state = self.state
+        y_stamp_ns = 0 if state.y is None else state.y.stamp_ns
+        stamp_ns = 0 if inputs is None else inputs.stamp_ns
+        whole = (inputs is not None, self._refused, state.mode, state.law is not None, y_stamp_ns)
+        times = (state.failsafe_start_ns, state.hold_ns, state.ramp_ns, stamp_ns)
+        self._integers.append((*map(int, whole), *times))
+        self._refused = 0
+        row = np.zeros(self._width)
+        parts = [state.u, state.u_free, state.u_trim, state.u_ff, state.u_failsafe]
+        if (effectors := state.effectors) is not None:
+            at_failsafe = state.effectors_failsafe
+            parts += [effectors, np.zeros_like(effectors) if at_failsafe is None else at_failsafe]
+        if state.law is not None and state.y is not None and state.y_m is not None:
+            parts += [state.y.value, state.y_m, *fields(state.law).values()]
+            if state.feedforward is not None:
+                parts += [np.atleast_1d(value) for value in state.feedforward]
+        values = np.concatenate(parts)
+        row[: len(values)] = values
+        if inputs is not None:
+            output = np.concatenate([inputs.y, inputs.y_m, [inputs.y_m_offset, inputs.dt]])
+            row[-len(output) :] = output
+        self._reals.append(row)
+
+    def recording(self, name: str) -> Recording:
+        """Events and states so far."""
+        events = np.array(self._events, dtype=event_type(len(self._none)))
+        integers = np.array(self._integers, dtype=np.int64).reshape(-1, len(INTEGERS))
+        return Recording(name, events, integers, np.array(self._reals).reshape(-1, self._width))
+
+
+def parameter_sets(controller: RiseDiConfig) -> list[RiseDiConfig]:
+    """The controller, then valid changes of its parameters: gains, limits, signs, times, schedule, observer, stops."""
+    widths = np.array(controller.input_scale) * controller.law_params().eps
+    bound = np.minimum(10.0 * widths, 0.1 * np.array(controller.upper or 10.0 * widths)).tolist()
+    tight = {"lower": tuple(-value for value in bound), "upper": tuple(bound), "slew": tuple(4.0 * value for value in bound)}
+    changes: list[Mapping[str, Any]] = [
+        {"k_g": 0.8 * controller.k_g, "Lambda": tuple(0.9 * value for value in controller.Lambda)},
+        {"beta": tuple(0.7 * value for value in controller.beta)},
+        tight,
+        {"slew": tuple(0.2 * value for value in bound)},
+        {"sign": "implicit"},
+        {"sign": "literal"},
+        {"sign": "soft"},
+        {"hold": 0.03, "ramp": 0.07, "max_age": 0.05},
+        {"on_deactivate": "hold"},
+    ]
+    if controller.schedule is not None:
+        changes.append({"schedule.time": 5.0 / controller.rate})  # below the longest dt
+    if controller.observer is not None:
+        changes.append({"observer.F": tuple(0.9 * value for value in controller.observer.F)})
+        changes.append({"observer.fade": 0.0})
+    if controller.allocation is not None:
+        stops = controller.effector_limits()
+        bind = {"allocation.lower": 0.05 * stops.lower, "allocation.upper": 0.05 * stops.upper}
+        bind |= {"allocation.slew": 0.2 * (stops.upper - stops.lower)}
+        changes.append({name: tuple(value.tolist()) for name, value in bind.items()})
+    sets = [controller]
+    for change in changes:
+        with suppress(ParameterError):  # an observer without a margin under these gains
+            sets.append(exportable(vary(controller, change)))
+    return sets
+
+
+def flight_recordings(scenario: Scenario, sets: Sequence[RiseDiConfig]) -> Iterator[Recording]:
+    """Flights in one process: as the scenario says, with a tenth of y lost, and with faults.
+
+    Faults: new parameters, y or y_m lost within hold, within ramp and beyond, deactivation, engagement, tight limits.
+    """
+    sensors = scenario.aircraft.sensors.model_dump() | {"dropout": 0.1}
+    yield _flown("the flight", scenario, Recorder(sets))
+    yield _flown("a tenth of y lost", scenario.vary(aircraft={"sensors": sensors}), Recorder(sets))
+    yield _flown("faults", scenario, Recorder(sets, _faults(scenario.flight.duration, sets)))
+
+
+def _flown(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
+    simulate(scenario, control=lambda _: recorder)
+    return recorder.recording(name)
+
+
+def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder, int], bool]:
+    """What happens before a tick of the flight with faults."""
+    controller = sets[0]
+    within_hold, in_ramp = (
+        controller.max_age + 0.5 * controller.hold,
+        controller.max_age + controller.hold + 0.5 * controller.ramp,
+    )
+    beyond = controller.max_age + controller.hold + controller.ramp + 0.2
+    lost = {0.25: ({"y"}, within_hold), 0.35: ({"y_m"}, in_ramp), 0.5: ({"y"}, beyond), 0.7: ({"y", "y_m"}, in_ramp)}
+    retuned = {0.05 + 0.9 * k / len(sets): k for k in range(1, len(sets))}
+    done: set[float] = set()
+
+    def before(recorder: Recorder, now_ns: int) -> bool:
+        t = now_ns / NANOSECONDS
+        silent = [names for part, (names, length) in lost.items() if part * duration <= t < part * duration + length]
+        recorder.silent = frozenset().union(*silent)
+        for part, index in retuned.items():
+            if t >= part * duration and part not in done:
+                done.add(part)
+                recorder.retune_to(index)
+        if t >= 0.97 * duration and 1.0 not in done:
+            done.add(1.0)
+            recorder.restart()
+        return not 0.8 * duration <= t < 0.8 * duration + 0.7
+
+    return before
+
+
+def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]:
+    """The parameters of a log and their changes in flight, the ticks of the log, and the number of ticks with the u of the log.
+
+    Raises ParameterError for parameters in force that the changes of the log do not lead to.
+    """
+    sets = [exportable(recorded_parameters(run.scenario_file()))]
+    changes = [*recorded_changes(run, sets[0])]
+    log = run.tape["internals"]
+    of_command = "u" if sets[0].allocation is None else internals.EFFECTOR
+    groups = {name: log.group(name).values for name in ("y", "y_m", of_command)}
+    recorder, equal = Recorder(sets), 0
+    now_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
+    for k in np.argsort(now_ns, kind="stable").tolist():
+        if log["number"][k] == 1 and k:
+            recorder.begin()
+        in_force = int(log["parameters"][k])
+        while recorder.digest != in_force:
+            found = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
+            require(bool(changes), "run", found, "a log with all changes of the parameters")
+            sets.append(exportable(vary(recorder.parameters, changes.pop(0))))
+            recorder.retune_to(len(sets) - 1)
+        sample = None
+        if log["mode"][k] == Mode.ENGAGED:
+            offset_ns = round(float(log["y_m_offset"][k]) * NANOSECONDS)
+            if log["dt"][k] == 0.0 and recorder.mode is Mode.ENGAGED:
+                recorder.restart()
+            sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
+        recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
+        equal += recorder.state.command.tobytes() == groups[of_command][k].tobytes()
+    return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal

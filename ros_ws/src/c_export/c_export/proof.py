@@ -1,0 +1,274 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The exported C code, compiled and compared with the Python controller: every u and every state, bit by bit."""
+
+import json
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from c_export.constants import header, packed
+from c_export.events import INTEGERS, Recording, real_names
+from flight_core.files import write_file, writing
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+SOURCE = Path(str(files("c_export"))) / "source"
+CODE = ("rise_di.h", "rise_di.c")
+PARAMETERS = "rise_di_parameters.h"
+REPORT, FMU = "proof.txt", "rise_di.fmu"  # beside the code
+COMPILERS = ("gcc", "clang")
+FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
+COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
+MAX_SETS = 64  # of proof.c
+
+FLOAT32_BOUND = 2.0**-10
+"""Largest difference of u in float32 along a flight, as a part of the range of u in the flight."""
+
+
+class Difference(NamedTuple):
+    """The first value of a recording that differs."""
+
+    tick: int  # from 0
+    channel: str
+    python: float
+    c: float
+
+
+class Comparison(NamedTuple):
+    """A recording computed by C: T ticks."""
+
+    name: str
+    ticks: int
+    values: int  # compared
+    differing: int  # values
+    first: Difference | None
+    deviation: float  # largest difference of u as a part of the range of u, largest of the inputs
+    modes_equal: bool  # whether modes and times are equal
+
+    def holds(self, *, float32: bool) -> bool:
+        """Whether every bit is equal; in float32 whether every mode is equal, and u within FLOAT32_BOUND."""
+        return self.modes_equal and self.deviation <= FLOAT32_BOUND if float32 else self.differing == 0
+
+
+def write_code(controller: RiseDiConfig, scenario: str, folder: Path, *, float32: bool) -> list[Path]:
+    """Write the C code of a controller to a folder, and remove report and unit of the code before. Raises ParameterError."""
+    with writing("c", folder, "a folder that can"):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in (REPORT, FMU):
+            (folder / name).unlink(missing_ok=True)
+        for name in CODE:
+            shutil.copyfile(SOURCE / name, folder / name)
+        write_file(folder / PARAMETERS, header(controller, scenario, float32=float32))
+    return [folder / name for name in (*CODE, PARAMETERS)]
+
+
+def compilers(named: Sequence[str] = ()) -> list[list[str]]:
+    """Commands of the C compilers: the named ones, or all of COMPILERS on the PATH. Raises ParameterError for none."""
+    commands = [_words(command) for command in named] or [[name] for name in COMPILERS if shutil.which(name)]
+    if not commands:
+        raise ParameterError(
+            f"compiler: found none of {', '.join(COMPILERS)} on the PATH, expected one for the proof; "
+            "--no-proof writes the code without a proof"
+        )
+    return commands
+
+
+def _words(command: str) -> list[str]:
+    """The words of the command of a compiler, as a shell reads them. Raises ParameterError for what is no program."""
+    expected = "expected the command of a C compiler"
+    try:
+        words = shlex.split(command)
+    except ValueError as error:  # a quotation without an end
+        raise ParameterError(f"compiler: found {command!r} ({error}), {expected}") from None
+    if not words or shutil.which(words[0]) is None:
+        raise ParameterError(f"compiler: found no program {command!r}, {expected}")
+    return words
+
+
+class Program:
+    """proof.c beside the exported code, compiled in a folder of its own."""
+
+    def __init__(
+        self, code: Path, compiler: Sequence[str], sets: Sequence[RiseDiConfig], folder: Path, *, float32: bool = False,
+        flags: Sequence[str] = FLAGS, source: str | None = None,
+    ) -> None:  # fmt: skip
+        """Compile; `source` replaces the text of rise_di.c. Raises ParameterError with the words of the compiler."""
+        self._folder, self._float32 = folder, float32
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in (code / "rise_di.h", code / "rise_di.c", code / PARAMETERS, SOURCE / "proof.c", SOURCE / "counting.h"):
+            shutil.copyfile(path, folder / path.name)
+        if source is not None:
+            (folder / "rise_di.c").write_text(source, encoding="utf-8")
+        self.take(sets)
+        build([*compiler, *flags, "-o", "proof", "proof.c"], folder)
+
+    def take(self, sets: Sequence[RiseDiConfig]) -> None:
+        """Replace the parameter sets; the first is that of the exported header all the same."""
+        self._sets = sets
+        content = b"".join(packed(controller, float32=self._float32) for controller in sets)
+        (self._folder / "sets").write_bytes(content)
+
+    def run(self, recording: Recording) -> tuple[np.ndarray, FloatArray, Mapping[str, int]]:
+        """Integers (T, 9) and reals (T, w) of the states of C, and what the program prints."""
+        (self._folder / "events").write_bytes(recording.events.tobytes())
+        (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
+        command = ["./proof", "sets", "events", "loaded", "states"]
+        try:
+            done = subprocess.run(command, cwd=self._folder, capture_output=True, text=True, check=False)  # noqa: S603 - built here
+        except OSError as error:
+            found = f"found a program that does not start here ({error.strerror})"
+            raise ParameterError(f"compiler: {found}, expected a compiler for this machine") from None
+        if done.returncode:
+            raise ParameterError(f"the exported code: {(done.stderr or 'the program failed').strip()[-2000:]}")
+        whole, reals = len(INTEGERS), len(real_names(self._sets[0]))
+        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, whole + reals)
+        return words[:, :whole], words[:, whole:].view(np.float64), json.loads(done.stdout)
+
+    def compare(self, recording: Recording) -> Comparison:
+        """The states of C beside the states of Python."""
+        integers, reals, _ = self.run(recording)
+        names = real_names(self._sets[0])
+        m = len(self._sets[0].outputs)
+        if len(integers) != recording.ticks:
+            raise ParameterError(f"the exported code: found {len(integers)} ticks of {recording.ticks}, expected each")
+        same = np.hstack([integers == recording.integers, reals.view(np.int64) == recording.reals.view(np.int64)])
+        first = None
+        if not same.all():
+            tick = int(np.flatnonzero(~same.all(axis=1))[0])
+            column = int(np.flatnonzero(~same[tick])[0])
+            both = (np.hstack([recording.integers[tick], recording.reals[tick]]), np.hstack([integers[tick], reals[tick]]))
+            first = Difference(tick, (*INTEGERS, *names)[column], float(both[0][column]), float(both[1][column]))
+        u = recording.reals[:, :m]
+        with np.errstate(over="ignore", invalid="ignore"):  # C that is wrong may give any number
+            parts = np.abs(reals[:, :m] - u).max(axis=0) / np.maximum(np.ptp(u, axis=0), np.finfo(float).tiny)
+        modes_equal = bool((integers == recording.integers).all())
+        return Comparison(
+            recording.name, recording.ticks, same.size, int((~same).sum()), first, float(parts.max()), modes_equal
+        )
+
+
+class Proof(NamedTuple):
+    """What was compiled, compared and measured."""
+
+    compilers: tuple[str, ...]  # their versions
+    comparisons: tuple[Comparison, ...]  # of the recordings, each with every compiler in turn
+    figures: Mapping[str, int]  # bytes and operations by name
+    float32: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether every comparison holds."""
+        return all(comparison.holds(float32=self.float32) for comparison in self.comparisons)
+
+
+def prove(
+    code: Path,
+    commands: Sequence[Sequence[str]],
+    sets: Sequence[RiseDiConfig],
+    recordings: Iterable[Recording],
+    *,
+    float32: bool,
+) -> Proof:
+    """Compile the code in a folder with each compiler, and compare the states of C with the recordings.
+
+    With g++ a program whose reals count gives the largest number of operations of a call.
+    """
+    comparisons: list[Comparison] = []
+    with tempfile.TemporaryDirectory(prefix="rise_di_export_") as name:
+        folder = Path(name)
+        programs = [Program(code, command, sets, folder / str(k), float32=float32) for k, command in enumerate(commands)]
+        figures = footprint(code, commands[0], folder)
+        counting = None
+        if shutil.which("g++") is not None and not float32:
+            counting = Program(code, ["g++"], sets, folder / "counting", flags=COUNTING_FLAGS)
+        for recording in recordings:
+            comparisons += [program.compare(recording) for program in programs]
+            printed = (counting or programs[0]).run(recording)[2]
+            figures |= {key: max(value, figures.get(key, 0)) for key, value in printed.items()}
+    return Proof(tuple(version(command) for command in commands), tuple(comparisons), figures, float32)
+
+
+FIGURES = {
+    "code_bytes": "machine code and constants of the functions, bytes",
+    "data_bytes": "global variables, bytes",
+    "parameters_bytes": "struct rise_di_parameters, bytes",
+    "controller_bytes": "struct rise_di_controller, bytes, with the samples kept",
+    "stack_bytes": "stack at most, bytes (sum of the frames of all functions)",
+    "add": "additions and subtractions, most of a call in the proof",
+    "multiply": "multiplications, most of a call in the proof",
+    "divide": "divisions, most of a call in the proof",
+    "compare": "comparisons, most of a call in the proof",
+}
+
+
+def report(proof: Proof, scenario: str) -> str:
+    """The proof as text."""
+    precision = "float32" if proof.float32 else "float64"
+    lines = [f"C code of the controller of {scenario}, {precision}, beside the Python controller of rise-di", ""]
+    lines += [f"compiler: {name}, {shlex.join(FLAGS)}" for name in proof.compilers]
+    lines.append("")
+    several = len(proof.compilers) > 1
+    for k, comparison in enumerate(proof.comparisons):
+        by = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
+        of = f"{comparison.name}{by}: {comparison.ticks} ticks, {comparison.values} values"
+        if proof.float32:
+            lines.append(f"{of}; u within {comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}")
+        else:
+            lines.append(f"{of}, {comparison.differing} differ")
+        if comparison.first is not None and not comparison.holds(float32=proof.float32):
+            tick, channel, python, c = comparison.first
+            lines.append(f"    first in tick {tick}: {channel} is {python!r} in Python, {c!r} in C")
+    lines += ["", *(f"{FIGURES[name]}: {value}" for name, value in sorted(proof.figures.items(), key=_place))]
+    within = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range" if proof.float32 else "every bit is equal"
+    lines += ["", f"PROVED: {within}" if proof.holds else "NOT PROVED"]
+    return "\n".join(lines) + "\n"
+
+
+def _place(figure: tuple[str, int]) -> int:
+    return list(FIGURES).index(figure[0])
+
+
+def build(command: Sequence[str], folder: Path) -> None:
+    """Run a compiler in a folder. Raises ParameterError with what it says."""
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
+    if done.returncode:
+        said = (done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}"
+        raise ParameterError(f"{shlex.join(command)}: {said}")
+
+
+def version(compiler: Sequence[str]) -> str:
+    """The first line of what a compiler says of itself."""
+    done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)  # noqa: S603 - as above
+    return (done.stdout or done.stderr).partition("\n")[0].strip()
+
+
+def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
+    """Bytes of machine code and constants, and of the stack: the sum of all frames. What is unknown is left out.
+
+    No function calls itself, so no chain of calls needs more stack than the sum.
+    """
+    for name in (*CODE, PARAMETERS):
+        shutil.copyfile(code / name, folder / name)
+    try:
+        build([*compiler, *FLAGS, "-fstack-usage", "-c", "-o", "rise_di.o", "rise_di.c"], folder)
+    except ParameterError:  # a compiler without -fstack-usage
+        build([*compiler, *FLAGS, "-c", "-o", "rise_di.o", "rise_di.c"], folder)
+    known = {}
+    usage = folder / "rise_di.su"
+    if usage.is_file():
+        lines = [line.split("\t") for line in usage.read_text(encoding="utf-8").splitlines()]
+        known["stack_bytes"] = sum(int(line[1]) for line in lines)
+    if (size := shutil.which("size")) is not None:
+        done = subprocess.run([size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - of binutils
+        text, data, bss = (int(word) for word in done.stdout.splitlines()[1].split()[:3])
+        known |= {"code_bytes": text, "data_bytes": data + bss}
+    return known

@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Margins of the linear loop of a scenario under the law of its controller, on the nominal and on uncertain aircraft."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import UNIFORM, Spread, nominal_and_sampled
+from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_core.arguments import as_count, as_number
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from rise_di_controller.law import Sign
+from rise_di_controller.linear_loop import (
+    MAX_DELAY_MARGIN,
+    SPECTRAL_RADIUS_TOLERANCE,
+    LinearLaw,
+    LinearPlant,
+    Loop,
+    closed_loop,
+    delay_margin,
+    linear_law,
+)
+from rise_di_controller.margins import Margins, SlowModes, loop_margins, slow_modes
+from rise_di_controller.params import AllocationConfig, ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+
+class LinearLoop(NamedTuple):
+    """The loop of a controller around a model of its aircraft; channels in the law's order."""
+
+    model: str  # what the plant is the model of
+    inputs: tuple[str, ...]
+    plant: LinearPlant  # of N aircraft, the nominal one first: A (N, n, n), B (N, n, m)
+    law: LinearLaw
+    loop: Loop
+
+    @property
+    def nominal(self) -> LinearPlant:
+        """The nominal aircraft."""
+        return LinearPlant(self.plant.A[0], self.plant.B[0], self.plant.C)
+
+
+class LoopMargins(NamedTuple):
+    """Margins of a loop, channels in the law's order."""
+
+    inputs: tuple[str, ...]
+    nominal: Margins
+    modes: SlowModes  # of the nominal aircraft
+    delay: float  # s, delay margin of the nominal aircraft, u late in all inputs
+    channel_delay: tuple[float, ...]  # s, u late in one input alone
+    worst: Margins | None = None  # of the uncertain aircraft, each figure by itself; None without any
+    worst_delay: float | None = None  # s
+    aircraft: int = 0  # number of uncertain aircraft
+    stable: int = 0  # number of those that are stable
+
+
+def margins(
+    scenario: Scenario, aircraft: int = 0, uncertainty: float = 0.3, seed: int = 1, spread: Spread = UNIFORM
+) -> LoopMargins:
+    """Margins of a scenario's loop: of the nominal aircraft, and the worst of uncertain aircraft.
+
+    Every entry of A and B of an uncertain aircraft is off by up to `uncertainty`, or as `spread` says, the rows of angles
+    excepted. The controller
+    gives lags and delay. The uncertainty of the scenario itself is left out. Raises ParameterError for the literal sign, and
+    for an aircraft of JSBSim under a controller without a model.
+    """
+    flown = as_scenario(scenario)
+    count, numbered = as_count(aircraft, "aircraft", 0), as_count(seed, "seed", 0)
+    deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
+    return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
+
+
+def loop_assessment(of: LinearLoop) -> LoopMargins:
+    """The margins of a loop: of the nominal aircraft, and the worst of the uncertain aircraft."""
+    together = loop_margins(of.plant, of.law, of.loop)
+    nominal, uncertain = (Margins._make(value[part] for value in together) for part in (0, slice(1, None)))
+    delay = delay_margin(of.nominal, of.law, of.loop)
+    each = tuple(delay_margin(of.nominal, of.law, of.loop, channel) for channel in range(len(of.inputs)))
+    result = LoopMargins(of.inputs, nominal, slow_modes(of.nominal, of.law, of.loop), delay, each)
+    count = len(of.plant.A) - 1
+    if not count:
+        return result
+    stable = int(uncertain.stable.sum())
+    return result._replace(worst=uncertain.worst(), worst_delay=_least_delay(of, delay), aircraft=count, stable=stable)
+
+
+def _least_delay(of: LinearLoop, nominal: float) -> float:
+    """The smallest delay margin of the uncertain aircraft, at most the nominal delay margin, s.
+
+    The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer nominal margin.
+    """
+    longest = min(nominal, MAX_DELAY_MARGIN)
+    uncertain = LinearPlant(of.plant.A[1:], of.plant.B[1:], of.plant.C)
+    for delay in np.append(np.arange(0.0, longest, max(of.loop.period / 2.0, longest / 12.0)), longest):
+        matrices = closed_loop(uncertain, of.law, of.loop, np.full(len(of.inputs), delay))
+        radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
+        unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
+        if len(unstable):
+            plants = (LinearPlant(uncertain.A[k], uncertain.B[k], uncertain.C) for k in unstable)
+            return min(nominal, *(delay_margin(plant, of.law, of.loop) for plant in plants))
+    return nominal
+
+
+def scenario_loop(
+    scenario: Scenario,
+    controller: ControllerConfig,
+    aircraft: int = 0,
+    uncertainty: float = 0.3,
+    seed: int = 1,
+    spread: Spread = UNIFORM,
+) -> LinearLoop:
+    """The loop of a controller around the nominal and uncertain aircraft of a scenario. Raises as `margins`."""
+    airframe = _model(scenario, controller)
+    A, B = nominal_and_sampled(airframe, uncertainty, aircraft, seed, spread)
+    if controller.allocation is not None and not scenario.aircraft.is_jsbsim:  # B of each effector is drawn
+        B = B @ _distribution(airframe, controller.allocation)
+        airframe = through_allocation(airframe, controller)
+    return linear_loop(controller, airframe, A, B)
+
+
+def linear_loop(controller: ControllerConfig, airframe: Airframe, A: FloatArray, B: FloatArray) -> LinearLoop:
+    """The loop of a controller around N aircraft, A (N, n, n) and B (N, n, m) with the states and channels of an airframe.
+
+    Raises ParameterError for the literal sign.
+    """
+    rows, columns = law_order(airframe, controller)
+    loop = loop_of(controller)
+    if not set(controller.vanes) <= set(airframe.states):  # y_dot = Omega u has no angles: the observer of y alone
+        controller = controller.without_vanes()
+    read = [[float(name == state) for state in airframe.states] for name in controller.vanes]
+    C = np.vstack([airframe.matrix_c()[rows], *read])
+    plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
+    model = f"model: {airframe.name}"
+    return LinearLoop(model, controller.inputs, plant, linear_law(controller.tuned_law(), len(rows), loop.period), loop)
+
+
+def through_allocation(airframe: Airframe, controller: ControllerConfig) -> Airframe:
+    """The airframe that the law of a controller sees: with its inputs v, u = T v; without an allocation as it is."""
+    if (allocation := controller.allocation) is None:
+        return airframe
+    return airframe.through(_distribution(airframe, allocation), controller.inputs)
+
+
+def _distribution(airframe: Airframe, allocation: AllocationConfig) -> FloatArray:
+    """T (p, m) with the rows in the order of the inputs of an airframe."""
+    T = np.reshape(allocation.T, (len(allocation.effectors), -1))
+    return T[[allocation.effectors.index(name) for name in airframe.inputs]]
+
+
+def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str, Any]:
+    """Delay margin of the nominal linear loop, s: u late in every channel, in a single channel by output; the least allowed.
+
+    Empty without a linear loop: an aircraft of JSBSim, the literal sign. 0 where the loop is unstable with its own lag.
+    """
+    if scenario.aircraft.is_jsbsim or is_literal(controller):
+        return {}
+    of = scenario_loop(scenario, controller)
+    each = {name: delay_margin(of.nominal, of.law, of.loop, channel) for channel, name in enumerate(controller.outputs)}
+    return {"delay_margin": delay_margin(of.nominal, of.law, of.loop), "channels": each, "least": of.loop.period}
+
+
+def is_literal(controller: ControllerConfig) -> bool:
+    """Whether a controller samples the literal sign: no linear loop."""
+    return isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.LITERAL
+
+
+def loop_of(controller: ControllerConfig) -> Loop:
+    """The loop of a controller."""
+    return Loop(np.array(controller.lag, dtype=np.float64), controller.delay, 1.0 / controller.rate)
+
+
+def law_order(airframe: Airframe, controller: ControllerConfig) -> tuple[list[int], list[int]]:
+    """Indices of the law's outputs and inputs in the order of an airframe."""
+    columns = [list(airframe.inputs).index(name) for name in controller.inputs]
+    return [airframe.outputs.index(name) for name in controller.outputs], columns
+
+
+def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
+    """The airframe of a scenario, or y_dot = Omega u of the inputs of the law from the controller of an aircraft of JSBSim.
+
+    Omega comes from the feedforward, or from abs(Omega_ii) = omega / input_scale of RISE-DI, an upper bound.
+    """
+    aircraft = scenario.aircraft
+    if not aircraft.is_jsbsim:
+        return load_airframe(aircraft.airframe)
+    if controller.feedforward is not None and set(controller.feedforward.states) == set(controller.outputs):
+        names = controller.feedforward.states
+        A, B = np.reshape(controller.feedforward.A, (len(names), -1)), np.reshape(controller.feedforward.B, (len(names), -1))
+    elif isinstance(controller, RiseDiConfig):
+        names = controller.outputs
+        A, B = np.zeros((len(names), len(names))), np.diag(np.array(controller.D) * controller.omega / controller.input_scale)
+    else:
+        expected = "a controller with a feedforward, or RISE-DI with its omega"
+        raise ParameterError(f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}")
+    channels = aircraft.channels()
+    inputs = {
+        name: {"unit": channels.inputs.get(name, "1"), "positive": channels.positive.get(name, f"more {name}")}
+        for name in controller.inputs
+    }
+    values = {
+        "name": f"y_dot = Omega u for {aircraft.airframe}",
+        "source": "the controller",
+        "speed": channels.speed,
+        "inputs": inputs,
+    }
+    states = {name: channels.outputs[name] for name in names}
+    matrices = {"states": states, "outputs": list(controller.outputs), "A": A.tolist(), "B": B.tolist()}
+    return Airframe.validate_mapping(values | matrices, f"model of {aircraft.airframe}")

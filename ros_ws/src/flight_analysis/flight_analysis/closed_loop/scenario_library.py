@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The scenarios of the stack, the file of a scenario's name, and scenarios with a route."""
+
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from flight_analysis.closed_loop.scenario import Scenario, load_scenario, scenario_yaml
+from flight_core.arguments import FilePath
+from flight_core.files import find_file, names_in, write_file, writing
+from flight_core.scenario_file import A_SCENARIO
+from flight_guidance.feasibility import speeds
+from flight_guidance.route_file import Waypoint
+
+LIBRARY = Path(str(files("flight_analysis"))) / "scenarios"
+
+
+def scenarios() -> list[str]:
+    """Names of the scenarios in LIBRARY."""
+    return names_in(LIBRARY)
+
+
+def find_scenario(name: FilePath | Scenario, duration: float | None = None, *, with_route: bool = True) -> Scenario:
+    """A scenario by its name in LIBRARY, or by the path of a file (.yaml), of a `duration` in s. Raises ParameterError.
+
+    A Scenario is returned as it is, or with the duration. `with_route` as of `load_scenario`.
+    """
+    if isinstance(name, Scenario):
+        scenario = name
+    else:
+        path = find_file(name, LIBRARY, "scenario", A_SCENARIO).absolute()
+        scenario = load_scenario(path, with_route=with_route)
+    return scenario if duration is None else scenario.vary(flight={"duration": duration})
+
+
+def with_route(scenario: Scenario, waypoints: Sequence[Waypoint], fence: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
+    """The scenario with a route that guidance flies from the start, in place of its route and its program of targets.
+
+    `fence`: further sections of guidance, as of `read_fence_file`.
+
+    Raises ParameterError where it cannot be flown.
+    """
+    flown = speeds(waypoints, scenario.aircraft.channels().speed)
+    route = {key: [getattr(waypoint, key) for waypoint in waypoints] for key in ("north", "east", "altitude")} | {
+        "V": list(flown),
+        "turns": [waypoint.turns for waypoint in waypoints],
+        "wait": [waypoint.wait for waypoint in waypoints],
+        "leave": [waypoint.departure for waypoint in waypoints],
+    }
+    route = {key: values for key, values in route.items() if key not in {"turns", "wait"} or any(values)}
+    if route["leave"] == route["altitude"]:
+        del route["leave"]
+    return scenario.vary(guidance={"route": route, "program": {}, **fence})
+
+
+def written(scenario: Scenario, path: Path) -> Scenario:
+    """A scenario that differs from its file, as a file of its own. Raises ParameterError where it cannot be written."""
+    with writing("", path, "a folder that can"):
+        write_file(path, scenario_yaml(scenario))
+    return load_scenario(path)

@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Margins of a linear loop as rows of a table, as figures of a file, and as Bode and Nyquist plots."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from flight_analysis.closed_loop.loop_margins import LinearLoop, LoopMargins
+from flight_analysis.report import comparison
+from flight_analysis.report.plotting import Figure, add_line, set_layout
+from flight_analysis.report.summary import NO_VALUE, Column
+from flight_analysis.report.tables import Table
+from flight_core.vectors import FloatArray
+from rise_di_controller.margins import Margins, disk_gain, disk_phase, loop_transfer
+
+MARGIN_COLUMNS = (
+    Column("phase", "deg"),
+    Column("at", "rad/s"),
+    Column("gain", "dB"),
+    Column("largest", "S"),
+    Column("disk", ""),
+    Column("delay", "ms"),
+)
+ALONE = ".3g"  # format of a column without the worst aircraft
+FORMATS = (".0f", ALONE, ".2g", ".2f", ".2f", ".0f")  # of MARGIN_COLUMNS
+ALL_INPUTS = "all inputs"
+MARGIN_LEGEND = (
+    "one input open, all others closed: phase margin and its frequency, gain margin, largest sensitivity, balanced disk margin,"
+    " delay margin. all inputs: an independent disk of this size in each input at once, the phase and gain that it guarantees,"
+    " the largest sensitivity under diagonal scaling, the delay in all inputs"
+)
+SHOWN_DAMPING = 0.8  # slow modes with less damping are listed
+FREQUENCIES_SHOWN = 240  # of Bode and Nyquist plots
+LOWEST_SHOWN = 1e-3  # of pi / T, rad/s
+NYQUIST_RANGE = ((-3.0, 1.0), (-2.0, 2.0))  # around the point -1
+UNIT_CIRCLE, BOUND = "#bbbbbb", "#444444"
+
+
+def decibels(factor: FloatArray | float) -> FloatArray:
+    """20 log10 of a factor."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(20.0 * np.log10(factor))
+
+
+def margin_rows(of: LoopMargins) -> list[list[str]]:
+    """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS: nominal (worst uncertain aircraft)."""
+    columns = _values(of.nominal, (*of.channel_delay, of.delay))
+    beside = columns if of.worst is None else _values(of.worst, (*[math.nan] * len(of.inputs), of.worst_delay or 0.0))
+    rows = []
+    for i, name in enumerate((*of.inputs, ALL_INPUTS)):
+        pairs = zip(columns, beside, FORMATS, strict=True)
+        rows.append([name, *(_cell(values[i], None if of.worst is None else worst[i], form) for values, worst, form in pairs)])
+    return rows
+
+
+def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
+    """The values of MARGIN_COLUMNS by row, in the units of the columns; NaN for none."""
+    phase, gain = np.append(margins.phase, disk_phase(margins.disk_all)), np.append(margins.gain, disk_gain(margins.disk_all))
+    return [
+        np.degrees(phase).tolist(),
+        [*margins.crossover.tolist(), math.nan],
+        decibels(gain).tolist(),
+        [*margins.sensitivity.tolist(), float(margins.sensitivity_all)],
+        [*margins.disk.tolist(), float(margins.disk_all)],
+        [1e3 * value for value in delay],
+    ]
+
+
+def _cell(value: float, worst: float | None, form: str) -> str:
+    """A value, and the value of the worst aircraft in parentheses."""
+
+    def text(number: float) -> str:
+        return NO_VALUE if math.isnan(number) else "none" if math.isinf(number) else format(number, form)
+
+    alone = worst is None or math.isnan(worst) or form == ALONE
+    return text(value) if worst is None or alone else f"{text(value)} ({text(worst)})"
+
+
+LEAST_MARGINS = {
+    "phase margin, deg": ".0f",
+    "gain margin, dB": ".2g",
+    "largest sensitivity": ".2f",
+    "disk margin, all inputs": ".2f",
+    "damping of slow modes": ".2f",
+    "delay margin, ms": ".0f",
+}
+"""The least margins of a loop, each with its format: of the worst input, or of all inputs at once."""
+
+
+def least_margins(of: LoopMargins | None) -> list[str]:
+    """The values of LEAST_MARGINS: nominal (worst uncertain aircraft)."""
+    if of is None:
+        return [NO_VALUE] * len(LEAST_MARGINS)
+    nominal, worst = _least(of.nominal, of.delay), None if of.worst is None else _least(of.worst, of.worst_delay or 0.0)
+    formats = LEAST_MARGINS.values()
+    beside = [None] * len(nominal) if worst is None else worst
+    return [_cell(*values) for values in zip(nominal, beside, formats, strict=True)]
+
+
+def _least(margins: Margins, delay: float) -> list[float]:
+    """LEAST_MARGINS of a set of margins, in the units of the names."""
+    phase, gain = np.degrees(margins.phase.min()), decibels(margins.gain.min())
+    values = (phase, gain, margins.sensitivity.max(), margins.disk_all, margins.damping, 1e3 * delay)
+    return [float(value) for value in values]
+
+
+def modes_text(of: LoopMargins) -> str:
+    """The slow modes with little damping as a sentence."""
+    shown = [(w, zeta) for w, zeta in zip(*of.modes, strict=True) if zeta < SHOWN_DAMPING]
+    modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in shown)
+    least = f"; least of the uncertain aircraft {float(of.worst.damping):.2f}" if of.worst is not None else ""
+    return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
+
+
+def margin_table(of: LoopMargins) -> Table:
+    """The margins of a flight's loop."""
+    return Table("Margins of the linear loop", MARGIN_COLUMNS, margin_rows(of), f"{MARGIN_LEGEND}. {modes_text(of)}")
+
+
+def margins_as_json(of: LoopMargins) -> dict[str, Any]:
+    """The margins in SI: phase in rad, gain as factors, delay in s. None for an infinite margin."""
+
+    def of_aircraft(margins: Margins) -> dict[str, Any]:
+        each = ("phase", "crossover", "gain_decrease", "gain_increase", "sensitivity", "disk")
+        by_input = {name: {key: float(getattr(margins, key)[i]) for key in each} for i, name in enumerate(of.inputs)}
+        together = {"disk": float(margins.disk_all), "sensitivity": float(margins.sensitivity_all)}
+        return {"inputs": by_input, "all": together, "damping": float(margins.damping)}
+
+    result: dict[str, Any] = {"nominal": of_aircraft(of.nominal) | {"stable": bool(of.nominal.stable)}}
+    result["nominal"]["modes"] = [{"frequency": w, "damping": zeta} for w, zeta in zip(*map(list, of.modes), strict=True)]
+    result["nominal"]["delay"] = {"all": of.delay, "inputs": dict(zip(of.inputs, of.channel_delay, strict=True))}
+    if of.worst is not None:
+        result["worst"] = of_aircraft(of.worst) | {"delay": {"all": of.worst_delay}}
+        result |= {"aircraft": of.aircraft, "stable": of.stable}
+    return result
+
+
+# Bode and Nyquist plots
+
+
+def bode_figure(loop: LinearLoop) -> Figure:
+    """Gain and phase of L_i over the frequency, nominal aircraft."""
+    w, L = _response(loop)
+    figure = Figure(2, 1, 220, spacing=0.06)
+    for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
+        phase = np.degrees(np.unwrap(np.angle(L[:, k])))
+        phase -= 360.0 * np.ceil(phase[0] / 360.0)
+        for place, (values, unit) in enumerate(((decibels(np.abs(L[:, k])), "dB"), (phase, "deg"))):
+            trace = _trace(name, colour, w, values) | {"hovertemplate": f"%{{y:.3g}} {unit} at %{{x:.3g}} rad/s"}
+            figure.add(trace | {"showlegend": place == 0}, place)
+    ends = [float(w[0]), float(w[-1])]
+    for place, level in ((0, 0.0), (1, -180.0)):
+        add_line(figure, place, "", ends, [level, level], {"color": BOUND, "width": 1.0, "dash": "dot"})
+        figure.data[-1]["showlegend"] = False
+        figure.x[place] |= {"type": "log", "range": [math.log10(end) for end in ends], "showticklabels": place == 1}
+    figure.x[1] |= {"title": {"text": "rad/s"}, "matches": None}
+    figure.y[0] |= {"title": {"text": "gain (dB)"}, "range": [-60.0, 60.0]}
+    figure.y[1] |= {"title": {"text": "phase (deg)"}, "dtick": 90.0}
+    return set_layout(figure, below=44)
+
+
+def nyquist_figure(loop: LinearLoop) -> Figure:
+    """L_i around the point -1, with the unit circle and the circle of sensitivity 2."""
+    _, L = _response(loop)
+    figure = Figure(1, 1, 420)
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    circles = {
+        "abs(L) = 1": (np.cos(turn), np.sin(turn), UNIT_CIRCLE),
+        "S = 2": (0.5 * np.cos(turn) - 1.0, 0.5 * np.sin(turn), BOUND),
+    }
+    for label, (x, y, colour) in circles.items():
+        add_line(figure, 0, label, x.tolist(), y.tolist(), {"color": colour, "width": 1.0, "dash": "dot"})
+    for k, (name, colour) in enumerate(zip(loop.inputs, _colours(loop.inputs), strict=True)):
+        near = np.abs(L[:, k]) < 10.0
+        figure.add(_trace(name, colour, L[near, k].real, L[near, k].imag) | {"hovertemplate": "%{x:.3g} %{y:+.3g} j"})
+    point = {"symbol": "cross", "size": 9, "color": BOUND}
+    figure.add(
+        {"type": "scatter", "x": [-1.0], "y": [0.0], "mode": "markers", "name": "-1", "marker": point, "showlegend": False}
+    )
+    across, up = NYQUIST_RANGE
+    figure.x[0] |= {"title": {"text": "Re L"}, "range": list(across), "constrain": "domain"}
+    figure.y[0] |= {"title": {"text": "Im L"}, "range": list(up), "scaleanchor": "x"}
+    return set_layout(figure, below=44)
+
+
+def _response(loop: LinearLoop) -> tuple[FloatArray, Any]:
+    highest = math.pi / loop.loop.period
+    w = np.geomspace(LOWEST_SHOWN * highest, highest, FREQUENCIES_SHOWN)
+    return w, loop_transfer(loop.nominal, loop.law, loop.loop, w)
+
+
+def _colours(names: Sequence[str]) -> list[str]:
+    return [comparison.COLOURS[k % len(comparison.COLOURS)] for k in range(len(names))]
+
+
+def _trace(name: str, colour: str, x: FloatArray, y: FloatArray) -> dict[str, Any]:
+    line = {"color": colour, "width": 1.4}
+    return {
+        "type": "scatter",
+        "x": x,
+        "y": y,
+        "mode": "lines",
+        "name": name,
+        "legendgroup": name,
+        "line": line,
+        "showlegend": True,
+    }

@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A first scenario for an airframe: commands, actuators, noise, and gusts of a size that fits the aircraft."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from flight_core.parameters import require
+from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
+from flight_design.gains import gain_selection
+from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
+from rise_di_controller.decomposition import search
+from rise_di_controller.params import AllocationConfig
+
+SURFACE_LAG, ENGINE_LAG = 0.05, 0.3  # s, servos and engine of a light aircraft, assumed
+STOP, SURFACE_RATE = 0.35, 1.0  # rad, rad/s: 20 deg, 57 deg/s, assumed
+AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
+USED = 0.4  # part of the authority that the edge of a command takes at most
+NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
+SOFTENING = 2.75  # 1, width of the softened sign in total lags, that of the shipped scenarios
+RATE = 200.0  # Hz, of y and y_m
+FASTEST = {"q": 3.0, "p": 4.0, "r": 2.0, "V": 1.2}  # rad/s, natural frequency of the reference model at most
+LAG_PRODUCT = 0.18  # 1, natural frequency times the lag of the input at most
+
+SCENARIO_YAML = gain_selection.yaml_template("""\
+# The airframe {{ airframe.name }} at {{ airframe.speed | digits(6) }} m/s: commands on every channel, servos, noise\
+{{ ", gusts" if gusts }}.
+# Lags, end stops, rates and noise are assumed: put those of your aircraft here, then select the gains again:
+# rise-di gains {{ path | line }} --scenario {{ scenario | line }} --write gains.yaml
+
+/**/flight:
+  ros__parameters: {duration: 40.0}        # s
+
+/**/aircraft:
+  ros__parameters:
+    airframe: {{ path | flow }}
+    rate: {{ rate | flow }}                        # Hz, y and truth
+    step: {{ step | flow }}                       # s, of the integration
+{% if gusts %}
+    gusts:                             # 1-cosine; entry in s, peak speed in m/s, distance to the peak in m
+{% for axis, gust in gusts.items() %}
+      {{ axis }}: {{ gust | flow }}
+{% endfor %}
+{% endif %}
+    actuators:                         # {{ inputs | join(", ") }}, from trim, SI
+{% for key, values in actuators.items() %}
+      {{ key }}: {{ values | flow }}
+{% endfor %}
+    sensors: {noise: {{ noise | flow }}, seed: 1}  # {{ outputs | join(", ") }}, rms, SI
+
+/**/reference_model:
+  ros__parameters:
+    rate: {{ rate | flow }}                        # Hz
+    outputs: {{ outputs | flow }}
+    second_order:                      # rad/s and 1
+      natural_frequency: {{ frequency | flow }}
+      damping: {{ damping | flow }}
+    rise: 0.2                          # s, edge of a pulse
+    pulses:                            # s, s, and SI
+{% for name, pulse in pulses.items() %}
+      {{ name }}: {{ pulse | flow }}
+{% endfor %}
+{% if turn %}
+    coordinated_turn: {{ turn | flow }}  # r += g/V0 sin(bank commanded)
+{% endif %}
+
+/**/recorder:
+  ros__parameters: {rate: 100.0}
+
+{{ controller }}""")
+
+
+def scenario_text(
+    airframe: Airframe, path: str, scenario: str, controller: str, lag: Sequence[float], size: float = 1.0
+) -> str:
+    """A scenario file for the airframe in `path`, with the text of the section controller; `size` multiplies the commands.
+
+    Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge of a command would take
+    more than USED of the input's authority. Gusts have 3 % of the trim speed.
+    """
+    inputs, outputs, V0 = list(airframe.inputs), list(airframe.outputs), airframe.speed
+    stops, rates = _stops(airframe), _rates(airframe)
+    if len(inputs) > len(outputs):
+        _, law = _distributed(airframe, lag)
+        authority, lag_of = law.upper, dict(zip(outputs, law.lag.tolist(), strict=True))
+    else:
+        paired = pairing(airframe)
+        response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
+        authority, lag_of = response * np.array(stops)[list(paired)], {outputs[i]: lag[j] for i, j in enumerate(paired)}
+    fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
+    banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))  # a bank turns an aeroplane
+    turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
+    amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
+    start, pulses = 2.0, {}
+    for k, output in enumerate(outputs):
+        reachable = USED * float(authority[k]) / fastest[output]
+        value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
+        if output == "r" and turn:
+            continue  # the turns command it
+        length = 8.0 if output in {"V", "u"} else 2.0
+        pulses[output] = {"start": [start, start + 2.0 * length], "stop": [start + length, start + 3.0 * length]}
+        pulses[output]["value"] = [value, -value] if length == 2.0 else [value, 0.0]
+        if length == 8.0:
+            pulses[output] = {"start": [start], "stop": [start + length], "value": [value]}
+        start += 3.0 if length == 2.0 else 4.0
+    gusts = {
+        axis: {"start": 32.0 + 3.0 * k, "speed": round(0.03 * V0, 2), "length": round(0.5 * V0, 1)}
+        for k, axis in enumerate(axis for axis in airframe.gusts if axis != "longitudinal")
+    }
+    return SCENARIO_YAML.render(
+        airframe=airframe,
+        path=path,
+        scenario=scenario,
+        rate=RATE,
+        step=1.0 / RATE,
+        gusts=gusts,
+        inputs=inputs,
+        outputs=outputs,
+        actuators={
+            "lag": list(lag),
+            "lower": [-stop for stop in stops],
+            "upper": stops,
+            "rate": rates,
+        },
+        noise=[NOISE.get(output, 0.001) for output in outputs],
+        frequency=list(fastest.values()),
+        damping=[1.0 if output in {"V", "u"} else 0.9 for output in outputs],
+        pulses=pulses,
+        turn=turn,
+        controller=controller,
+    )
+
+
+def _surfaces(airframe: Airframe) -> list[bool]:
+    return [quantity(given.unit).dimension == ANGLE for given in airframe.inputs.values()]
+
+
+def _stops(airframe: Airframe) -> list[float]:
+    """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the output that it moves."""
+    Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
+    given = np.array([AUTHORITY.get(quantity(unit).dimension, 1.0) for unit in airframe.units_of_outputs().values()])
+    moved = np.argmax(Omega / given[:, None], axis=0).tolist()
+    if len(airframe.inputs) == len(airframe.outputs):
+        for i, j in enumerate(pairing(airframe)):
+            moved[j] = i
+    return [
+        STOP if surface else float(f"{given[i] / max(Omega[i, j], 1e-9):.3g}")
+        for j, (surface, i) in enumerate(zip(_surfaces(airframe), moved, strict=True))
+    ]
+
+
+def _rates(airframe: Airframe) -> list[float]:
+    return [SURFACE_RATE if surface else stop for surface, stop in zip(_surfaces(airframe), _stops(airframe), strict=True)]
+
+
+def _distributed(airframe: Airframe, lag: Sequence[float]) -> tuple[AllocationConfig, LawInputs]:
+    """The allocation of an airframe with more inputs than outputs."""
+    stops = np.array(_stops(airframe))
+    return design_allocation(airframe, Effectors(-stops, stops, np.array(_rates(airframe)), np.array(lag)))
+
+
+def default_lags(airframe: Airframe) -> tuple[float, ...]:
+    """Lags of the inputs, s: a servo for an angle, an engine for the rest."""
+    return tuple(SURFACE_LAG if surface else ENGINE_LAG for surface in _surfaces(airframe))
+
+
+def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
+    """A section controller with gains of 1, for the selection of gains."""
+    allocation, m = None, len(airframe.outputs)
+    if len(airframe.inputs) > m:
+        config, law = _distributed(airframe, lag)
+        allocation, inputs, lags = config.model_dump(exclude_none=True), list(law.names), law.lag.tolist()
+    else:
+        paired = pairing(airframe)
+        inputs, lags = [list(airframe.inputs)[j] for j in paired], [lag[j] for j in paired]
+    require(m > 1, "inputs", inputs[0], "two inputs or more: add a thrust with --thrust, or a second control")
+    values: Mapping[str, Any] = {
+        "rate": 100.0,
+        "outputs": list(airframe.outputs),
+        "inputs": inputs,
+        "D": [1] * m,
+        "k_g": 1.0,
+        "k_d": [1.0] * (m - 1),
+        **dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), [1.0] * m),
+        "sign": "auto",
+        "lag": lags,
+        "delay": 0.003,
+        "softening": SOFTENING,
+        "max_age": 0.1,
+        "hold": 0.5,
+        "ramp": 2.0,
+        **({} if allocation is None else {"allocation": allocation}),
+    }
+    lines = [f"    {key}: {gain_selection.yaml_flow(value, 10)}" for key, value in values.items()]
+    return "\n".join(["/**/controller:", "  ros__parameters:", *lines, ""])
+
+
+def pairing(airframe: Airframe) -> tuple[int, ...]:
+    """The input of each output, as the smallest change that gives D = I, else in their order."""
+    best = search(airframe.matrix_c() @ airframe.matrix_b())
+    if best is None:
+        return tuple(range(len(airframe.outputs)))
+    return tuple(j for _, j in sorted(zip(best.outputs, best.inputs, strict=True)))

@@ -1,0 +1,337 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Gains for an airframe in the loop of a scenario, as `rise-di gains` selects and checks them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from flight_analysis.closed_loop.loop_margins import loop_of, through_allocation
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
+from flight_core.parameters import require
+from flight_design.gains import gain_selection, tuned_gains
+from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
+from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection, Study
+from flight_design.gains.nominal import sizes
+from flight_design.gains.observer_selection import (
+    gains_beside_sketch,
+    gains_by_rule,
+    gains_of_search,
+    model_for,
+    with_aircraft_observer,
+)
+from flight_design.gains.requirement import OBSERVER_REQUIREMENT, PHASE_MARGIN, Requirement, requirement
+from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
+"""Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
+SLOWER = 1.8
+"""Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`, searched with 38 ms in q, they
+have the margins with 55 ms and miss them with 65 and 75 ms. Those of the rule have them from 75 ms on."""
+DIAGONAL, FULL = MIXINGS = ("diagonal", "full")
+MESSAGES = 3.0  # of y: the age limit of the law, at least
+RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
+MAX_SAMPLES = 10_000
+PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
+LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # parts of the trim speed, within the range of the schedule's factor
+
+
+def select_gains(
+    airframe: FilePath | Airframe,
+    scenario: FilePath | Scenario = "osprey_servo",
+    *,
+    uncertainty: float = 0.3,
+    rate: float | None = None,
+    y_rate: float | None = None,
+    lag: ArrayLike | None = None,
+    delay: float | None = None,
+    inputs: str | Sequence[str] = (),
+    gamma_2: float = 0.0,
+    samples: int = 100,
+    seed: int = 1,
+    feedforward: bool = False,
+    observer: bool = False,
+    model: FilePath | Airframe | None = None,
+    margin: float = 0.03,
+    speeds: ArrayLike = (),
+    phase_margin: float = PHASE_MARGIN,
+    accept: bool = False,
+    mixing: str = DIAGONAL,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Selection:
+    """Gains for an airframe by Theorem 1 and by the engineering procedure, with every condition on both.
+
+    The commands, the gusts and the loop are those of the scenario. `scenario.vary(controller=selection.chosen)`
+    flies the engineering gains; `gains_yaml` writes them as a section of a scenario file.
+
+    Args:
+        airframe: Name in the library, path of an airframe file (.yaml), or an Airframe.
+        scenario: Name, path of a scenario file (.yaml), or a Scenario.
+        uncertainty: Largest relative deviation of each entry of A and B, 0 to 1.
+        rate: Rate of the law in Hz; None: that of the scenario.
+        y_rate: Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three.
+        lag: Lags of the actuators in s, one or one an input in the airframe's order; None: those of the scenario.
+        delay: Pure delay in s; None: that of the scenario.
+        inputs: Input of each output, in the airframe's order: a list, or a text with commas. Empty: the airframe's.
+        gamma_2: gamma_2 of Lemma 1 in 1/s, an assumption.
+        samples: Number of uncertain airframes for the bounds of the theorem, at most 10,000.
+        seed: Seed of the uncertain airframes.
+        feedforward: Whether the engineering gains have the airframe as the model of a feedforward.
+        observer: Whether they have a feedforward and an observer, and gains beside these.
+        model: Airframe that the observer takes as its model; None: the airframe itself.
+        margin: Least delay margin of the nominal loop with the observer, s.
+        speeds: Two parts of the trim speed, one below 1 and one above, with models of their own. A schedule flies the observer
+            from the one to the other. Empty: the observer holds at the trim speed alone.
+        phase_margin: Least phase margin of the nominal loop behind servos, deg, beside 6 dB, a sensitivity of at most 2 and
+            a damping of 0.4; 35 deg with the observer.
+        accept: Whether less than 40 deg are accepted.
+        mixing: "diagonal": an input an output; "full": the law has inputs v of its own, an allocation u = T v by the
+            pseudo-inverse of the airframe's C B distributes them. More inputs than outputs always have an allocation.
+        progress: Called with a sentence before a step of the search for the observer.
+
+    Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
+    """
+    chosen, frame = find_scenario(scenario), load_airframe(airframe)
+    chosen.rise_di()
+    require(callable(progress), "progress", progress, "a function of a text")
+    require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
+    loop = _loop(chosen, frame, rate, y_rate, lag, delay)
+    if mixing == FULL or len(frame.inputs) > len(frame.outputs):
+        loop, frame = _allocated(loop, chosen, frame)
+    else:
+        loop = _with_limits(_without_allocation(loop, chosen), chosen, frame)
+    setting = loop._replace(
+        inputs=as_names(inputs, "inputs", f"the inputs {', '.join(frame.inputs)} in any order"),
+        gamma_2=as_number(gamma_2, "gamma_2", 0.0, unit="1/s"),
+        feedforward=feedforward,
+        requirement=requirement(phase_margin, accept=accept),
+    )
+    require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
+    margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
+    ratios = as_numbers(speeds, "speeds", expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4")
+    require(
+        observer or not ratios, "speeds", speeds, "observer beside them: the bare law follows the airspeed by schedule alone"
+    )
+    pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
+    fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
+    require(fits, "speeds", speeds, f"{expected}, from {LEAST_SPEED:g} to {MOST_SPEED:g}")
+    known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
+    selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
+    if not observer:
+        return selection
+    needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
+    controller, origin = observed(selection.chosen, chosen, known_model, margin, needed, speeds=pair, progress=progress)
+    return replace(selection, chosen=controller, origin=origin)
+
+
+def check_gains(
+    airframe: FilePath | Airframe,
+    scenario: FilePath | Scenario = "osprey_servo",
+    *,
+    uncertainty: float = 0.3,
+    gamma_2: float = 0.0,
+    samples: int = 100,
+    seed: int = 1,
+) -> GainAssessment[ControllerConfig]:
+    """Every condition on the gains of a scenario under any law, and the margins of the loop; arguments as for `select_gains`.
+
+    Raises ParameterError.
+    """
+    chosen = find_scenario(scenario)
+    frame = through_allocation(load_airframe(airframe), chosen.controller)
+    gamma_2 = as_number(gamma_2, "gamma_2", 0.0, unit="1/s")
+    return gain_selection.check_gains(chosen, study(frame, chosen, uncertainty, samples, seed), gamma_2)
+
+
+def study(airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int) -> Study:
+    """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario. Raises ParameterError."""
+    return gain_selection.study_airframe(
+        airframe,
+        gain_selection.manoeuvre(scenario, airframe),
+        as_number(uncertainty, "uncertainty", 0.0, 1.0),
+        as_count(samples, "samples", 0, MAX_SAMPLES),
+        as_count(seed, "seed", 0),
+    )
+
+
+def _loop(
+    scenario: Scenario,
+    airframe: Airframe,
+    rate: float | None,
+    y_rate: float | None,
+    lag: ArrayLike | None,
+    delay: float | None,
+) -> LoopSetting:
+    """The loop of a scenario with another rate of the law or of y, Hz, lag or delay, s. Raises ParameterError.
+
+    The law steps with each y, so the lag of sampling is 1.5 periods of y. Those of the law are counted from its own rate.
+    """
+    loop = gain_selection.loop_setting(scenario)
+    if rate is not None:
+        loop = loop._replace(rate=as_number(rate, "rate", *RATES, "Hz"))
+    if delay is not None:
+        loop = loop._replace(delay=as_number(delay, "delay", 0.0, MAX_DELAY_MARGIN, "s"))
+    if lag is not None:
+        loop = loop._replace(lag=lags_by_input(lag, airframe))
+    if y_rate is not None:
+        y_rate = as_number(y_rate, "y_rate", *RATES, "Hz")
+        age = max(loop.base.max_age, MESSAGES / y_rate)
+        loop = loop._replace(
+            delay=loop.delay + 1.5 * max(1.0 / y_rate - 1.0 / loop.rate, 0.0),
+            base=loop.base.model_copy(update={"max_age": age}),
+        )
+    return loop
+
+
+def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> LoopSetting:
+    """The loop with limits of u within the end stops of the scenario's actuators; without limits for another aircraft."""
+    aircraft = scenario.aircraft
+    if aircraft.is_jsbsim or load_airframe(aircraft.airframe).name != airframe.name:
+        return loop._replace(base=loop.base.model_copy(update=dict.fromkeys(gain_selection.INPUT_LIMITS)))
+    limits = {}
+    for key, tighter in (("lower", max), ("upper", min)):
+        stops = getattr(aircraft.actuators, key)
+        if stops:
+            by_input = dict(zip(aircraft.channels().inputs, stops, strict=True))
+            own = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
+            limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(own, loop.base.inputs, strict=True))
+    return loop._replace(base=loop.base.model_copy(update=limits))
+
+
+def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
+    """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of the actuators."""
+    if loop.base.allocation is None:
+        return loop
+    names, actuators = tuple(scenario.aircraft.channels().inputs), scenario.aircraft.actuators
+    plain = {"allocation": None, "inputs": names, **dict.fromkeys(gain_selection.INPUT_LIMITS)}
+    lag = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True))
+    return loop._replace(base=loop.base.model_copy(update=plain), lag=lag | dict(loop.lag))
+
+
+def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tuple[LoopSetting, Airframe]:
+    """The loop and the airframe that the law sees through an allocation by the airframe's own C B.
+
+    Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops of the airframe's actuators.
+    """
+    actuators, names = scenario.aircraft.actuators, list(airframe.inputs)
+    own = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
+    stops = own and actuators.lower and actuators.upper
+    require(bool(stops), "scenario", scenario.name, f"a scenario of {airframe.name} with aircraft.actuators, lower and upper")
+    given = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True)) | dict(loop.lag)
+    rate = np.array(actuators.rate or [np.inf] * len(names))
+    lag = np.array([given[name] for name in names])
+    effectors = Effectors(np.array(actuators.lower), np.array(actuators.upper), rate, lag)
+    earlier = loop.base.allocation
+    kept = () if earlier is None or earlier.priority is None else [name.removeprefix(LAW_INPUT) for name in earlier.priority]
+    allocation, law = design_allocation(airframe, effectors, kept)
+    m, slew = len(law.names), dict(zip(law.names, law.slew.tolist(), strict=True))
+    base = {
+        "outputs": airframe.outputs,
+        "inputs": law.names,
+        "allocation": allocation.model_dump(),
+        "lower": law.lower.tolist(),
+        "upper": law.upper.tolist(),
+        "slew": None,
+        "D": [1] * m,
+        "lag": law.lag.tolist(),
+        "k_d": [1.0] * (m - 1),
+        **dict.fromkeys(("Lambda", "beta", "omega", "input_scale"), [1.0] * m),
+        "softening": 1.0,
+        "feedforward": None,
+        "observer": None,
+        "learn": None,
+        "schedule": None,
+    }
+    T = np.reshape(allocation.T, (len(names), m))
+    return (
+        loop._replace(
+            base=RiseDiConfig.validate_mapping(scenario.rise_di().model_dump() | base, "controller"),
+            lag=dict(zip(law.names, law.lag.tolist(), strict=True)),
+            rate_limit={name: limit for name, limit in slew.items() if np.isfinite(limit)},
+        ),
+        airframe.through(T, law.names),
+    )
+
+
+def lags_by_input(lag: ArrayLike, airframe: Airframe) -> dict[str, float]:
+    """Lags by input, s. Raises ParameterError."""
+    names = list(airframe.inputs)
+    values = as_numbers(lag, "lag", expected := "seconds, 0 or more")
+    values = values * len(names) if len(values) == 1 else values
+    require(len(values) == len(names), "lag", f"{len(values)} values", f"one for all or one for each of {', '.join(names)}")
+    require(min(values) >= 0.0, "lag", lag, expected)
+    return dict(zip(names, values, strict=True))
+
+
+def observed(
+    controller: RiseDiConfig,
+    scenario: Scenario,
+    model: Airframe,
+    margin: float,
+    needed: Requirement = OBSERVER_REQUIREMENT,
+    *,
+    uncertain: bool = True,
+    sketched: bool = False,
+    speeds: tuple[float, float] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[RiseDiConfig, str]:
+    """A controller with feedforward and observer of a model, and a sentence on its gains.
+
+    The gains are those that `rise-di compare --tune` found in the scenario, or in one that ships with its airframe and lags,
+    where the model has the same states and no channel has SLOWER times the total lag; else they follow from the lags by a rule.
+    Of several gain sets it is the one that the margins change least, then the one of the least cost. `uncertain` counts the
+    phase margin of uncertain aircraft too, `sketched` takes the gains for a model from a sketch, and `speeds` are two ratios to
+    the trim speed, with models there. `progress` as for `with_aircraft_observer`.
+    """
+    channels = scenario.aircraft.channels().outputs
+    by_name = dict(zip(channels, scenario.aircraft.sensors.noise or (0.0,) * len(channels), strict=True))
+    measured = [name for name in scenario.aircraft.vanes.channels if name in model.states]
+    vanes: dict[str, float] = {name: by_name[name] or PERFECT_VANE for name in measured}
+    perfect = (
+        sizes(model.units_of_outputs()[name] for name in controller.outputs) / 100.0
+    )  # noise in place of none, of a perfect sensor
+    noise = np.array([by_name[name] or least for name, least in zip(controller.outputs, perfect, strict=True)])
+    nominal = model_for(model, controller, noise)
+    tuned = _tuned_scenario(scenario)
+    results = {} if sketched else {law: tuned_gains.find(tuned, law, OBJECTIVE) for law in OBSERVER_LAWS}
+    searched = sorted(
+        ((result.cost, law, result) for law, result in results.items() if result is not None), key=lambda row: row[0]
+    )
+    axes, origin = tuple(model.gusts), "gains by a rule from the lags, a start"
+    candidates = [(gains_by_rule(nominal, axes, model.speed), origin)]
+    if sketched:
+        candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
+    of_tuned = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
+    ratios = [lag / of_tuned.get(name, np.inf) for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)]
+    if searched and max(ratios) < SLOWER and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
+        titles = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
+        of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
+        candidates = list(zip(of_search, titles, strict=True))
+    sets, origins = zip(*candidates, strict=True)
+    found = with_aircraft_observer(
+        controller, model, sets, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds, progress=progress
+    )
+    origin = origins[found.place]
+    factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
+    relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
+    lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
+    margins = f"delay margin {1e3 * found.delay_margin:.0f} ms, phase margin {np.degrees(found.phase_margin):.0f} deg"
+    beside = f" with vanes for {' and '.join(vanes)}" if vanes else ""
+    return found.controller, f"observer of {model.name}{beside}: {origin}{lowered}; {margins}"
+
+
+def _tuned_scenario(scenario: Scenario) -> Scenario:
+    """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
+    shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
+    own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
+    alike = (candidate for candidate in shipped if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == own)
+    return next(
+        (candidate for candidate in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(candidate))), scenario
+    )

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a phase margin costs: the error of the linear loop along a manoeuvre, for gains selected by several requirements."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, linear_loop
+from flight_core.vectors import FloatArray
+from flight_design.gains.gain_selection import STEP, Selection, Study, select_gains
+from rise_di_controller.linear_loop import closed_loop, zero_order_hold
+
+TRADED_PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg
+
+
+class TradeRow(NamedTuple):
+    """The engineering gains for a phase margin."""
+
+    phase_margin: float  # deg, the requirement
+    found: float  # deg, the least of the loop
+    delay_margin: float  # s
+    rms: FloatArray  # (m,) of the error of the linear loop along the manoeuvre, SI, by output of the law
+
+
+def trade(selection: Selection, phase_margins: Sequence[float] = TRADED_PHASE_MARGINS) -> tuple[TradeRow, ...]:
+    """The engineering gains of a selection for other phase margins, deg, and their errors on the nominal aircraft."""
+    nominal = _nominal(selection.study)
+    rows = []
+    for phase_margin in phase_margins:
+        needed = selection.setting.requirement._replace(phase=math.radians(phase_margin))
+        assessed = select_gains(nominal, selection.setting._replace(requirement=needed)).engineering
+        if assessed.margins is None:
+            continue
+        loop = linear_loop(assessed.controller, nominal.airframe, nominal.A, nominal.B)
+        least = math.degrees(float(assessed.margins.nominal.phase.min()))
+        _, columns = law_order(nominal.airframe, assessed.controller)
+        rms = linear_error(loop, nominal.u_dot[:, 0][:, columns])
+        rows.append(TradeRow(phase_margin, least, assessed.margins.delay, rms))
+    return tuple(rows)
+
+
+def _nominal(study: Study) -> Study:
+    """The study of the nominal airframe alone."""
+    return study._replace(A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1])
+
+
+def linear_error(of: LinearLoop, u_dot: FloatArray) -> FloatArray:
+    """Rms of e of the nominal linear loop that has to give the ideal control u*, (m,), SI.
+
+    u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the aircraft, from trim on.
+    `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
+    """
+    period = of.loop.period
+    u = np.concatenate([np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)])
+    t = period * (np.arange(int((len(u) - 1) * STEP / period)) + 0.5)
+    held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
+    step = closed_loop(of.nominal, of.law, of.loop, np.zeros(u.shape[1]))
+    _, drive = zero_order_hold(of.nominal.A, of.nominal.B, period)
+    n, state, total = len(of.nominal.A), np.zeros(len(step)), np.zeros(len(of.nominal.C))
+    for disturbance in -(held @ drive.T):
+        state = step @ state
+        state[:n] += disturbance
+        total += (of.nominal.C @ state[:n]) ** 2
+    return np.asarray(np.sqrt(total / max(len(t), 1)))

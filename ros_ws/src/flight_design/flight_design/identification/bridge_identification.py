@@ -1,0 +1,558 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""From a channel map to gains without a model: the scenario of an experiment, and a scenario for the aircraft.
+
+The experiment excites the inputs in turn, open loop. `identify_response` estimates Omega, lags and delays from the log. The
+airframe of the scenarios is y_dot = Omega u: nothing further is known of the aircraft.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.uncertainty import nominal_and_sampled
+from autopilot_bridge.channel_map import to_channel
+from autopilot_bridge.params import UNITS, ChannelMap
+from control_laws.excitation import ExcitationConfig
+from flight_analysis.closed_loop.loop_margins import LoopMargins, linear_loop, loop_assessment
+from flight_core.files import comment, dump_yaml
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import FloatArray
+from flight_design.gains import gain_selection
+from flight_design.gains.gain_conditions import bandwidths
+from flight_design.gains.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
+from flight_design.gains.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
+from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
+from flight_design.identification.response_identification import MIN_RATIO, Response, Spans
+from flight_design.identification.sign_check import motion_as_channel_grows, output_signs
+from flight_design.identification.step_identification import DAMPING, NATURAL_FREQUENCY, PULSE_P, PULSE_V, reference_parameters
+from flight_log.engagements import Engagement
+from reference_model.params import ReferenceModelConfig
+from rise_di_controller.law import Sign
+from rise_di_controller.linear_loop import Loop
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+RATE = 100.0  # Hz, of law and reference model by default
+
+AMPLITUDE = 0.2  # of the smaller limit of an input, by default
+
+
+class Excitation(NamedTuple):
+    """The excitation of an input."""
+
+    width: float = 0.25  # s
+    period: float = 6.0  # s
+    lowest: float = 0.3  # Hz
+    highest: float = 8.0  # Hz
+
+
+EXCITATIONS: Mapping[str, Excitation] = {
+    "V": Excitation(1.0, 12.0, 0.1, 0.8),  # engines take longer
+    "climb": Excitation(0.8, 10.0, 0.1, 1.5),  # the climb is an integral: slow commands move it more than its noise
+}
+"""By the motion that the input causes; another input turns the aircraft."""
+PAUSE = 1.5  # s, between the inputs
+
+REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequency per bandwidth of a channel, at most
+HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V or climb needs in the end; the rest is for disturbances
+HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
+FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
+UNCERTAINTY, SAMPLES = 0.3, 20  # of the uncertain aircraft whose phase margin counts
+MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
+INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
+AGE, HOLD, RAMP = (
+    1.5,
+    0.5,
+    2.0,
+)  # failsafe of the controller: its age limit per largest one of the bridge, which acts first; s, s
+WAIT = 30.0  # s before the first command of the flight: the time to engage
+
+
+def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
+    """Outputs and driving inputs by the motions of the map, and the signs of the effects, (m,).
+
+    Raises ParameterError for an output without an input, and for one with the opposite sign.
+    """
+    driven: dict[str, tuple[str, int]] = {}
+    for name, row in channel_map.inputs.items():
+        output, sign = row.motion
+        other = driven.setdefault(output, (name, sign))
+        require(other[0] == name, f"map {channel_map.name}: inputs", f"{other[0]} and {name} both for {output}", "one of them")
+    moved = motions(channel_map)
+    for (name, motion), sign in zip(moved.items(), output_signs(channel_map), strict=True):
+        require(motion in driven, f"map {channel_map.name}: inputs", f"none that moves {name}", "one input for each output")
+        require(sign > 0.0, f"map {channel_map.name}: outputs.{name}", "the opposite sign", "the stack's signs")
+    inputs = tuple(driven[motion][0] for motion in moved.values())
+    return ChannelPairing(tuple(moved), inputs), np.array([float(driven[motion][1]) for motion in moved.values()])
+
+
+def motions(channel_map: ChannelMap) -> dict[str, str]:
+    """The motion of each output of a map, a key of UNITS: the name of q, p, r and V."""
+    return {name: row.motion[0] for name, row in channel_map.outputs.items()}
+
+
+def has_airspeed(channel_map: ChannelMap) -> bool:
+    """Whether a map has an airspeed: without one the aircraft hovers."""
+    return "V" in motions(channel_map).values()
+
+
+def require_envelope(channel_map: ChannelMap) -> None:
+    """Raise ParameterError for a map without limits of the speeds, and of a measured attitude: nothing further guards."""
+    needed: list[str] = [name for name in ("phi", "theta") if name in channel_map.pose]
+    needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
+    missing = [name for name in needed if name not in channel_map.envelope]
+    limits = ", ".join(needed)
+    found = f"none of {', '.join(missing)}"
+    require(not missing, f"map {channel_map.name}: envelope", found, f"limits of {limits}: an experiment is open loop")
+
+
+class Experiment(NamedTuple):
+    """The files of an experiment."""
+
+    airframe: str  # text of the airframe file: signs alone
+    scenario: str  # text of the scenario file
+    controller: ExcitationConfig
+
+
+def experiment(
+    channel_map: ChannelMap, speed: float | None, amplitude: float, airframe_file: str, wait: float = WAIT
+) -> Experiment:
+    """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s, None in hover."""
+    pairing, sign = channel_pairs(channel_map)
+    rows = [channel_map.inputs[name] for name in pairing.inputs]
+    m, chosen = len(rows), [EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()]
+    controller = ExcitationConfig.validate_mapping(
+        _controller(channel_map, pairing)
+        | {
+            "law": "excitation",
+            "D": [int(value) for value in sign],
+            "input_scale": [1.0] * m,
+            "lag": [0.0] * m,
+            "delay": 0.0,
+            "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
+            "pause": PAUSE,
+        }
+        | {key: [getattr(excitation, key) for excitation in chosen] for key in Excitation._fields},
+        "controller",
+    )
+    none = {"rate": RATE, "outputs": list(pairing.outputs), "rise": 0.1}
+    none["second_order"] = {"natural_frequency": [1.0] * m, "damping": [1.0] * m}
+    heading = f"Experiment on the aircraft behind the map {channel_map.name}: each input is excited by itself, open loop."
+    return Experiment(
+        airframe_yaml(channel_map, pairing, signs_alone(sign), speed, "signs of the channel map; sizes not known"),
+        scenario_text(heading, airframe_file, wait + controller.duration, none, controller.model_dump(exclude_defaults=True)),
+        controller,
+    )
+
+
+WHOLE = 0.95  # of the planned duration: reports of the engagement are late by less than the rest
+
+
+def cut_short(flown: Sequence[Engagement], duration: float) -> str:
+    """When and why the bridge released before the end of an experiment, as a sentence; empty for a whole one.
+
+    Arguments: the engagements of the log; the planned duration, s.
+    """
+    lengths = [math.inf if part.stop_ns is None else (part.stop_ns - part.start_ns) / NANOSECONDS for part in flown]
+    engaged = max(lengths)
+    if engaged > WHOLE * duration:
+        return ""
+    return f"the bridge released after {engaged:.0f} of {duration:.0f} s: {flown[lengths.index(engaged)].reason}"
+
+
+def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: float | None) -> list[ChannelModel | None]:
+    """The models of the channels of a map from the log of an experiment, engaged in `spans`; None for no model.
+
+    Arguments: `speed` in trim, m/s, None in hover. V has no model without a measured climb: the phugoid, which thrust excites
+    too, would be taken for a response to thrust. A climb in hover is of first order. Source: G. D. Padfield, "Helicopter Flight
+    Dynamics", 2007, 4.3 (heave).
+    """
+    pairing, sign = channel_pairs(channel_map)
+    y, u = tape["y"].within(spans), tape["u"].within(spans)
+    gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
+    moved = motions(channel_map)
+    return [
+        None
+        if moved[output] == "V" and gravity is None
+        else fit_channel(
+            y, u, output, name, direction, gravity if moved[output] == "V" else None, first_order=moved[output] == "climb"
+        )
+        for output, name, direction in zip(pairing.outputs, pairing.inputs, sign.tolist(), strict=True)
+    ]
+
+
+def gravity_along_path(pose: Signal, speed: float) -> Signal | None:
+    """V_dot by gravity, -g climb / speed, m/s^2, at the stamps of a pose; None without a climb."""
+    if "climb" not in pose.names:
+        return None
+    known = np.isfinite(pose["climb"])
+    return Signal(pose.stamp_ns[known], ("V",), -GRAVITY / speed * pose["climb"][known, None]) if known.any() else None
+
+
+class Channels(NamedTuple):
+    """What is known of m channels, output i driven by input i; SI."""
+
+    Omega: FloatArray  # (m, m)
+    Omega_deviation: FloatArray  # (m,) of its diagonal
+    lag: FloatArray  # (m,) s
+    delay: FloatArray  # (m,) s
+    damping: FloatArray  # (m,) 1/s; 0 where none is known
+    stiffness: FloatArray  # (m,) 1/s^2
+    zero: FloatArray  # (m,) 1/s, slow / Omega
+    misfit: FloatArray  # (m,) rms of the output error / rms of y; NaN where the step response alone is known
+
+
+def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelModel | None]) -> Channels:
+    """The models of the channels with a model, the step responses of the rest.
+
+    Raises ParameterError for a channel without a certain result, and for signs in contradiction to the map or among themselves.
+    """
+    pairing, sign = channel_pairs(channel_map)
+    Omega, m = np.where(np.isfinite(response.Omega), response.Omega, 0.0), len(sign)
+    Omega = np.where(np.abs(Omega) > MIN_RATIO * np.nan_to_num(response.Omega_deviation, nan=np.inf), Omega, 0.0)
+    deviation, lag, delay = np.diag(response.Omega_deviation).copy(), response.lag.copy(), response.delay.copy()
+    damping, stiffness, zero, misfit = np.zeros(m), np.zeros(m), np.zeros(m), np.full(m, np.nan)
+    refused = []
+    for i, (name, output, model) in enumerate(zip(pairing.inputs, pairing.outputs, models, strict=True)):
+        if model is not None and model.usable:
+            Omega[i, i], deviation[i] = model.Omega, np.sqrt(model.covariance[2, 2])
+            lag[i], delay[i] = model.lag, model.delay
+            damping[i], stiffness[i], zero[i] = model.damping, model.stiffness, model.slow / model.Omega
+            misfit[i] = model.misfit
+        elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
+            refused.append(response.refusal[i] or response.sign_refusal(i))
+            continue
+        else:
+            Omega[i, i] = response.Omega[i, i]
+        opposite = f"{output}_dot that {'falls' if Omega[i, i] < 0.0 else 'rises'} with {name}"
+        require(Omega[i, i] * sign[i] > 0.0, f"map {channel_map.name}: inputs.{name}", opposite, "the opposite: change `sign`")
+    if refused:
+        raise ParameterError("; ".join(refused))
+    return Channels(Omega, deviation, lag, delay, damping, stiffness, zero, misfit)
+
+
+class Flyable(NamedTuple):
+    """A controller for an identified aircraft, and the files for a flight."""
+
+    controller: RiseDiConfig
+    delay_margin: float | None  # s, of the identified channels with the lags and the delay; None without a softened sign
+    lacking: str  # margins that the requirement asks for and the loop does not have, "" for none
+    airframe: str  # text of the airframe file
+    scenario: str  # text of the scenario file
+
+
+def flying_scenario(
+    channel_map: ChannelMap, found: Channels, speed: float | None, airframe_file: str, needed: Requirement = REQUIREMENT
+) -> Flyable:
+    """Gains for identified channels, and the texts of airframe and scenario.
+
+    The bandwidths follow from lag, delay and rate by the engineering procedure, for y_dot = Omega u. The integrals follow
+    from damping and stiffness. Integrals and bandwidths fall until the loop around the identified channels has the margins
+    `needed`. The feedforward has the airframe as model, in coordinated turns without sideslip.
+    """
+    pairing, _ = channel_pairs(channel_map)
+    delay = float(np.min(found.delay))
+    later = found.lag + found.delay - delay  # the controller has one delay: what a channel has beyond it counts as its lag
+    moved = motions(channel_map)
+    products = {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved.items()}
+    loop = Loop(later, delay, 1.0 / RATE)
+    bandwidth = dict(zip(pairing.outputs, bandwidths(loop, np.array(list(products.values()))).tolist(), strict=True))
+    rows = {name: channel_map.inputs[name] for name in pairing.inputs}
+    range_ = np.array([min(-row.lower, row.upper) for row in rows.values()])
+    authority = dict(zip(pairing.outputs, (np.abs(np.diag(found.Omega)) * range_).tolist(), strict=True))
+    held = {
+        name: HELD_FRACTION * authority[name] / max(damping, 1e-3)
+        for name, damping in zip(pairing.outputs, found.damping.tolist(), strict=True)
+    }
+    commands = _commands(moved, bandwidth, speed, authority, held)
+    lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
+    ones = [1.0] * len(pairing.inputs)
+    base = RiseDiConfig.validate_mapping(
+        _controller(channel_map, pairing)
+        | dict.fromkeys(("Lambda", "beta", "input_scale", "omega"), ones)
+        | {"k_g": 1.0, "k_d": ones[1:], "D": [1] * len(ones), "sign": "auto", "softening": gain_selection.SOFTENING}
+        | {"lag": list(lag.values()), "delay": delay},
+        "controller",
+    )
+    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
+    range_rate = range_ / FULL_RANGE_TIME
+
+    airframe = airframe_yaml(channel_map, pairing, found, speed, "identified in flight")
+    frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
+    slew = gain_selection.study_airframe(frame, manoeuvre, samples=1).slew
+    none = found._replace(damping=0.0 * found.damping, stiffness=0.0 * found.stiffness, zero=0.0 * found.zero)
+    integrators = Airframe.validate_mapping(
+        yaml.safe_load(airframe_yaml(channel_map, pairing, none, speed, "none")), "airframe"
+    )
+    # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
+    studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
+    studied = studied._replace(slew=np.maximum(slew, range_rate))
+    setting = LoopSetting(base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed)
+    selection = gain_selection.select_gains(studied, setting)
+    flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, found, loop), frame, needed)
+    turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
+    model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
+    flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
+    heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
+    heading += f"\n# {gain_selection.margins_sentence(flown, margins)}"
+    text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
+    lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
+    return Flyable(flown, None if margins is None else margins.delay, lacking, airframe, text)
+
+
+def _within_margins(
+    controller: RiseDiConfig, airframe: Airframe, needed: Requirement
+) -> tuple[RiseDiConfig, LoopMargins | None]:
+    """The controller with slower integrals and lower bandwidths where the loop around an airframe lacks margins; the margins.
+
+    A bandwidth falls with the input scale: K of (22) stays.
+    """
+    if controller.sampled_sign()[0] is not Sign.SOFT:
+        return controller, None
+    A, B = nominal_and_sampled(airframe, UNCERTAINTY, SAMPLES, 1)
+
+    def build(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
+        ones = np.ones(len(controller.outputs))
+        changes: dict[str, FloatArray] = {
+            "Lambda": np.array(controller.Lambda) / (slower * lower) * ones,
+            "softening": np.array(controller.softening) * (slower * lower) * ones,
+            "input_scale": np.array(controller.input_scale) / lower * ones,
+            "omega": np.array(controller.omega) / lower * ones,
+            "beta": np.array(controller.beta) * lower * ones,  # the same rate of u
+        }
+        values = controller.model_dump() | {key: value.tolist() for key, value in changes.items()}
+        chosen = RiseDiConfig.validate_mapping(values, "controller")
+        return Candidate(chosen, linear_loop(chosen, airframe, A, B))
+
+    chosen = within_requirement(build, needed)
+    return chosen.controller, loop_assessment(chosen.loop)
+
+
+def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
+    """Channels of r with damping alone: the stiffness of a straight flight would skid in a coordinated turn.
+
+    The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the stiffness would skid.
+    """
+    turns = np.array([name == "r" for name in pairing.outputs])
+    damping = np.where(turns, found.damping - found.zero, found.damping)
+    return found._replace(
+        damping=damping, stiffness=np.where(turns, 0.0, found.stiffness), zero=np.where(turns, 0.0, found.zero)
+    )
+
+
+def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiConfig:
+    """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
+
+    Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
+    order the integral is the damping, and the loop is K / s. A stiff channel answers u with a rate and needs a larger integral,
+    but a lower integral where the sensitivity would exceed MAX_SENSITIVITY. Source: K. J. Astrom, T. Hagglund, "Advanced PID
+    Control", 2006, 6.5 (lambda tuning), 4.6 (largest sensitivity).
+    """
+    places = [pairing.outputs.index(name) for name in controller.outputs]
+    params = controller.law_params()
+    crossover = params.K * params.input_scale * np.abs(np.diag(found.Omega)[places])
+    of_sign = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
+    Lambda = [
+        max(float(own), _integral(found, i, float(K), float(loop.total[i])) - float(slope))
+        for own, i, K, slope in zip(controller.Lambda, places, crossover, of_sign, strict=True)
+    ]
+    return RiseDiConfig.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
+
+
+def _integral(found: Channels, i: int, crossover: float, total_lag: float) -> float:
+    """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the largest safe integral below."""
+    omega = np.geomspace(0.1, 1e3, 400) * crossover
+
+    def response(omega: Any) -> Any:
+        """Of K times the model, without the delay."""
+        s = 1j * omega
+        return crossover * (s + found.zero[i]) / (s**2 + found.damping[i] * s + found.stiffness[i])
+
+    wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
+    delayed = response(omega) * np.exp(-1j * omega * total_lag)
+    safe = (
+        integral
+        for integral in wanted * INTEGRALS
+        if np.min(np.abs(1.0 + delayed * (1.0 - 1j * integral / omega))) > 1.0 / MAX_SENSITIVITY
+    )
+    return float(next(safe, 0.0))
+
+
+def measured_trims(channel_map: ChannelMap, would_send: Signal, engaged_ns: int) -> dict[str, float]:
+    """The commands in trim by input, from what the bridge sent in the pause after an engagement, when u was 0; SI."""
+    stamps = (would_send.stamp_ns - engaged_ns) / NANOSECONDS
+    still = (stamps > 0.2 * PAUSE) & (stamps < 0.8 * PAUSE)
+    require(bool(still.any()), "bridge/would_send", "no sample after the engagement", "a log of the experiment")
+    rows = channel_map.inputs.items()
+    return {name: to_channel(float(np.median(would_send[f"{row.message}.{row.field}"][still])), row.line) for name, row in rows}
+
+
+def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[ChannelMap, list[str]]:
+    """A map whose limits around trims stay in the ranges of the fields, and a sentence for each narrower one.
+
+    Raises ParameterError for a trim at a stop.
+    """
+    values, sentences = channel_map.model_dump(exclude_unset=True), []
+    for name, trim in trims.items():
+        row = channel_map.inputs[name]
+        low, high = sorted(to_channel(raw, row.line) for raw in row.range)
+        key, way_on = f"map {channel_map.name}: inputs.{name}", "fly slower, or trim the aircraft otherwise"
+        require(low < trim < high, key, f"a trim of {trim:.4g} at its stop", f"room on both sides: {way_on}")
+        for side, limit, room in (("lower", row.lower, low - trim), ("upper", row.upper, high - trim)):
+            if abs(limit) > abs(room):
+                values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")  # the trim is rounded too
+                found = f"{name}: its trim is {trim:.3g}, so that the {side} limit is {room:.3g} in place of {limit:.3g}"
+                sentences.append(f"{found}: {way_on}")
+    return ChannelMap.validate_mapping(values, f"map {channel_map.name}"), sentences
+
+
+def map_text(channel_map: ChannelMap, trims: Mapping[str, float], source: str) -> str:
+    """The text of a channel map with measured trims. A captured trim is measured again at every engagement."""
+    values = channel_map.model_dump(exclude_unset=True)
+    values["source"] = f"{values['source']}; trims measured in {source}"
+    for name, trim in trims.items():
+        values["inputs"][name]["trim"] = float(f"{trim:.5g}")
+    ChannelMap.validate_mapping(values, f"map {channel_map.name}")
+    return yaml.dump(_plain(values), Dumper=_WholeRows, sort_keys=False, width=128)
+
+
+class _WholeRows(yaml.SafeDumper):
+    """Rows without shared references."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _controller(channel_map: ChannelMap, pairing: ChannelPairing) -> dict[str, Any]:
+    """Parameters of the controller by the map."""
+    rows = [channel_map.inputs[name] for name in pairing.inputs]
+    limits = {"lower": [row.lower for row in rows], "upper": [row.upper for row in rows]}
+    common = {"rate": RATE, "outputs": list(pairing.outputs), "inputs": list(pairing.inputs)}
+    max_age = AGE * max(row.max_age for row in channel_map.outputs.values())
+    return common | limits | {"max_age": max_age, "hold": HOLD, "ramp": RAMP}
+
+
+def _commands(
+    moved: Mapping[str, str],
+    bandwidth: Mapping[str, float],
+    speed: float | None,
+    authority: Mapping[str, float],
+    held: Mapping[str, float],
+) -> dict[str, Any]:
+    """Commands after WAIT, by a reference model within reach of the loop; V and climb to `held` m/s.
+
+    With an airspeed they are those of `reference_parameters`, in hover doublets of one channel after another and a climb.
+    Arguments, by output: the motion, the bandwidth, rad/s, the authority, y_dot, and the speed that half of it holds.
+    """
+    motion_of = {motion: name for name, motion in moved.items()}
+    cruise = None if speed is None else reference_parameters(speed, authority.get("V", 1.0))
+    fastest = {"climb": NATURAL_FREQUENCY["V"], **NATURAL_FREQUENCY}
+    if cruise is not None:
+        fastest |= dict(zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True))
+    limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
+    pulses = {
+        motion_of[motion]: pulse | {key: [WAIT + t for t in pulse[key]] for key in ("start", "stop")}
+        for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items()
+        if motion in motion_of
+    }
+    for name, pulse in pulses.items():
+        if UNITS[moved[name]] == "m/s":
+            pulse["value"] = [round(min(value, held[name]), 4) for value in pulse["value"]]
+    turns = cruise["coordinated_turn"] if cruise is not None and {"p", "r"} <= set(moved) else None
+    return (cruise or {}) | {
+        "rate": RATE,
+        "outputs": list(moved),
+        "second_order": {
+            "natural_frequency": [round(min(fastest[motion], limit[name]), 4) for name, motion in moved.items()],
+            "damping": [DAMPING.get(motion, DAMPING["V"]) for motion in moved.values()],
+        },
+        "rise": 0.5,
+        "pulses": pulses,
+        "coordinated_turn": turns,
+    }
+
+
+def _hover_pulses() -> dict[str, dict[str, list[float]]]:
+    """By motion: doublets of 1 s of the rates, back to the attitude before, then a climb of 8 s."""
+    starts = zip(HOVER, (2.0, 8.0, 14.0), strict=True)
+    pulses = {
+        motion: {"start": [t, t + 2.0], "stop": [t + 1.0, t + 3.0], "value": [HOVER[motion], -HOVER[motion]]}
+        for motion, t in starts
+    }
+    return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}
+
+
+def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Channels, speed: float | None, source: str) -> str:
+    """The text of the airframe of identified channels, in units of the map's channels.
+
+    With z_i of the dimension of y_i dt:
+
+    y_i_dot = -(damping_i - zero_i) y_i + (damping_i zero_i - stiffness_i - zero_i^2) z_i + sum_j Omega_ij u_j
+    z_i_dot = y_i - zero_i z_i                                             only where stiffness or zero are not 0
+    """
+    m = len(pairing.outputs)
+    second = [i for i in range(m) if found.stiffness[i] or found.zero[i]]
+    A = np.zeros((m + len(second), m + len(second)))
+    for i in range(m):
+        A[i, i] = found.zero[i] - found.damping[i]
+    for place, i in enumerate(second, m):
+        A[i, place] = found.damping[i] * found.zero[i] - found.stiffness[i] - found.zero[i] ** 2
+        A[place, i], A[place, place] = 1.0, -found.zero[i]
+    B = np.vstack([found.Omega, np.zeros((len(second), m))])
+    states = {name: UNITS[motion] for name, motion in motions(channel_map).items()}
+    states |= {f"{pairing.outputs[i]}_integral": "1" for i in second}
+    values = {
+        "name": f"{channel_map.name}_aircraft",
+        "source": source,
+        **({} if speed is None else {"speed": float(speed)}),
+        "states": states,
+        "inputs": {
+            name: {"unit": "1", "positive": motion_as_channel_grows(channel_map.inputs[name])} for name in pairing.inputs
+        },
+        "outputs": list(pairing.outputs),
+        "A": [[float(f"{value:.4g}") for value in row] for row in A],
+        "B": [[float(f"{value:.4g}") for value in row] for row in B],
+    }
+    Airframe.validate_mapping(values, "airframe")
+    return dump_yaml(values)
+
+
+def signs_alone(sign: FloatArray) -> Channels:
+    """Channels with a known sign alone."""
+    none = 0.0 * sign
+    return Channels(np.diag(sign), none + np.nan, none, none, none, none, none, none + np.nan)
+
+
+def scenario_text(
+    heading: str, airframe_file: str, duration: float, commands: Mapping[str, Any], controller: Mapping[str, Any]
+) -> str:
+    """The text of a scenario."""
+    sections = {
+        "flight": {"duration": float(duration)},
+        "aircraft": {"airframe": airframe_file, "rate": RATE, "step": 1.0 / RATE},
+        "reference_model": {key: value for key, value in commands.items() if value is not None},
+        "controller": _plain(controller),
+        "recorder": {"rate": 100.0},
+    }
+    body = {f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}
+    return comment([heading]) + dump_yaml(body)
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Lists for tuples, numbers with six digits."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, (list, tuple)):
+            return [plain(entry) for entry in value]
+        if isinstance(value, Mapping):
+            return {key: plain(entry) for key, entry in value.items()}
+        return float(f"{value:.6g}") if isinstance(value, float) else value
+
+    return {key: plain(value) for key, value in values.items() if value is not None}

@@ -1,0 +1,318 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of many models side by side."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import AXES
+from aircraft_sim.turbulence import MODERATE, dryden
+from control_laws import observer_design
+from control_laws.nominal_model import NominalModel
+from control_laws.observer_design import Names, ObserverModel, Weights
+from control_laws.riccati import correction_of, corrections_near
+from flight_core.parameters import require, require_channels
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
+from flight_design.gains.nominal import nominal_model, sizes
+from rise_di_controller.linear_loop import Loop
+
+TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count: the filter starts from y alone
+MOST_GAPS = 10.0  # span of a log, times that of the samples of u: the gaps are filled
+DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observer_design.Weights` has them: small
+MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
+LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
+HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
+GUST_TIME, RATE_TIME = 0.5, 0.2  # s, decay of the rate of a gust, and of the change of that rate
+LEAST_RATE = 1e-4  # m/s^3 per root s, noise of that change where there is no gust: negligible
+LEVELS = np.array(
+    [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
+    + [(0.03, strength) for strength in (20.0, 40.0, 80.0, 160.0, 320.0)]
+)
+"""Winds of the filter, a row a level, from calm air to gusts: noise of the wind in parts of that of moderate turbulence, and
+noise of the change of its rate, m/s^3 per root s. A gust is smooth: with noise of the wind, or of its rate, the model has
+gusts as fast as the inputs, and the effects of the inputs come out too weak."""
+
+
+class Recording(NamedTuple):
+    """A flight in T equal periods, channels in the airframe's order, deviations from trim."""
+
+    period: float  # s
+    t: FloatArray  # (T,) flight time, s
+    y: FloatArray  # (T, m), NaN where a sample was lost
+    u: FloatArray  # (T, m) as the actuators received it
+
+
+def coarser(recorded: Recording, factor: int) -> Recording:
+    """The means over `factor` periods; u between the middles of two means of y."""
+    count = len(recorded.t) // factor
+    ahead = [np.concatenate([recorded.u[k:], np.repeat(recorded.u[-1:], k, axis=0)]) for k in ((factor - 1) // 2, factor // 2)]
+    t, y, u = (
+        values[: count * factor].reshape(count, factor, *values.shape[1:]).mean(axis=1)
+        for values in (recorded.t, recorded.y, (ahead[0] + ahead[1]) / 2.0)
+    )
+    return Recording(factor * recorded.period, t, y, u)
+
+
+class Actuation(NamedTuple):
+    """What lies between u and the aircraft."""
+
+    lag: FloatArray  # (m,) time constants of the actuators in the airframe's order, s
+    delay: float  # s
+
+
+def recording(tape: Tape, airframe: Airframe) -> Recording:
+    """Y and u of a tape at the rate of u, from the first u on.
+
+    y is the sample nearest to the instant, within half a period; u is the last one. Raises ParameterError for a log without
+    the channels of the airframe, or one shorter than ten times the transient, with gaps beyond MOST_GAPS, or with an output
+    that never changes.
+    """
+    y, u = tape["y"], tape["u"]
+    for topic, names, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
+        require_channels(f"topic {topic}", names, expected, f"the channels of the airframe {airframe.name}")
+    require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
+    period_ns = round(float(np.median(np.diff(u.stamp_ns))))
+    require(period_ns > 0, "topic u", "samples with equal stamps", "one a period")
+    end_ns = min(u.stamp_ns[-1], y.stamp_ns[-1])
+    seconds = (end_ns - u.stamp_ns[0]) / NANOSECONDS
+    held = len(u.stamp_ns) * period_ns / NANOSECONDS
+    require(seconds < MOST_GAPS * held, "the log", f"{held:.3g} s of u in {seconds:.3g} s", "a log without long gaps")
+    instants = np.arange(u.stamp_ns[0], end_ns + 1, period_ns)
+    seconds = len(instants) * period_ns / NANOSECONDS
+    require(seconds > 10.0 * TRANSIENT, "the log", f"{seconds:.3g} s with y and u", f"more than {10.0 * TRANSIENT:g} s")
+    after = np.clip(np.searchsorted(y.stamp_ns, instants), 1, len(y.stamp_ns) - 1)
+    nearest = after - (instants - y.stamp_ns[after - 1] <= y.stamp_ns[after] - instants)
+    lost = 2 * np.abs(y.stamp_ns[nearest] - instants) > period_ns
+    measured = np.stack([y[name] for name in airframe.outputs], axis=1)[nearest]
+    measured[lost] = np.nan
+    moves = np.ptp(measured[~lost], axis=0) > 0.0 if not lost.all() else np.zeros(len(airframe.outputs), dtype=bool)
+    still = ", ".join(name for name, moved in zip(airframe.outputs, moves, strict=True) if not moved)
+    require(not still, "the log", f"no change of {still}", "a flight that excites each output")
+    places = np.searchsorted(u.stamp_ns, instants + period_ns // 2, side="right") - 1
+    commanded = np.stack([u[name] for name in airframe.inputs], axis=1)[places]
+    return Recording(period_ns / NANOSECONDS, (instants - tape.start_ns) / NANOSECONDS, measured, commanded)
+
+
+def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) -> NominalModel:
+    """The model of an airframe for its filter, channels in the airframe's order."""
+    noise = measured_noise(recorded.y, airframe.matrix_c() @ sizes(airframe.states.values()))
+    loop = Loop(actuation.lag, actuation.delay, recorded.period)
+    return nominal_model(airframe, airframe.outputs, tuple(airframe.inputs), noise, loop)
+
+
+def delayed(u: FloatArray, periods: float) -> FloatArray:
+    """u, (T, m), some periods later: between two samples the mean that acts in a period."""
+    whole, part = int(periods), periods % 1.0
+    late = np.concatenate([np.repeat(u[:1], whole + 1, axis=0), u])
+    return np.asarray((1.0 - part) * late[1 : len(u) + 1] + part * late[: len(u)])
+
+
+def measured_noise(y: FloatArray, size: FloatArray) -> FloatArray:
+    """Noise of each channel a sample, rms, from the third differences of y, shape (T, m): their variance is 20 times that of y.
+
+    At least MIN_NOISE of `size`, the unit of the channel.
+    """
+    third = np.diff(y, n=3, axis=0)
+    spread = np.nanmedian(np.abs(third), axis=0) / 0.6745  # of a normal distribution
+    return np.asarray(np.maximum(spread / np.sqrt(20.0), MIN_NOISE * size))
+
+
+class FilterBank(NamedTuple):
+    """Stationary Kalman filters of N models at each of the levels of the wind."""
+
+    sampled: ObserverModel  # Phi (N, 1, s, s), Gamma (N, 1, s, m)
+    L: FloatArray  # (N, levels, s, m)
+    covariance: FloatArray  # (N, levels, m, m) of the innovations
+    gravity: FloatArray  # (n, n)
+    period: float  # s
+
+    def by_level(self) -> "FilterBank":
+        """The first model at the levels, as a model a level."""
+        levels = self.L.shape[1]
+        Phi, Gamma = (np.repeat(matrix[:1], levels, axis=0) for matrix in (self.sampled.Phi, self.sampled.Gamma))
+        sampled = self.sampled._replace(Phi=Phi, Gamma=Gamma)
+        return self._replace(
+            sampled=sampled, L=np.swapaxes(self.L[:1], 0, 1), covariance=np.swapaxes(self.covariance[:1], 0, 1)
+        )
+
+    def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
+        """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then sin(x) - x, to r and z."""
+        H, Phi, Gamma, L = self.sampled.H, self.sampled.Phi[:, 0], self.sampled.Gamma[:, 0], self.L[:, level]
+        (m, s), angles = H.shape, np.flatnonzero(self.gravity.any(axis=0))
+        z = np.zeros((len(Phi), s, s + 2 * HOLD * m + len(angles)))
+        z[:, :, :s], rows = np.eye(s), []
+        for j in range(HOLD):
+            r = -H @ z
+            r[:, np.arange(m), s + j * m + np.arange(m)] += 1.0
+            z = Phi @ (z + L @ r if seen[j] else z)
+            z[:, :, s + (HOLD + j) * m : s + (HOLD + j + 1) * m] += Gamma
+            z[:, : len(self.gravity), s + 2 * HOLD * m :] += self.period * self.gravity[:, angles]
+            rows.append(r)
+        return np.concatenate([*rows, z], axis=1)
+
+
+class Passage:
+    """The filters of a bank over y, (T, m), and u, (T, m) or (N, T, m) with inputs a model.
+
+        r = y - H z,  z+ = Phi (z + L r) + Gamma u + period gravity (sin(x) - x)
+
+    with no update where y is lost. A block of HOLD periods has a `level`, (T / HOLD,). sin(x) - x is held over a block, so the
+    blocks are linear: with the same level and the same lost samples they have the same matrix.
+    """
+
+    def __init__(self, bank: FilterBank, y: FloatArray, u: FloatArray, level: NDArray[np.int64]) -> None:
+        (T, m), (N, _, s, _), blocks = y.shape, bank.L.shape, len(level)
+        self._angles = np.flatnonzero(bank.gravity.any(axis=0))
+        short, self._shape = blocks * HOLD - T, (N, m, s)  # the last block is filled with lost samples
+        y = np.vstack([y, np.full((short, m), np.nan)])
+        u = np.concatenate([u, np.zeros((*u.shape[:-2], short, m))], axis=-2)
+        self._seen: NDArray[np.bool_] = np.asarray(np.isfinite(y).all(axis=1))
+        known = np.where(self._seen[:, None], y, 0.0).reshape(blocks, HOLD * m).T
+        given = np.swapaxes(u.reshape(*u.shape[:-2], blocks, HOLD * m), -1, -2)
+        inputs = np.concatenate([np.broadcast_to(known, given.shape), given], axis=-2)
+        code = level << HOLD | self._seen.reshape(blocks, HOLD) @ (1 << np.arange(HOLD))
+        kinds, self._kind = np.unique(code, return_inverse=True)
+        lifted = [bank.lifted(kind >> HOLD, [bool(kind >> j & 1) for j in range(HOLD)]) for kind in kinds.tolist()]
+        self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
+        own, driven = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]], slice(s, s + 2 * HOLD * m)
+        following = HOLD * m + np.append(np.arange(s), self._angles)  # z, and again its angles, in place of sin(x) - x
+        for k, matrix in enumerate(lifted):
+            of = np.flatnonzero(self._kind == k)
+            forced = matrix[..., driven] @ inputs[..., of]
+            self._forced[..., of], self._states[of + 1, ..., 0] = forced[:, :-s], np.moveaxis(forced[:, following], -1, 0)
+        self._steps = [np.ascontiguousarray(matrix[:, following][..., own]) for matrix in lifted]
+        self._outputs = [np.ascontiguousarray(matrix[:, :-s, own]) for matrix in lifted]
+
+    def run(self, z: FloatArray, first: int = 0, last: int | None = None) -> tuple[FloatArray, FloatArray]:
+        """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and z after them."""
+        (N, m, s), steps = self._shape, self._steps
+        kind = self._kind[first:last]
+        states = self._states[first : first + len(kind) + 1]
+        states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
+        sine, moved = np.empty(states[0, :, s:].shape), np.empty(states[0].shape)
+        # the loop is half of a search: no array is made in it
+        for k, now, turned, following in zip(kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True):
+            np.subtract(np.sin(turned, sine), turned, turned)
+            np.add(following, np.matmul(steps[k], now, moved), following)
+        r, x = self._forced[..., first : first + len(kind)].copy(), np.moveaxis(states[:-1, ..., 0], 0, -1)
+        for k in np.unique(kind).tolist():
+            of = kind == k
+            r[..., of] += self._outputs[k] @ x[..., of]
+        r = np.moveaxis(r, -1, 1).reshape(N, len(kind) * HOLD, m)
+        r[:, ~self._seen[HOLD * first : HOLD * first + r.shape[1]]] = np.nan
+        return r, states[-1, :, :s, 0]
+
+
+def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArray]:
+    """Time constants, s, and noises, m/s per root s, of winds of first order like Dryden's moderate turbulence, (G,) each.
+
+    They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the
+    flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. Arguments: `speed` V0, m/s.
+    """
+    spectrum, places = dryden(**MODERATE, sigma=0.0), np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
+    time, along = spectrum.length[places] / speed, places == AXES.index("longitudinal")
+    noise = spectrum.sigma[places] * np.sqrt(np.where(along, 2.0, 3.0) / time)
+    return np.where(along, time, time / np.sqrt(3.0)), noise
+
+
+def filter_bank(
+    model: NominalModel,
+    names: Names,
+    speed: float,
+    strength: FloatArray,
+    levels: NDArray[np.int64] | slice = slice(None),
+    drift: float = DRIFT,
+    *,
+    near: bool = False,
+) -> FilterBank:
+    """The filters of models with A (N, n, n), B (N, n, m) and wind (N, n, G) at the trim speed V0, m/s, z = [x, w, v, a, ..].
+
+        w_dot = v - w / wind_time + noise,  v_dot = a - v / GUST_TIME,  a_dot = -a / RATE_TIME + noise
+
+    The noises are of `levels` of LEVELS, times `strength` (N, G); `drift` as in `observer_design.Weights`. Models `near` the
+    first one have gains exact to first order.
+    """
+    wind_time, noise = wind_model(names.winds, speed)
+    (N, n, m), G = model.B.shape, model.wind.shape[-1]
+    s = n + 3 * G
+    x, w, v, a = np.split(np.arange(s), [n, n + G, n + 2 * G])
+    A, B, gravity = np.zeros((N, s, s)), np.zeros((N, s, m)), np.zeros((s, s))
+    A[:, x[:, None], x], A[:, x[:, None], w], B[:, x], gravity[:n, :n] = model.A, model.wind, model.B, model.gravity
+    A[:, w, w], A[:, v, v], A[:, a, a] = -1.0 / wind_time, -1.0 / GUST_TIME, -1.0 / RATE_TIME
+    A[:, w, v] = A[:, v, a] = 1.0
+    each = model._replace(
+        A=A[:, None],
+        B=B[:, None],
+        C=np.hstack([model.C, np.zeros((m, 3 * G))]),
+        gravity=gravity,
+        wind=np.zeros((s, 0)),
+        kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(3 * G)]),
+        size=np.concatenate([model.size, np.ones(3 * G)]),
+    )
+    of_wind = tuple(f"{kind}.{axis}" for kind in ("wind", "rate", "change") for axis in names.winds)
+    sampled = observer_design.aircraft_model(each, names._replace(states=names.states + of_wind, winds=()), np.zeros(0))
+    gust, change = (
+        strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
+    )
+    loose = np.concatenate([np.full((*gust.shape[:2], n), LOOSE), gust, 0.0 * gust, change + LEAST_RATE], axis=-1)
+    weights = Weights(np.ones(m), np.full(m, drift), np.zeros(0), np.zeros(0), loose)
+    L = observer_design.aircraft_correction(sampled, each, weights, corrections_near if near else correction_of)
+    # L = S H'(H S H' + R)^-1 leaves I - H L = R (H S H' + R)^-1
+    covariance = np.linalg.solve(np.eye(m) - sampled.H @ L, np.broadcast_to(np.diag(model.noise**2), (*L.shape[:2], m, m)))
+    return FilterBank(sampled, L, np.asarray(covariance), gravity, model.period)
+
+
+class Block(NamedTuple):
+    """Indices of a part of the aircraft that does not couple with the rest."""
+
+    states: NDArray[np.int64]
+    inputs: NDArray[np.int64]
+    outputs: NDArray[np.int64]
+    winds: NDArray[np.int64]
+
+    def of(self, model: NominalModel) -> NominalModel:
+        """The model of this part alone."""
+        x, u, y = self.states, self.inputs, self.outputs
+        square = np.ix_(x, x)
+        return model._replace(
+            A=model.A[square],
+            B=model.B[np.ix_(x, u)],
+            C=model.C[np.ix_(y, x)],
+            gravity=model.gravity[square],
+            wind=model.wind[np.ix_(x, self.winds)],
+            noise=model.noise[y],
+            kinematic=model.kinematic[x],
+            size=model.size[x],
+            input_scale=model.input_scale[u],
+            D=model.D[u],
+            lag=model.lag[u],
+            total_lag=model.total_lag[u],
+            lower=model.lower[u],
+            upper=model.upper[u],
+        )
+
+
+def blocks(model: NominalModel) -> list[Block]:
+    """The parts of an aircraft that neither A, gravity, B, C nor the wind couple; one where a part is not square."""
+    (n, m), G = model.B.shape, model.wind.shape[1]
+    coupled = np.zeros((n + 2 * m + G, n + 2 * m + G))
+    coupled[:n] = np.hstack([model.A + model.gravity, model.B, model.C.T, model.wind]) != 0.0
+    _, labels = connected_components(coupled, directed=False)
+    parts = np.split(labels, [n, n + m, n + 2 * m])
+    found = [Block(*(np.flatnonzero(part == label) for part in parts)) for label in np.unique(labels)]
+    if all(len(block.inputs) == len(block.outputs) > 0 for block in found):
+        return found
+    return [whole(model)]
+
+
+def whole(model: NominalModel) -> Block:
+    """All of an aircraft as one part."""
+    (n, m), G = model.B.shape, model.wind.shape[1]
+    return Block(*map(np.arange, (n, m, m, G)))

@@ -1,0 +1,257 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""y, u and pose of a channel map, from the log of an autopilot that the stack did not fly."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from autopilot_bridge.channel_map import Line, to_channel
+from autopilot_bridge.params import ChannelMap, InputRow
+from flight_core.files import parse_yaml
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from flight_design.identification.parameter_agreement import (
+    SAME_LINE,
+    Servo,
+    Stick,
+    changes,
+    require_agreement,
+    servo_of,
+    stick_of,
+)
+from flight_log.bag import COMPARED, IMPORTED
+from flight_log.tape_reader import RecordedRun
+from flight_log.vehicle_log import COPTER, PLANE, ULOG_TORQUES, Source, VehicleLog
+
+COMMANDS = "commands"  # the topic with trim + u, by input
+AIRBORNE = 0.5  # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
+TYPICAL = 90.0  # percentile of either in a log, which may have more time on the ground than in the air
+LEAST = 2.0  # s of flight that are worth a bag
+
+PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
+
+Stamps = NDArray[np.int64]
+
+
+class Window(NamedTuple):
+    """What is taken of a log, s since its first sample of the output `instant`; None: the flight that is found."""
+
+    start: float | None
+    stop: float | None
+
+
+class Imported(NamedTuple):
+    """The tape of a log, the parameters of the autopilot at the first sample, and sentences on what stays unknown."""
+
+    tape: Tape
+    parameters: Mapping[str, float]
+    notes: tuple[str, ...]
+
+
+def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos: bool) -> Imported:
+    """y, u, `commands` and the pose of a log, as the bridge would have published them.
+
+    y and the pose hold the newest values at the stamps of the map's `instant` and of the first channel of the pose. u is the
+    command less its median: the setpoint of the map (PX4) or of the rate controllers (ArduCopter), else the stick in MANUAL, or
+    with `servos` the servo's position, scaled as the stick. Without a window the longest stretch in the air is taken, for
+    sticks in MANUAL. Raises ParameterError for a channel that the log does not have, for another vehicle, without such a
+    stretch, and for parameters of the log that differ from the map or change between the samples.
+    """
+    require(log.vehicle in {PLANE, COPTER}, "the log", f"one of a {log.vehicle}", "one of a plane or a multicopter")
+    rows = channel_map.outputs
+    sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
+    stamps = log.tables[sources[channel_map.instant].message].stamp_ns
+    speed = next((log.at(sources[name], stamps) for name, row in rows.items() if row.motion[0] == "V"), None)
+    if speed is None:  # a multicopter: its thrust
+        lifts = {name: row.motion[1] for name, row in channel_map.inputs.items() if row.motion[0] == "climb"}
+        speed = next((sign * _commands(channel_map, log, name, servos, {}).at(stamps) for name, sign in lifts.items()), None)
+    has_sticks = log.format is not None and log.vehicle == PLANE
+    first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
+    parameters = log.parameters_at(first)
+    notes = changes(log.parameters, int(stamps[0]), first, last)
+    try:
+        readers = {name: _commands(channel_map, log, name, servos, parameters) for name in channel_map.inputs}
+        sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
+        notes.append(require_agreement(channel_map.name, sticks, log.parameters, parameters))
+    except ParameterError as error:
+        raise ParameterError("; ".join([str(error), *notes])) from None
+    y_stamps = stamps[(stamps >= first) & (stamps <= last)]
+    y = np.column_stack([row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()])
+    y_stamps, y = _complete(y_stamps, y)
+    require(len(y_stamps) > 1, "the log", "no instant with all outputs of the map", "a flight")
+    for column, row in enumerate(rows.values()):
+        y[:, column] += -np.median(y[:, column]) if row.captured else row.offset
+    u_stamps = np.unique(np.concatenate([reader.stamp_ns for reader in readers.values()]))
+    u_stamps = u_stamps[(u_stamps >= first) & (u_stamps <= last)]
+    u_stamps, commands = _complete(u_stamps, np.column_stack([reader.at(u_stamps) for reader in readers.values()]))
+    require(len(u_stamps) > 1, "the log", "no instant with all inputs of the map", "a flight")
+    signals = {
+        "y": Signal(y_stamps, tuple(rows), y),
+        "u": Signal(u_stamps, tuple(readers), commands - np.median(commands, axis=0)),
+        COMMANDS: Signal(u_stamps, tuple(readers), commands),
+    }
+    if (pose := _pose(channel_map, log, first, last)) is not None:
+        signals["pose"] = pose
+    return Imported(Tape(signals, int(y_stamps[0])), parameters, tuple(filter(None, notes)))
+
+
+def median_trims(commands: Signal) -> dict[str, float]:
+    """The commands in trim by input: the medians of an imported flight, SI."""
+    return {name: float(np.median(commands[name])) for name in commands.names}
+
+
+def _measured(log: VehicleLog, quantity: str, key: str) -> Source:
+    source = log.source(quantity)
+    if source is None:
+        raise ParameterError(f"{key}: found no {quantity} in the log, expected {_messages(log, quantity)}")
+    return source
+
+
+def _messages(log: VehicleLog, quantity: str) -> str:
+    """The messages of a log's format that have a quantity, as a sentence."""
+    from flight_log.vehicle_log import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
+
+    sources = ULOG_SOURCES if log.format is None else log.format.sources
+    return " or ".join(dict.fromkeys(at.message for at in sources.get(quantity, ()))) or "one that the format has"
+
+
+class _Reader(NamedTuple):
+    """The command of an input: SI = line(raw). The raw value of the map's field comes from the pulse of a stick or a servo."""
+
+    log: VehicleLog
+    source: Source
+    line: Line
+    stick: Stick | None = None
+    servo: Servo | None = None
+
+    @property
+    def stamp_ns(self) -> Stamps:
+        return self.log.tables[self.source.message].stamp_ns
+
+    def at(self, stamp_ns: Stamps) -> FloatArray:
+        values = self.log.at(self.source, stamp_ns)
+        if self.stick is not None and self.servo is not None:
+            values = self.stick.raw(self.servo.deflection(values, self.stick))
+        before = self.stick.trim_line if self.stick is not None and self.servo is None else SAME_LINE
+        return np.array([to_channel(to_channel(value, before), self.line) for value in values.tolist()])
+
+
+def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool, parameters: Mapping[str, float]) -> _Reader:
+    row = channel_map.inputs[name]
+    if log.format is None:
+        topic = channel_map.messages[row.message].topic.rpartition("/")[2]
+        source = Source(topic, row.field)
+        before_1_14 = ULOG_TORQUES.get((topic, row.field), source)
+        source = source if log.has(source) or not log.has(before_1_14) else before_1_14
+        require(log.has(source), f"inputs.{name}", f"no {topic}.{row.field} in the log", "it: the map and the log fit together")
+        require(not servos, "--servos", "a ULog", "none: its setpoints of torque and thrust are the commands")
+        return _Reader(log, source, row.line)
+    if log.vehicle == COPTER:
+        return _torque(log, name, row, servos)
+    stick = stick_of(channel_map, name)
+    servo = servo_of(stick, name, parameters) if servos else None
+    place, number = (log.format.sticks, stick.channel) if servo is None else (log.format.servos, servo.output)
+    source = Source(place.message, place.field.format(number))
+    expected = (
+        "the transmitter's channel (bit RC of LOG_BITMASK, messages of the tlog), or --servos"
+        if servo is None
+        else "its pulses"
+    )
+    require(log.has(source), f"inputs.{name}", f"no {source.message}.{source.field} in the log", expected)
+    return _Reader(log, source, row.line, stick, servo)
+
+
+def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
+    """The output of a multicopter's rate controller: no mode has sticks that are commands. It is normalised as PX4's."""
+    quantity, sign = row.motion
+    source = next((at for at in log.format.torques.get(quantity, ()) if log.has(at)), None) if log.format else None
+    if source is None:
+        expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
+        raise ParameterError(f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected {expected}")
+    require(not servos, "--servos", "a multicopter", "none: the outputs of its rate controllers are the commands")
+    return _Reader(log, source, Line(1 if sign > 0 else -1, row.scale, 0.0))
+
+
+def _flight(
+    log: VehicleLog, stamps: Stamps, speed: FloatArray | None, window: Window, *, needs_manual: bool
+) -> tuple[int, int]:
+    """First and last instant that are taken: the window, or the longest stretch in the air, for sticks in MANUAL."""
+    start_ns = int(stamps[0])
+    keep = np.ones(len(stamps), dtype=bool)
+    if window.start is not None:
+        keep &= stamps >= start_ns + nanoseconds(window.start)
+    if window.stop is not None:
+        keep &= stamps <= start_ns + nanoseconds(window.stop)
+    where = "in the window" if window != (None, None) else "in the log"
+    require(
+        int(keep.sum()) > 1, "--from, --until", "no sample", f"a part of the {1e-9 * (stamps[-1] - start_ns):.0f} s of the log"
+    )
+    if speed is not None and window.start is None and window.stop is None:
+        require(bool(np.isfinite(speed).any()), "the log", "no airspeed or thrust at the samples of y", "a flight")
+        keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
+    if needs_manual:
+        expected = "it, for only there the sticks are the commands, or --servos"
+        mode = next((at for at in log.format.mode if log.has(at)), None) if log.format is not None else None
+        if mode is None:
+            raise ParameterError(f"the log: found no message with the mode, expected MANUAL in {expected}")
+        keep &= log.at(mode, stamps) == log.manual
+        require(bool(keep.any()), "the log", f"no flight in MANUAL {where}", expected)
+    require(bool(keep.any()), "the log", f"no time in the air {where}", "a flight, or --from and --until")
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], keep, [False]]).astype(np.int8)))
+    runs = [(int(stamps[first]), int(stamps[end - 1])) for first, end in zip(edges[::2], edges[1::2], strict=True)]
+    first, last = max(runs, key=lambda run: run[1] - run[0])
+    length = 1e-9 * (last - first)
+    require(length >= LEAST, "the log", f"{length:.1f} s of flight {where}", f"{LEAST:g} s or more in one stretch")
+    return first, last
+
+
+def _complete(stamp_ns: Stamps, values: FloatArray) -> tuple[Stamps, FloatArray]:
+    """The samples in which every channel is known."""
+    known = np.isfinite(values).all(axis=1)
+    return stamp_ns[known], values[known]
+
+
+def _pose(channel_map: ChannelMap, log: VehicleLog, first: int, last: int) -> Signal | None:
+    """The channels of the map's pose that the log has, NaN where one is not known yet."""
+    sources = {name: source for name in channel_map.pose if (source := log.source(name)) is not None}
+    if not sources:
+        return None
+    stamps = log.tables[next(iter(sources.values())).message].stamp_ns
+    stamps = stamps[(stamps >= first) & (stamps <= last)]
+    values = [log.at(source, stamps) for source in sources.values()]
+    return Signal(stamps, tuple(sources), np.column_stack(values)) if len(stamps) else None
+
+
+def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> None:
+    """Raise ParameterError for an imported log whose u is not by the map, but by rows of another map or an earlier version."""
+    source = recorded.metadata.get(IMPORTED)
+    if source is None:
+        return
+    key, again = str(recorded.path or "the log"), f"that of the map {channel_map.name}: import the log again, with --map"
+    require(COMPARED in source, key, "a log of an earlier version, which did not compare its parameters with the map", again)
+    maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
+    require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")
+    content = parse_yaml(maps[0], key, "a channel map")
+    before = _rows_of_import(ChannelMap.validate_mapping(content, key))
+    for name, value in _rows_of_import(channel_map).items():
+        require(before.get(name) == value, key, f"{name} {before.get(name)} of the map of the import", f"{value}, {again}")
+
+
+def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
+    """What an import takes of a map, by key."""
+    keys = {
+        "outputs": {"positive", "sign"},
+        "inputs": {"field", "positive", "sign", "scale", "offset", "range"},
+        "trims": {"field", "sign", "scale", "offset"},
+    }
+    return {
+        f"{kind}.{name}.{key}": getattr(row, key)
+        for kind, fields in keys.items()
+        for name, row in getattr(channel_map, kind).items()
+        for key in sorted(fields)
+    }

@@ -1,0 +1,516 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Learning in the air: A and B from the last seconds of a flight, checked, and the observer and feedforward of that model.
+
+The identification is that of a log (`model_identification.identify`), about a rough airframe. A model that fails a check is
+refused with a sentence. The controller refuses parameters that fail its own checks at load.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from itertools import chain, combinations, pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.airspeed import at_speed, exponents, level_flight
+from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
+from flight_core.parameters import ParameterError, require
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
+from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
+from flight_design.identification.model_identification import (
+    HELD_OUT,
+    KNOWN,
+    MAX_DELAY_ERROR,
+    MAX_DEVIATION,
+    MAX_WHITENESS,
+    PRIOR,
+    Identification,
+    Part,
+    Unknown,
+    another_airframe,
+    best_known,
+    identify,
+    with_entries,
+)
+from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
+from rise_di_controller import divergence
+from rise_di_controller.proposals import given_up, outputs_without, with_channels_of
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
+DELAY_DEVIATION = 0.015  # s: a host, a bridge or a servo that is 30 ms later than the file says is found
+DELAY_LEFT = 0.01  # s, delay margin beyond the latest delay: a loop of 30 ms flew well with u 20 ms late
+FAINT = 1e-3  # 1, of an effect: none, with its sign, which the search keeps
+SHORTEST = 20.0 * TRANSIENT  # s, of a record: two held-out seconds of the six that `identify` needs at least
+
+SPREAD = 0.02  # 1, rms of the airspeed about its mean in a record of one speed: effects of surfaces then vary by 4 %
+
+Design = Callable[[RiseDiConfig, Airframe], RiseDiConfig]
+"""A controller with the feedforward and the observer of a model, and its delay margin. Raises ParameterError."""
+
+
+class Known(NamedTuple):
+    """A part of the aircraft whose model flies."""
+
+    end_ns: int  # of its window
+    deviation: Mapping[str, float]  # of its entries by name, 1
+    delay: float  # of its inputs, s
+    is_rough: bool  # that of the rough airframe as it is
+    delay_deviation: float = 0.0  # s, standard deviation of `delay`
+
+    @property
+    def latest(self) -> float:
+        """The delay of its inputs and two standard deviations, s."""
+        return self.delay + 2.0 * self.delay_deviation
+
+
+class Sample(NamedTuple):
+    """A tick of the record; y and u in the law's order."""
+
+    stamp_ns: int
+    y: FloatArray  # (m,)
+    u: FloatArray  # (m,), after its limits
+    flown: int  # digest of the parameters
+
+
+class Learner:
+    """The record of y and u over a window, and proposals from it.
+
+    The parts of the aircraft that do not couple are learned one by one: one without a model flies the law of the start.
+    """
+
+    def __init__(
+        self, controller: RiseDiConfig, airframe: Airframe, design: Design, delay: float = 0.0, rough: Unknown = KNOWN
+    ) -> None:
+        """`airframe` is the rough model, the prior; `delay` that of the loop, s, beyond sampling and lags.
+
+        `rough` has the deviation of B in the rough model, and the noise of the disturbances. With more noise than DRIFT the
+        aircraft is not tested for a change: the disturbances stand for a change, and for a dead input.
+        Raises ParameterError for a controller that does not learn.
+        """
+        settings = controller.learn
+        require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
+        assert settings is not None  # noqa: S101 - for the type checker
+        self._controller, self._rough, self._design = controller, airframe, design
+        self._period, self._believed = 1.0 / controller.rate, rough
+        self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
+        self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
+        lag = dict(zip(controller.inputs, controller.lag, strict=True))
+        self._actuation = Actuation(np.array([lag[name] for name in airframe.inputs]), delay)
+        self._record: deque[Sample] = deque()
+        self._window_ns = nanoseconds(settings.window)
+        self._planned = deque(map(nanoseconds, settings.updates))
+        self._first_ns: int | None = None
+        self._prior, self._model = airframe, airframe  # of the next identification; what flies
+        self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
+        # Parts that fly the law of the start for good: their inputs without effect, "" for outputs of `learn.without`
+        self._dead: dict[tuple[str, ...], str] = {}
+        self._start = controller  # with the `learn.without` of what flies
+        self._has_ended = False
+        self._give_up(controller)
+        self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
+        self._flew = self._last = controller  # the last proposal that flew, and the last one
+        self._proposed = controller.digest()  # of the last one
+        self._proposals = set[int]()  # digests of all of them
+        self.identification: Identification | None = None  # the last one
+
+    @property
+    def model(self) -> Airframe | None:
+        """The rough airframe with the models of the parts that are known; None where there is none."""
+        return self._model if self._known else None
+
+    def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
+        """Record y and u, after its limits, of a tick, (m,), in the law's order, and the digest of its parameters."""
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        if not self._record or stamp_ns > self._record[-1][0]:
+            self._record.append(Sample(stamp_ns, y, u, flown))
+        while stamp_ns - self._record[0].stamp_ns >= self._window_ns:
+            self._record.popleft()
+
+    def recording(self, after_ns: int = -1) -> Recording:
+        """The record after an instant in equal periods, in the airframe's order; y of a lost tick is NaN, u is held."""
+        record = [sample for sample in self._record if sample.stamp_ns > after_ns]
+        stamp_ns = np.array([sample.stamp_ns for sample in record])
+        place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
+        place, kept = np.unique(place, return_index=True)
+        y = np.array([sample.y for sample in record])[kept]
+        u = np.array([sample.u for sample in record])[kept]
+        t = seconds(int(stamp_ns[0])) + self._period * np.arange(place[-1] + 1)
+        whole = np.full((len(t), y.shape[1]), np.nan)
+        whole[place] = y
+        held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
+        of_y, of_u = self._controller.outputs, self._controller.inputs
+        y, u = (
+            np.stack([values[:, own.index(name)] for name in names], axis=1)
+            for values, own, names in ((whole, of_y, self._rough.outputs), (held, of_u, tuple(self._rough.inputs)))
+        )
+        return Recording(self._period, t, y, u)
+
+    def propose(self, flown: int) -> LearnerResult:
+        """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
+
+        The last RECORD seconds are tested for a loss of effect of inputs. After a loss the older record is left out, and the
+        flown model is the prior. A part with an input without effect flies the law of the start, without this input.
+        Before the first model of a part, a rough airframe that explains the flight as it is, with white innovations, is taken
+        itself.
+
+        Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
+        controller fell back. Outputs that the controller took back, because they oscillated, are not proposed again. Where no
+        part is left, nothing is identified, and the sentence says so once.
+        """
+        try:
+            return self._proposal(flown)
+        except ParameterError as error:  # no steady airspeed, no motion, or no design
+            return LearnerResult(None, str(error))
+
+    def _proposal(self, flown: int) -> LearnerResult:
+        """The proposal of `propose`. Raises ParameterError where there is none."""
+        end_ns = self._record[-1].stamp_ns if self._record else 0
+        length = seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0  # lost ticks included
+        if length < SHORTEST - self._period:
+            return LearnerResult(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
+        self._note_fallback(flown)
+        lost = flown != self._proposed
+        if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
+            ended, self._has_ended = self._has_ended, True
+            return LearnerResult(
+                None, "" if ended else "each part flies the law of the start from now on: no part is left to learn"
+            )
+        changes = self._changes(end_ns)
+        dead = {change.outputs: change.dead for change in changes if change.dead}
+        found = [change for change in changes if change.found]
+        due = self._is_due(end_ns) or lost
+        if not (due or found or self._changed):
+            return LearnerResult(None, unchanged(changes))
+        if found:
+            self._record = deque(sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD))
+            self._prior = self._model
+            self._changed |= {change.outputs for change in found}
+        identified = self.identification = self._identified()
+        dead = {part: name for part, name in dead.items() if not self._acts(name, identified)}
+        gone = self._dead | dead
+        sentences = [
+            f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
+            for part, name in (gone if lost else dead).items()
+            if name
+        ]
+        sentences += [changed(change) for change in found if change.outputs not in dead]
+        known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
+        refusals = []
+        for part in identified.parts:
+            if any(is_within(part.outputs, without) or is_within(without, part.outputs) for without in gone):
+                continue
+            rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
+            learned = {outputs for outputs, of_part in known.items() if not of_part.is_rough} - self._changed
+            before = model if part.outputs in learned and not lost else None
+            of_flight = "" if rough else part.refusal or not_white(part) or weaker(part, before)
+            if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or of_flight:
+                refusals.append(refusal)
+                continue
+            entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
+            model = with_entries(model, entries)
+            deviation = {entry.name: abs(entry.deviation * entry.unit / entry.value) for entry in entries if entry.value}
+            known = {old: value for old, value in known.items() if not is_within(old, part.outputs)}
+            known[part.outputs] = Known(end_ns, deviation, part.delay, rough, part.delay_deviation)
+            sentences.append(
+                f"{' and '.join(part.outputs)} of the airframe {self._rough.name} as it is" if rough else sentence(part)
+            )
+        if self._changed and any(another_airframe(part.entries, self._rough.name, AT_BOUND) for part in identified.parts):
+            # the model that flew may have been the wrong one, and not the aircraft have changed
+            self._prior = self._model if self._prior is self._rough else self._rough
+        if not sentences:
+            return LearnerResult(None, "; ".join(refusals) or "each part flies the law of the start from before on")
+        proposed = self._designed(model, known, gone)
+        new = [*gone, *(part for part, value in known.items() if value.end_ns == end_ns)]
+        self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
+        self._known, self._model, self._dead = known, model, gone
+        self._last, self._proposed = proposed, proposed.digest()
+        self._proposals.add(self._proposed)
+        return LearnerResult(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
+
+    def _note_fallback(self, flown: int) -> None:
+        """Give up the outputs that fly the law of the start to the end of the engagement, by the digest of what flies.
+
+        The rest of it is the last proposal, the one before, which flew, or the start.
+        """
+        if flown == self._proposed:
+            self._flew = self._last
+        if flown in {self._proposed, self._start.digest()}:
+            return
+        names = self._controller.outputs
+        subsets = [outputs for count in range(1, len(names) + 1) for outputs in combinations(names, count)]
+        for model, outputs in product((self._last, self._flew, self._start), subsets):
+            fallen = given_up(self._controller, model, outputs)
+            if fallen.digest() == flown:
+                self._give_up(fallen)
+                if model is self._last:  # else it does not fly: the controller refused it
+                    self._last, self._proposed = fallen, flown
+                return
+
+    def _give_up(self, flown: RiseDiConfig) -> None:
+        """Leave the outputs of `learn.without` to the law of the start."""
+        self._start = given_up(self._controller, self._controller, outputs_without(flown))
+        if without := outputs_without(flown):
+            self._dead[without] = ""
+            self._known = {part: known for part, known in self._known.items() if not is_within(part, without)}
+
+    def _is_due(self, end_ns: int) -> bool:
+        """Whether an identification is planned by now: at `learn.updates`, then once a window."""
+        assert self._first_ns is not None  # noqa: S101 - there is a record
+        due = False
+        while end_ns - self._first_ns > self._planned[0] - nanoseconds(self._period):
+            due, last = True, self._planned.popleft()
+            if not self._planned:
+                self._planned.append(last + self._window_ns)
+        return due
+
+    def _acts(self, name: str, identified: Identification) -> bool:
+        """Whether an identified model predicts the held-out samples better than one that is identified without an input.
+
+        The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not. Better
+        is a gain of log-likelihood above the limit of the test: beside a dead rudder, with wider bounds, it was 1.1.
+        """
+        gain = identified.after.log_likelihood - self._identified(without=name).after.log_likelihood  # of a sample
+        return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN
+
+    def _identified(self, without: str = "") -> Identification:
+        """A and B from the record, about the prior, `without` the effect of an input; also from the model that flies on.
+
+        Beside models at several speeds the record is of a steady speed, and so is the prior. The entries are reduced to the
+        trim speed. Raises ParameterError where the speed is not steady over SHORTEST.
+        """
+        channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
+        unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
+        identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
+        prior, model = self._prior, self.model
+        if without:
+            prior, model = without_effect(prior, without), model and without_effect(model, without)
+        if not self._has_speeds:
+            return identified(self.recording(), prior, flown=model)
+        found, ratio = self._steady(self.recording())
+        length = self._period * len(found.t)
+        expected = f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
+        require(length > SHORTEST - self._period, "airspeed", f"it steady over the last {length:.3g} s", expected)
+        flown = None if model is None else self._at_speed(model, ratio)
+        there = identified(found, self._at_speed(prior, ratio), flown=flown)
+        parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in there.parts)
+        return there._replace(parts=tuple(parts))
+
+    def _steady(self, recorded: Recording) -> tuple[Recording, float]:
+        """Beside models at several speeds: the steady end of a record, about the trim there, and the speed over V0."""
+        if not self._has_speeds:
+            return recorded, 1.0
+        found, ratio = steady_end(recorded, self._rough)
+        return about(found, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
+
+    def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
+        """A model at a speed of `_steady`."""
+        return at_speed(model, ratio, self._thrust) if self._has_speeds else model
+
+    def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
+        """Entries reduced to the trim speed: relative errors and deviations stay."""
+        powers, states = exponents(self._rough, self._thrust), list(self._rough.states)
+        columns, of = {"A": states, "B": list(self._rough.inputs)}, {"A": powers.A, "B": powers.B}
+        each = [ratio ** of[e.matrix][states.index(e.row), columns[e.matrix].index(e.column)].item() for e in entries]
+        return tuple(
+            entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)
+            for entry, factor in zip(entries, each, strict=True)
+        )
+
+    def _changes(self, end_ns: int) -> list[Change]:
+        """Tests of the parts whose window ended RECORD ago or earlier; none where the speed was not steady over the test.
+
+        Nor is there one where the law fell back in these seconds, or an output oscillated: a loop near instability moves y as
+        no model with a stable loop says, and healthy inputs look weak.
+        """
+        tested = {part: known for part, known in self._known.items() if part not in self._changed}
+        old = {part: known for part, known in tested.items() if end_ns - known.end_ns >= nanoseconds(RECORD)}
+        if not old or self._believed.drift > DRIFT:
+            return []
+        begin_ns = end_ns - nanoseconds(RECORD)
+        if self._fell_back(begin_ns) or self._oscillated(begin_ns):
+            return []
+        whole = self.recording(begin_ns)
+        recent, ratio = self._steady(whole)
+        if len(recent.t) < len(whole.t):
+            return []
+        delays = {part: known.delay for part, known in old.items()}
+        changes = change_test(recent, self._at_speed(self._model, ratio), self._actuation, delays)
+        return [change for change in changes if change.outputs in old]
+
+    def _fell_back(self, after_ns: int) -> bool:
+        """Whether the law fell back after an instant: other parameters than a proposal replaced those that flew."""
+        flown = [sample.flown for sample in self._record if sample.stamp_ns > after_ns]
+        return any(new != old and new not in self._proposals for old, new in pairwise(flown))
+
+    def _oscillated(self, after_ns: int) -> bool:
+        """Whether an output oscillated after an instant, over the whole time."""
+        y = np.array([sample.y for sample in self._record if sample.stamp_ns > after_ns])
+        return bool(divergence.oscillating(y, divergence.least(self._controller.outputs)).any())
+
+    def _designed(
+        self, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+    ) -> RiseDiConfig:
+        """The controller of a model, with the law of the start in the parts without one.
+
+        Its delay margin is the one behind the latest delay of the parts. Raises ParameterError.
+        """
+        start = self._controller
+        latest = max((value.latest for value in known.values()), default=0.0)
+        try:
+            return self._designed_behind(latest, model, known, dead)
+        except ParameterError as error:
+            if margin_behind(latest, start) > margin_of(start):
+                raise ParameterError(f"u is up to {1e3 * latest:.0f} ms late: {error}") from None
+            raise
+
+    def _designed_behind(
+        self, delay: float, model: Airframe, known: Mapping[tuple[str, ...], Known], dead: Mapping[tuple[str, ...], str]
+    ) -> RiseDiConfig:
+        """`_designed`, with the delay margin behind a delay, s. Raises ParameterError."""
+        start = self._controller
+        learned = {output for part in known for output in part}
+        bare = [output not in learned for output in start.outputs]
+        designed = start.model_copy(update={"learn": None})
+        if learned:
+            designed = self._design(with_margin(designed, margin_behind(delay, start)), model)
+            designed = _with_deviations(designed, {k: v for part in known.values() for k, v in part.deviation.items()})
+        proposed = with_channels_of(start, designed, bare, [name in dead.values() for name in start.inputs])
+        return RiseDiConfig.validate_mapping(proposed.model_dump() | {"learn": self._start.model_dump()["learn"]}, "proposal")
+
+
+def margin_of(controller: RiseDiConfig) -> float:
+    """The delay margin that a controller loads with, s."""
+    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
+    return controller.observer.margin
+
+
+def with_margin(controller: RiseDiConfig, margin: float) -> RiseDiConfig:
+    """A controller that loads with another delay margin, s."""
+    assert controller.observer is not None  # noqa: S101 - a controller that learns has one
+    return controller.model_copy(update={"observer": controller.observer.model_copy(update={"margin": margin})})
+
+
+def margin_behind(delay: float, start: RiseDiConfig) -> float:
+    """The delay margin of a model whose inputs are late by a delay, s: that of the start, or more.
+
+    Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
+    """
+    left = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
+    return max(margin_of(start), round(delay + left, 4))  # 0.1 ms, as few digits as the file of a scenario
+
+
+def unchanged(changes: Iterable[Change]) -> str:
+    """The sentence of tests without a change."""
+    effects = ", ".join(f"{name} {100 * left:.0f} %" for change in changes for name, left in change.left.items())
+    if not effects:
+        return "no identification is due, and no part is tested for a change"
+    return f"the aircraft has not changed: effects of inputs, of those of the model, {effects}"
+
+
+def _with_deviations(designed: RiseDiConfig, deviation: Mapping[str, float]) -> RiseDiConfig:
+    """A controller whose model of the feedforward has the standard deviations of B, given by entry and relative to it."""
+    model = designed.feedforward
+    assert model is not None  # noqa: S101 - a design has one
+    names = [f"B[{state}, {name}]" for state in model.states for name in designed.inputs]
+    values = tuple(abs(value) * deviation.get(name, 0.0) for name, value in zip(names, model.B, strict=True))
+    return designed.model_copy(update={"feedforward": model.model_copy(update={"deviation": values})})
+
+
+def without_effect(model: Airframe, name: str) -> Airframe:
+    """A model with almost no effect of an input."""
+    column = model.matrix_b()[:, list(model.inputs).index(name)].tolist()
+    effects = zip(model.states, column, strict=True)
+    return with_entries(model, [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value])
+
+
+def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
+    """Whether the outputs of a part are among those of another."""
+    return set(part) <= set(whole)
+
+
+def changed(found: Change) -> str:
+    """The part that has changed, and its weakest input."""
+    name, left = min(found.left.items(), key=lambda effect: effect[1])
+    weakest = f"{name} has {100 * left:.0f} % of its effect"
+    return f"{' and '.join(found.outputs)} changed, log-likelihood {found.gain:.3g}: {weakest}"
+
+
+def explains(found: Part) -> bool:
+    """Whether the nominal airframe predicts the held-out samples as well as the identified model."""
+    return bool(found.after.log_likelihood <= found.before.log_likelihood)
+
+
+def not_white(found: Part) -> str:
+    """The output with the least white innovations, if above MAX_WHITENESS."""
+    worst = int(np.argmax(found.after.whiteness))
+    white = float(found.after.whiteness[worst])
+    if white <= MAX_WHITENESS:
+        return ""
+    name = found.outputs[worst]
+    return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
+
+
+def too_late(found: Part, delay: float) -> str:
+    """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of the loop, s."""
+    bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
+    if found.delay < bound - 1e-6:  # s, of rounding
+        return ""
+    names = " and ".join(found.inputs)
+    return f"{names}: found u {1e3 * found.delay:.0f} ms late or later, expected less than {1e3 * bound:.0f} ms"
+
+
+def uncoupled(found: Part, known: Iterable[tuple[str, ...]]) -> str:
+    """The refusal of a part alone where the flown model couples the part with another; empty where it does not."""
+    if not any(is_within(found.outputs, whole) for whole in known if whole != found.outputs):
+        return ""
+    return f"{' and '.join(found.outputs)}: found no model with coupling, expected one, as that which flies"
+
+
+def weaker(found: Part, flown: Airframe | None) -> str:
+    """The effect that a record of gusts has weaker than the model that flies, if by more than MAX_DEVIATION.
+
+    Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
+    """
+    if flown is None or not found.gusts:
+        return ""
+    for entry in best_known(found.entries, found.outputs):
+        share = entry.value / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
+        if share < 1.0 - MAX_DEVIATION:
+            expected = f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
+            return f"{entry.name}: found {100 * share:.0f} % of that of the model that flies, {expected}"
+    return ""
+
+
+def sentence(found: Part) -> str:
+    """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with deviations."""
+    effects = (entry for entry in found.entries if entry.matrix == "B" and entry.row in found.outputs)
+    known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
+    text = ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
+    return text if all(entry.nominal for entry in found.entries) else f"{text}, with coupling"
+
+
+def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
+    """The longest end of a record over which a linear model holds, and the mean airspeed over V0.
+
+    The airspeed differs from the mean by SPREAD of the mean, rms, at most: effects of surfaces then vary twice as much.
+    """
+    V = recorded.y[:, airframe.outputs.index("V")] / airframe.speed
+    known = np.isfinite(V)[::-1]
+    ratio = np.where(known, 1.0 + V[::-1], 0.0)
+    count = np.maximum(np.cumsum(known), 1)
+    mean = np.cumsum(ratio) / count
+    square = np.cumsum(ratio**2) / count - mean**2
+    length = int(np.flatnonzero(square <= (SPREAD * mean) ** 2)[-1]) + 1
+    first = len(V) - length
+    return recorded._replace(t=recorded.t[first:], y=recorded.y[first:], u=recorded.u[first:]), float(mean[length - 1])
+
+
+def about(recorded: Recording, airframe: Airframe, x: FloatArray, u: FloatArray) -> Recording:
+    """A record as deviations from a trim, x (n,) and u (m,) in the airframe's order."""
+    return recorded._replace(y=recorded.y - airframe.matrix_c() @ x, u=recorded.u - u)

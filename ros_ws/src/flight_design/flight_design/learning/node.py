@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The learner node: from the ticks of the controller to proposals of feedforward and observer.
+
+The search runs in a thread of low priority. The loop does not wait for it in real time.
+"""
+
+import os
+import threading
+import traceback
+from functools import partial
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from flight_analysis.closed_loop.learning_loop import Identifications, LearnerResult, as_received
+from flight_analysis.closed_loop.scenario import load_scenario
+from flight_core.modes import Mode
+from flight_core.parameters import ParameterError
+from flight_core.publisher_lock import PublisherLock
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_core.vectors import StampedVector
+from flight_design.learning.params import LearnerConfig
+from flight_design.learning.scenario_learner import learner
+from flight_ros import reports
+from flight_ros.event_loop import IDLE_POLL_PERIOD
+from flight_ros.flight_node import FlightNode
+from flight_ros.messages import Decoder
+from flight_ros.reports import Report
+from flight_ros.ticker import Tick
+from flight_ros.topics import INTERNALS, LEARNED, LOCKSTEP, PROPOSAL, RECORD_FOREIGN
+from rise_di_controller.proposals import Updates
+
+PERIOD_NS = NANOSECONDS // 10
+NICE = 10  # of a search in real time, above the nodes of the loop: it takes a core for seconds
+
+
+class LearnerNode(FlightNode[LearnerConfig]):
+    """Takes y and u of each tick from `internals`, and publishes a proposal for each identification that is due.
+
+    While a search runs, the samples wait in the queue of the subscription: the record of a search does not change, and in
+    lockstep the proposals are those of the loop in one process. In real time a search begins with the newest sample: of
+    identifications that became due meanwhile the last is made.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("learner", LearnerConfig)
+        scenario = load_scenario(self.parameters.scenario_file)
+        lockstep = self.parameters.lockstep
+        make = learner(scenario, real_time=not lockstep)
+        if make is None:
+            raise ParameterError("learner.scenario_file: found a scenario without controller.learn, expected one that learns")
+        self._start = scenario.rise_di()
+        assert self._start.learn is not None  # noqa: S101 - for the type checker
+        self._settings, self._new_learner = self._start.learn, partial(make, self._start)
+        names = ("mode", "age", "parameters", *(f"y.{name}" for name in self._start.outputs))
+        names += tuple(f"u.{name}" for name in self._start.inputs)
+        self._internals = self.receive(
+            INTERNALS,
+            Decoder(names).decode,
+            self._take,
+            max_age_ns=None,  # the samples wait for a search
+            lock=None if lockstep else PublisherLock(self._timeouts_ns),
+            qos=LOCKSTEP if lockstep else RECORD_FOREIGN,
+        )
+        self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
+        self._search: threading.Thread | None = None
+        self._proposal, self._end_ns, self._flown = LearnerResult(None, ""), 0, 0
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin with an empty record."""
+        self._learner, self._updates = self._new_learner(), Updates(self._settings)
+        self._identifications = Identifications(self._learner, self._start.outputs)
+        self._has_record = self._is_due = False
+        self._said = "no model yet"
+
+    def period_ns(self) -> int:
+        return PERIOD_NS
+
+    def tick(self, tick: Tick, now_ns: int) -> None:
+        self._advance(now_ns)
+
+    def advance(self) -> bool:
+        if self._search is not None:
+            self._search.join(IDLE_POLL_PERIOD)  # samples wait, so the event loop would not
+        return self._advance(0)
+
+    def awaited_topic(self) -> str:
+        return "" if self._search is not None else self._internals.name
+
+    def _timeouts_ns(self) -> tuple[int, int]:
+        max_age_ns = nanoseconds(self._start.max_age)
+        return max_age_ns, max_age_ns + nanoseconds(self._start.hold + self._start.ramp)
+
+    def _advance(self, now_ns: int) -> bool:
+        """Publish the proposal of a search that has ended, and take samples until the next search. Whether there was one."""
+        advanced = False
+        if self._search is not None and not self._search.is_alive():
+            self._search = None
+            proposal = as_received(self._proposal, self._start, self._end_ns, self._flown)
+            values = {"start": proposal.start, "flown": proposal.flown, **proposal.change}
+            report = Report(self._end_ns, self.instance, proposal.sentence, values, warns=not proposal.change)
+            self._publish(reports.encode(report, "proposal"))
+            if (found := self._identifications.next(self._proposal)) is not None:
+                self._publish_learned(self.encoder(found.names).encode(self._end_ns, found.values))
+            if proposal.sentence:
+                self._said = f"{'proposes' if proposal.change else 'no model:'} {proposal.sentence}"
+                self.get_logger().info(self._said)
+            advanced = True
+        while self._search is None and self._internals.poll(now_ns, 1):
+            advanced = True
+            if self.parameters.lockstep:
+                self._begin_search()
+        self._begin_search()
+        return advanced
+
+    def _begin_search(self) -> None:
+        """Begin the search that is due, if any, on the record so far."""
+        if self._is_due and self._search is None:
+            self._is_due = False
+            self._search = threading.Thread(target=self._propose, daemon=True)  # it does not delay the end of the node
+            self._search.start()
+
+    def _take(self, sample: StampedVector, now_ns: int) -> None:
+        mode, age, flown = sample.value[:3].tolist()
+        y, u = np.split(sample.value[3:], 2)
+        if mode == Mode.INACTIVE:  # the next engagement begins with the law of the start
+            if self._has_record:
+                self._begin()
+            return
+        if mode == Mode.ENGAGED:
+            self._learner.take(sample.stamp_ns, y, u, int(flown))
+        self._has_record = True
+        self._end_ns, self._flown = sample.stamp_ns + round(age * NANOSECONDS), int(flown)
+        self._is_due = self._updates.due(self._end_ns) or self._is_due
+
+    def _propose(self) -> None:
+        if not self.parameters.lockstep:
+            os.nice(NICE)  # Linux: of this thread alone
+        try:
+            self._proposal = self._learner.propose(self._flown)
+        except Exception as error:  # the flight goes on, and in lockstep waits for a proposal
+            self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
+            self._proposal = LearnerResult(None, f"the identification failed: {' '.join(str(error).split())}")
+
+    def close(self) -> None:
+        """In lockstep complete the searches that are due: the log has their entries, as that of one process."""
+        if self.parameters.lockstep:
+            self._advance(0)
+            while self._search is not None:
+                self._search.join()
+                self._advance(0)
+
+    def status(self) -> tuple[bytes, str, dict[str, object]]:
+        return DiagnosticStatus.OK, "identifies" if self._search is not None else self._said, {}

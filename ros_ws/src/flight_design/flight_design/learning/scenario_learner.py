@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The learner of a scenario: its airframe file is the rough model, and its observers have the gains of `rise-di gains`."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from aircraft_sim.airframe import Airframe, load_airframe
+from aircraft_sim.uncertainty import as_yaml
+from flight_analysis.closed_loop.learning_loop import Entry, Learn
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.files import comment
+from flight_core.modes import Mode
+from flight_core.parameters import require
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Tape
+from flight_design.gains.gain_design import observed
+from flight_design.identification.model_identification import KNOWN
+from flight_design.identification.sketch import ROUGH, sketched
+from flight_design.learning.learner import Learner
+from rise_di_controller.proposals import Updates
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+
+def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
+    """What `simulate` and `fly_and_report` take as `learn`; None for a scenario that does not learn.
+
+    The published airframe is the rough model, not the aircraft in flight. For an aircraft of JSBSim the rough model is the
+    controller's feedforward. In real time the loop has the delay of the controller's section; in one process and in lockstep u
+    acts at once. Raises ParameterError.
+    """
+    controller, aircraft = scenario.controller, scenario.aircraft
+    if not isinstance(controller, RiseDiConfig) or controller.learn is None:
+        return None
+    if aircraft.is_jsbsim:
+        condition = aircraft.flight_condition()
+        airframe, rough = sketched(Path(condition.name).stem, controller, condition.speed), ROUGH
+    else:
+        airframe, rough = load_airframe(aircraft.airframe), KNOWN
+    if controller.learn.prior is not None:
+        airframe = _prior(controller.learn.prior, airframe)
+
+    speeds = None
+    if controller.schedule is not None:
+        slow, fast = (there.ratio for there in controller.schedule.models)
+        speeds, V0 = (slow, fast), controller.schedule.speed
+        require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", f"{airframe.speed:g} m/s, that of the model")
+
+    def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
+        assert start.observer is not None  # noqa: S101 - a controller that learns has one
+        margin, sketch = start.observer.margin, aircraft.is_jsbsim
+        return observed(start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds)[0]
+
+    return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
+
+
+def _prior(path: str, flown: Airframe) -> Airframe:
+    """The rough model of a file. Raises ParameterError for one of another airframe."""
+    prior = load_airframe(path)
+    for key in ("name", "states", "inputs", "outputs", "speed"):
+        same = getattr(prior, key) == getattr(flown, key)
+        require(same, "controller.learn.prior", f"an airframe with another {key}", f"a model of {flown.name}")
+    return prior
+
+
+class LearnStep(NamedTuple):
+    """What the learner found at a flight time."""
+
+    t: float  # s
+    proposed: bool
+    sentence: str
+
+
+class LearnResult(NamedTuple):
+    """The learner's steps over a log, and the model at its end; None where nothing was learned."""
+
+    steps: tuple[LearnStep, ...]
+    model: Airframe | None
+    entries: tuple[Entry, ...]  # of the last identification
+
+
+def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
+    """Step the learner of a scenario with y and u of the engaged ticks of a log. Raises ParameterError.
+
+    A deactivated law ends a record, as in flight. Where the log has other settings of the learner than the scenario, or none,
+    each proposal is taken as flown.
+    """
+    make, controller = learner(scenario, real_time=tape.start_ns > 0), scenario.rise_di()  # simulated time begins at 0
+    require(make is not None, "controller.learn", "no section", "one")
+    assert make is not None  # noqa: S101 - for the type checker
+    settings = controller.learn
+    assert settings is not None  # noqa: S101 - there is a learner
+
+    def begun() -> tuple[Learner, Updates]:
+        made = make(controller)
+        assert isinstance(made, Learner)  # noqa: S101 - `learner` makes no other
+        return made, Updates(settings)
+
+    flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
+    require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
+    ticks, steps = tape["internals"], list[LearnStep]()
+    y, u, mode = ticks.group("y").values, ticks.group("u").values, ticks["mode"]
+    instants_ns = ticks.stamp_ns + np.round(ticks["age"] * NANOSECONDS).astype(np.int64)
+    flown, start = ticks["parameters"], controller.digest()
+    is_of_log = bool(np.any(flown == start))
+    (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
+    for k, (stamp_ns, now_ns) in enumerate(zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)):
+        if mode[k] == Mode.INACTIVE:
+            continue
+        if k and mode[k - 1] == Mode.INACTIVE:
+            (learned, updates), proposed, begin_ns = begun(), start, now_ns
+        longest_ns = max(longest_ns, now_ns - begin_ns)
+        if mode[k] == Mode.ENGAGED:
+            learned.take(stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed)
+        if updates.due(now_ns):
+            proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
+            proposed = proposed if proposal.controller is None else proposal.controller.digest()
+            t = (now_ns - tape.start_ns) / NANOSECONDS
+            if proposal.sentence:
+                steps.append(LearnStep(t, proposal.controller is not None, proposal.sentence))
+    first = f"{settings.updates[0]:g} s or more, the first of learn.updates"
+    require(bool(steps), "the log", f"at most {longest_ns / NANOSECONDS:.3g} s of ticks of an active controller", first)
+    last = learned.identification
+    return LearnResult(tuple(steps), learned.model, () if last is None else last.entries)
+
+
+def learned_yaml(result: LearnResult, origin: str) -> str:
+    """The model of a result as the text of an airframe file; the header has the steps. Raises ParameterError without one."""
+    require(result.model is not None, "the learner", "no model", "one")
+    assert result.model is not None  # noqa: S101 - for the type checker
+    lines = [f"The airframe {result.model.name}, with A and B learned from {origin}.", ""]
+    lines += [f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}" for step in result.steps]
+    return comment(lines) + as_yaml(result.model)

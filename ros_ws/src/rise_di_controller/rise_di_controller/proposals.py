@@ -1,0 +1,465 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models learned in flight, on the side of the controller: when identifications begin, which proposals fly, the fallback.
+
+Pure: for the node and for the loop in one process.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flight_core.channels import SIDES, UNKNOWN
+from flight_core.modes import Mode
+from flight_core.parameters import SMALLEST, ParameterError, flatten, require
+from flight_core.rates import nanoseconds, seconds
+from flight_core.vectors import FloatArray
+from rise_di_controller.controller import Controller, Prepared, prepared, preparing
+from rise_di_controller.law import MIN_GAIN
+from rise_di_controller.params import ControllerConfig
+from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
+
+DESIGNED = frozenset(
+    {"k_g", "k_d", "Lambda", "beta", "softening", "input_scale", "omega", "sign", "feedforward", "observer", "schedule"}
+)
+"""Parameters, or groups of them, that a proposal may change: what `rise-di gains --observer` designs, at every speed."""
+
+OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation")
+"""Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
+
+
+FLIES, REFUSED = "flies", "refused"
+"""First words of the sentence of an event: a proposal is taken, a proposal fails a check."""
+
+
+class Proposal(NamedTuple):
+    """What a learner found in its window, as the controller receives it."""
+
+    stamp_ns: int  # the end of the window: the instant of its last tick
+    start: int  # digest of the parameters of the start, for which the learner was started
+    flown: int  # digest of the parameters that flew at the end of the window
+    change: Mapping[str, Any]  # all of DESIGNED by dotted name, None for what is gone; empty where no model is proposed
+    sentence: str  # what was learned, or why there is no model
+
+
+class Event(NamedTuple):
+    """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none, and why."""
+
+    stamp_ns: int
+    change: Mapping[str, Any]
+    sentence: str
+
+
+FALLBACKS = 2
+"""Fallbacks of a part in an engagement after which the part has no further model: the second model was certified, too."""
+
+AUTHORITY_TICKS = 10
+"""Ticks of the controller from one sample of `authority` to the next."""
+
+
+class Fallback(NamedTuple):
+    """A fallback to the law of the start in all parts."""
+
+    flown: int  # digest of the parameters before
+    input_scale: tuple[float, ...]  # of these
+    fallen: int  # digest of the parameters after
+
+    def outlived_by(self, proposal: Proposal, flown: int) -> bool:
+        """Whether a proposal beside the parameters before holds an input more, one without effect, and nothing else changed."""
+        scale = proposal.change.get("input_scale")
+        if (proposal.flown, flown) != (self.flown, self.fallen) or not isinstance(scale, Sequence):
+            return False
+        return any(new == SMALLEST < old for new, old in zip(scale, self.input_scale, strict=False))
+
+
+class Updates:
+    """When identifications and tests begin: at the first tick at or after each of the times, counted from the first tick."""
+
+    def __init__(self, settings: LearnConfig) -> None:
+        self._check_ns = nanoseconds(settings.check)
+        self._times_ns = deque(map(nanoseconds, settings.updates))
+        self._first_ns: int | None = None
+
+    def due(self, now_ns: int) -> bool:
+        """Whether an identification begins at this tick. Call it at each tick in order."""
+        self._first_ns = now_ns if self._first_ns is None else self._first_ns
+        due = False
+        while now_ns - self._first_ns >= self._times_ns[0]:
+            due, last_ns = True, self._times_ns.popleft()
+            if not self._times_ns:
+                self._times_ns.append(last_ns + self._check_ns)
+        return due
+
+
+class Learning:
+    """The proposals of a flight and the fallback, stepped between two ticks of the controller.
+
+    In simulated time a proposal acts `learn.latency` after the end of its window, for which the flight waits. Else it acts
+    when it is certified: a part of the certificate a step, so that no tick waits for it.
+    """
+
+    def __init__(self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool) -> None:
+        assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
+        self._start, self._digest, self._settings = parameters, parameters.digest(), parameters.learn
+        self._announce, self._simulated = announce, simulated
+        self._updates = Updates(parameters.learn)
+        self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
+        self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
+        self._certificate: tuple[Proposal, Generator[None, None, Prepared]] | None = None
+        self._spacing_ns = nanoseconds(parameters.learn.spacing()) // 2
+        self._last_ns: int | None = None  # end of the window of the last proposal that was not refused at once
+        self._since_ns: int | None = None  # when the law was last inactive: an earlier window is of another engagement
+        self._fallback: Fallback | None = None  # the last one
+        self._fallbacks = Counter[str]()  # of this engagement, by output
+        self._diverged = set[int]()  # digests of the parameters that diverged in this engagement
+
+    def authority(self, controller: Controller) -> FloatArray:
+        """`authority` of what flies."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
+        return authority(flown, self._start)
+
+    def ticked(self, controller: Controller, now_ns: int) -> bool:
+        """Note a tick; whether an identification begins with it. None begins while the law is deactivated."""
+        due = controller.mode is not Mode.INACTIVE and self._updates.due(now_ns)
+        if due and self._simulated:
+            self._due.append(now_ns)
+        return due
+
+    def waits(self, now_ns: int) -> bool:
+        """In simulated time: whether the tick at `now_ns` waits for a proposal."""
+        return any(self._acts_ns(end_ns) <= now_ns and end_ns not in self._received for end_ns in self._due)
+
+    def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
+        """Take a proposal, or refuse it with an event."""
+        if refusal := self._refusal(proposal, now_ns, controller):
+            self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
+        elif self._simulated:
+            self._received[proposal.stamp_ns] = proposal
+        else:
+            self._last_ns = proposal.stamp_ns
+            self._begin(proposal, controller, now_ns)
+
+    def step(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Certify, let the proposals act that are due, and fall back where the law diverges.
+
+        A deactivated law begins again with the parameters of the start: it may have been deactivated because of its model.
+        Returns the parameters that the controller has taken; None where it keeps its own.
+        """
+        if controller.mode is Mode.INACTIVE:
+            return self._begin_again(controller, now_ns)
+        taken = None
+        while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
+            self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
+            taken = self._certify(controller, now_ns) or taken
+        if not self._simulated:
+            taken = self._certify(controller, now_ns)
+        if oscillations := controller.oscillations():
+            taken = self._end_oscillations(oscillations, controller, now_ns)
+        elif diverging := controller.diverging():
+            taken = self._end_divergence(diverging, controller, now_ns)
+        return taken
+
+    def _end_divergence(self, diverging: Collection[str], controller: Controller, now_ns: int) -> RiseDiConfig:
+        """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to the end of the engagement."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        part = [name for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True) if diverges]
+        self._fallbacks.update(part)
+        ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
+        fallen = given_up(self._start, self._start, {*outputs_without(flown), *ended})
+        lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
+        reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
+        self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
+        self._diverged.add(controller.digest)
+        self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start{lasting}: {reason}")
+        return fallen
+
+    def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
+        """Take the law of the start, to the end of the engagement, in the parts of the model whose outputs oscillate."""
+        flown = controller.parameters
+        assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
+        bare = coupled(flown, periods)
+        fallen = given_up(self._start, flown, [name for name, without in zip(flown.outputs, bare, strict=True) if without])
+        rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
+        outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
+        what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
+        self._take(controller, now_ns, prepared(fallen), what)
+        return fallen
+
+    def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """Forget what is under way; the parameters of the start where a learned model flew."""
+        self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
+        self._due.clear()
+        self._received.clear()
+        self._fallbacks.clear()
+        self._diverged.clear()
+        if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self._start):
+            return None
+        self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
+        return self._start
+
+    def _acts_ns(self, end_ns: int) -> int:
+        return end_ns + nanoseconds(self._settings.latency)
+
+    def _refusal(self, proposal: Proposal, now_ns: int, controller: Controller) -> str:
+        """Why a proposal is not certified at all; empty for one that may be. Costs microseconds, whatever the proposal."""
+        window = f"a window that ends {seconds(now_ns - proposal.stamp_ns):.3g} s ago"
+        if proposal.start != self._digest:
+            return f"found a proposal for the parameters {proposal.start}, expected {self._digest}, those of the start"
+        if self._simulated:
+            known = proposal.stamp_ns in self._due and proposal.stamp_ns not in self._received
+            return "" if known else f"found {window}, expected that of an identification that is due, once"
+        longest = nanoseconds(self._settings.window)
+        if self._since_ns is not None:
+            longest = min(longest, now_ns - self._since_ns)
+        if not 0 <= now_ns - proposal.stamp_ns <= longest:
+            return f"found {window}, expected 0 to {seconds(longest):.3g} s"
+        if self._certificate is not None:
+            return f"found {window} while another proposal is certified, expected one at a time"
+        if self._last_ns is not None and proposal.stamp_ns - self._last_ns < self._spacing_ns:
+            later = f"one that ends at least {seconds(self._spacing_ns):g} s after that of the last proposal"
+            return f"found {window}, expected {later}"
+        return self._unfit(proposal, controller)
+
+    def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
+        if proposal.change:
+            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
+        elif proposal.sentence:
+            self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
+
+    def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
+        """A part of the certificate, in simulated time all of it; the parameters taken at its end."""
+        if self._certificate is None:
+            return None
+        proposal, certificate = self._certificate
+        try:
+            next(certificate)
+            while self._simulated:
+                next(certificate)
+        except StopIteration as end:
+            self._certificate = None
+            refusal = self._unfit(proposal, controller)
+            if end.value.digest in self._diverged:
+                refusal = "found parameters that diverged in this engagement, expected others"
+            if not refusal:
+                without = outputs_without(end.value.parameters)
+                what = f"{FLIES} {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
+                self._take(controller, now_ns, end.value, what)
+                return controller.parameters
+        except ArithmeticError as error:
+            refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
+        except ValueError as error:  # ParameterError, or a matrix of which LAPACK finds no eigenvalues
+            refusal = str(error)
+        else:
+            return None
+        self._certificate = None
+        self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
+        return None
+
+    def _unfit(self, proposal: Proposal, controller: Controller) -> str:
+        """The refusal of a proposal for a law that is not engaged, or that lost the race with another change; else empty.
+
+        An input that has lost its effect has none after a fallback either, which its loss may have caused.
+        """
+        if controller.mode is not Mode.ENGAGED:
+            return f"found the mode {controller.mode.name}, expected a model only while the law is engaged"
+        if proposal.flown == controller.digest:
+            return ""
+        if self._fallback is not None and self._fallback.outlived_by(proposal, controller.digest):
+            return ""
+        return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
+
+    def _take(self, controller: Controller, now_ns: int, new: Prepared, sentence: str) -> None:
+        change = changes(controller.parameters, new.parameters)
+        controller.retune(new)
+        self._announce(Event(now_ns, change, sentence))
+
+
+def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:
+    """The flown parameters with a change, checked as at load, in parts of at most about 1 ms. Raises ParameterError."""
+    foreign = sorted(name for name in change if name.split(".")[0] not in DESIGNED)
+    require(not foreign, "proposal", f"a change of {', '.join(foreign)}", f"changes of {', '.join(sorted(DESIGNED))} alone")
+    proposed = RiseDiConfig.validate_mapping(flown.changed(change), "controller", check=False)
+    yield
+    require(proposed.observer is not None, "proposal", "no observer", "one")
+    assert proposed.observer is not None  # noqa: S101 - for the type checker
+    assert start.observer is not None  # noqa: S101 - a controller that learns has one
+    require(
+        proposed.observer.states == start.observer.states,
+        "controller.observer.states",
+        ", ".join(proposed.observer.states),
+        f"those of the start: {', '.join(start.observer.states)}",
+    )
+    speeds = _speeds(start)
+    require(
+        _speeds(proposed) == speeds,
+        "controller.schedule",
+        _speeds(proposed) or "none",
+        f"that of the start: {speeds or 'none'}",
+    )
+    least = start.observer.margin
+    found = proposed.observer.margin
+    require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
+    if without := outputs_without(flown):
+        others = f"one of other outputs than {', '.join(without)}, by learn.without"
+        require(proposed.feedforward is not None, "proposal", "no feedforward", others)
+        bare = coupled(proposed, without)
+        proposed = fallen_back(start, proposed, bare)
+        require(not all(bare), "proposal", "no model", others)
+        yield
+    try:
+        yield from proposed.checks()
+    except ParameterError as error:
+        raise ParameterError(f"controller.{error}") from None
+    ready = yield from preparing(proposed)
+    yield
+    return ready
+
+
+def _speeds(parameters: RiseDiConfig) -> str:
+    """The speeds of the models, and how the schedule follows; empty without a schedule."""
+    schedule = parameters.schedule
+    if schedule is None:
+        return ""
+    ratios = " and ".join(f"{model.ratio!r}" for model in schedule.models)
+    return f"{schedule.speed!r} m/s, {schedule.time!r} s, models at {ratios or 'no'} times it"
+
+
+def designed(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """All of DESIGNED of a new set by dotted name; None for what an old set, or what flies meanwhile, may have besides."""
+    before, after = (
+        {name: value for name, value in flatten(parameters.model_dump()) if name.split(".")[0] in DESIGNED}
+        for parameters in (old, new)
+    )
+    return dict.fromkeys([*before, *OPTIONAL]) | after
+
+
+def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence[bool], dead: Sequence[bool]) -> RiseDiConfig:
+    """A controller with the gains of `start` in some channels, without feedforward and observer there; not checked.
+
+    A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
+    input scale, so that the law holds it.
+    """
+    law, own = start.law_params(), designed.law_params()
+    last, channels = own.K[-1], np.array(bare)
+    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
+    K[-1] = last
+    share = np.where(channels, law.K / K, 1.0)
+    scale = np.where(channels, law.input_scale * share, own.input_scale)
+    of_start, of_designed = (
+        (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
+        for part in (start, designed)
+    )
+    beta, Lambda, omega, softening = (
+        np.where(channels, kept * factor, taken)
+        for kept, taken, factor in zip(of_start, of_designed, (1.0 / share, 1.0, share, 1.0), strict=True)
+    )
+    changed: dict[str, Any] = {
+        "k_d": tuple((K[:-1] - last).tolist()),
+        "Lambda": tuple(Lambda.tolist()),
+        "beta": tuple(beta.tolist()),
+        "omega": tuple(omega.tolist()),
+        "softening": tuple(softening.tolist()),
+        "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
+    }
+    observer, feedforward, schedule = designed.observer, designed.feedforward, designed.schedule
+    if channels.any() and observer is not None and feedforward is not None:
+
+        def without(F: Sequence[float]) -> dict[str, Any]:
+            return {"F": tuple((np.reshape(F, (len(bare), -1)) * ~channels[:, None]).ravel().tolist())}
+
+        acting = feedforward.inputs or start.inputs
+        flown = tuple(name for name, is_bare in zip(start.inputs, bare, strict=True) if name in acting and not is_bare)
+        changed["observer"] = observer.model_copy(update=without(observer.F))
+        if schedule is not None and schedule.slow is not None and schedule.fast is not None:
+            slow, fast = (model.model_copy(update=without(model.F)) for model in schedule.models)
+            changed["schedule"] = schedule.model_copy(update={"slow": slow, "fast": fast})
+        changed["feedforward"] = feedforward.model_copy(update={"inputs": flown or None})
+    return designed.model_copy(update=changed)
+
+
+def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
+    """The inputs with a feedforward or an observer: those of the parts with a model."""
+    feedforward, observer, inputs = parameters.feedforward, parameters.observer, parameters.inputs
+    fed = () if feedforward is None else feedforward.inputs or inputs
+    models = () if parameters.schedule is None else parameters.schedule.models
+    F = np.hstack([np.reshape(model.F, (len(inputs), -1)) for model in (observer, *models) if model is not None])
+    return tuple(name for name, row in zip(inputs, F, strict=True) if name in fed or row.any())
+
+
+def authority_names(outputs: Sequence[str]) -> tuple[str, ...]:
+    """Channels of the topic `authority`."""
+    return tuple(f"{side}.{name}" for side in SIDES for name in outputs)
+
+
+def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
+    """Least change of the outputs by the paired inputs, from trim to the lower and the upper limit, (2m,), units/s:
+
+        y_dot_i = abs(Omega_ii) exp(-2 s_i) abs(limit of u_i),  Omega = C B of the model learned in flight
+
+    with s_i the standard deviation of Omega_ii over Omega_ii: two deviations less for a small s_i, and above 0 for any. Beside
+    models at further speeds it is the least over the speeds.
+    For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the start.
+    """  # noqa: D400, D415 - what follows is an equation
+    m, model, acting = len(flown.outputs), flown.feedforward, acting_inputs(flown)
+    dead = np.array(flown.input_scale) <= SMALLEST
+    found = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
+    if model is None or flown.models() == start.models():
+        return found.ravel()
+    rows = [model.states.index(name) for name in flown.outputs]
+    both = (model.B, model.deviation or (0.0,) * len(model.B))
+    B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
+    least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
+    for there in () if flown.schedule is None else flown.schedule.models:
+        least = least * np.minimum(np.abs(np.reshape(there.B, (-1, m))[rows].diagonal() / B), 1.0)
+    for k, limits in enumerate((flown.lower, flown.upper)):
+        if limits is None:
+            continue
+        side = np.where(B > 0.0, k, 1 - k)
+        known = ~dead & [name in acting for name in flown.inputs]
+        found[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
+    return found.ravel()
+
+
+def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
+    """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
+    acting, is_first = acting_inputs(flown), flown.models() == start.models()
+    if is_first or all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
+        return start
+    mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
+    return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
+
+
+def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
+    """Outputs without a model to the end of the engagement, by `learn.without`."""
+    learn = parameters.learn if isinstance(parameters, RiseDiConfig) else None
+    return () if learn is None else learn.without or ()
+
+
+def given_up(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]) -> RiseDiConfig:
+    """What flies, with the law of the start in some outputs to the end of the engagement, added to `learn.without`."""
+    fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
+    assert start.learn is not None  # noqa: S101 - a controller that learns
+    without = tuple(name for name in start.outputs if name in {*outputs_without(flown), *outputs})
+    return fallen.model_copy(update={"learn": start.learn.model_copy(update={"without": without or None})})
+
+
+def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
+    """Mask of the outputs that the model of the feedforward couples with some of them, (m,)."""
+    model = parameters.feedforward
+    assert model is not None  # noqa: S101 - a learned model flies
+    n = len(model.states)
+    A, gravity, B = (np.reshape(values, (n, -1)) != 0.0 for values in (model.A, model.gravity or np.zeros(n), model.B))
+    links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
+    reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
+    at = [model.states.index(name) for name in names]
+    return [bool(np.any(reached[model.states.index(output), at])) for output in parameters.outputs]
+
+
+def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
+    """What differs between two parameter sets, by dotted name; None for a parameter that is gone."""
+    before, after = dict(flatten(old.model_dump())), dict(flatten(new.model_dump()))
+    return {name: after.get(name) for name in before | after if before.get(name) != after.get(name)}
