@@ -32,9 +32,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import yaml
-from benchmarks import evidence_data
-from benchmarks.evidence_data import Row, row
-from benchmarks.evidence_page import write_page
+from benchmarks import evidence
+from benchmarks.evidence import Row, row
 
 from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationConfig
@@ -683,7 +682,7 @@ def main() -> None:
     if reason := missing():
         sys.exit(f"error: {reason}")
     for name in arguments.only or MEASUREMENTS:
-        begun = evidence_data.origin(f"python -m benchmarks.autopilots --only {name}")
+        begun = evidence.origin(f"python -m benchmarks.autopilots --only {name}")
         if name == "signs":
             result = (
                 signs_of_logs(arguments.log, lambda number, _: TURBULENCE[number % len(TURBULENCE)])
@@ -696,8 +695,7 @@ def main() -> None:
             result = MEASUREMENTS[name]()
         (FOLDER / f"{name}.json").write_text(json.dumps({"result": result}, indent=1), encoding="utf-8")
         print(name, json.dumps(result), flush=True)
-        evidence_data.write(f"autopilots-{name}", ROWS[name](result), begun)
-        write_page()
+        evidence.write(f"autopilots-{name}", ROWS[name](result), begun)
 
 
 if __name__ == "__main__":

@@ -97,7 +97,8 @@ def main(
     table.add_row("chunks with the bytes of one process", f"{same} of {len(expected)}")
     Console().print(table)
     if json_file is not None:
-        result = {"faults": FAULTS, "workers": WORKERS, "aircraft": aircraft, "chunks": len(expected), "same": same}
+        result = {"faults": FAULTS, "workers": WORKERS, "aircraft": aircraft, "chunks": len(expected)}
+        result["differing"] = len(expected) - same
         json_file.write_text(json.dumps(result), encoding="utf-8")
     if same != len(expected):
         raise typer.Exit(1)

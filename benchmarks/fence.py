@@ -25,8 +25,7 @@ from itertools import chain, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks import evidence_data
-from benchmarks.evidence_page import write_page
+from benchmarks import evidence
 from benchmarks.guidance import aircraft_of, turbulence
 
 from aircraft_sim.airframe import load_airframe
@@ -108,13 +107,13 @@ class Row(NamedTuple):
     lost: int  # flights
     home: int  # flights within HOME_RADII at the end
 
-    def figures(self) -> Iterator[evidence_data.Row]:
+    def figures(self) -> Iterator[evidence.Row]:
         """The rows of evidence."""
         about = f"{self.fence}, {self.wind}"
-        yield evidence_data.row(f"{about}: flights", self.flights)
-        yield evidence_data.row(f"{about}: flights outside", self.outside, at_most=0)
-        yield evidence_data.row(f"{about}: flights lost", self.lost, at_most=0)
-        yield evidence_data.row(f"{about}: farthest outside", self.farthest, "m")
+        yield evidence.row(f"{about}: flights", self.flights)
+        yield evidence.row(f"{about}: flights outside", self.outside, at_most=0)
+        yield evidence.row(f"{about}: flights lost", self.lost, at_most=0)
+        yield evidence.row(f"{about}: farthest outside", self.farthest, "m")
 
 
 def of_radius(zones: tuple[Zone, ...], radius: float) -> tuple[Zone, ...]:
@@ -229,7 +228,7 @@ def main() -> int:
         return int(not all(fly_home(chosen.aircraft, chosen.seed, writer.writerow)))
     for name in chosen.only:
         options = f" --aircraft {chosen.aircraft} --seed {chosen.seed}" * (name == OSPREY)
-        begun, flown = evidence_data.origin(f"python -m benchmarks.fence --only {name}{options}"), list[Row]()
+        begun, flown = evidence.origin(f"python -m benchmarks.fence --only {name}{options}"), list[Row]()
         for shape, wind in product(chosen.shapes, chosen.winds):
             of_fleet = name == OSPREY
             row = fly_fleet(shape, wind, chosen.aircraft, chosen.seed) if of_fleet else fly_alone(name, shape, wind)
@@ -238,8 +237,7 @@ def main() -> int:
             sys.stdout.flush()
             failed |= bool(row.outside or row.lost)
         if len(flown) == len(SHAPES) * len(WINDS):
-            evidence_data.write(f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun)
-            write_page()
+            evidence.write(f"guidance-fence-{name}", chain.from_iterable(row.figures() for row in flown), begun)
     return int(failed)
 
 

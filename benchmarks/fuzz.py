@@ -3,6 +3,7 @@
 """Coverage-guided fuzzing of all readers of external input (tests/fuzz/targets.py), with atheris.
 
 python -m benchmarks.fuzz mcap --seconds 60          # or any other target of tests/fuzz/targets.py
+python -m benchmarks.fuzz all --seconds 60           # every target, a core each; prints statistics as JSON
 python -m benchmarks.fuzz mcap --replay FILE ...     # each input once, under the same limits, without atheris
 
 A fuzzer starts from outputs of the stack's own writers and from tests/corpus/<target>/. At an input that raises, hangs or takes
@@ -12,10 +13,15 @@ input to the corpus.
 
 import argparse
 import hashlib
+import json
+import os
+import re
 import resource
 import signal
+import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from multiprocessing import get_context
 from pathlib import Path
@@ -37,13 +43,15 @@ STACK = [
 def main() -> None:
     """Fuzz, or replay."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    names = "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, targets, control or page"
+    names = "mcap, metadata, scenario, airframe, export, map, message, route, vehicle_log, targets, control, page or all"
     parser.add_argument("target", help=names)
     parser.add_argument("--seconds", type=int, default=60, help="how long to fuzz")
     parser.add_argument("--replay", type=Path, nargs="*", help="read each of these inputs once instead of fuzzing")
     arguments = parser.parse_args()
     if arguments.replay is not None:
         replay(arguments.target, arguments.replay)
+    elif arguments.target == "all":
+        fuzz_all(arguments.seconds)
     else:
         sys.exit(fuzz(arguments.target, arguments.seconds))
 
@@ -67,6 +75,23 @@ def replay(target: str, files: list[Path]) -> None:
                 raise
             signal.setitimer(signal.ITIMER_PROF, 0)
     print(f"{target}: {len(files)} inputs read or refused")
+
+
+def fuzz_all(seconds: int) -> None:
+    """Fuzz every target in a process of its own; print the statistics and the exit status of each fuzzer."""
+    from tests.fuzz.targets import TARGETS  # noqa: PLC0415 - as above
+
+    def statistics(target: str) -> dict[str, int]:
+        command = [sys.executable, "-m", "benchmarks.fuzz", target, "--seconds", str(seconds)]
+        done = subprocess.run(command, cwd=REPOSITORY, check=False, capture_output=True, text=True)  # noqa: S603 - ours
+        if done.returncode:
+            print(done.stderr[-10_000:], file=sys.stderr)
+        counts = re.findall(r"^stat::(\w+):\s+(\d+)", done.stderr, re.MULTILINE)
+        counts += [("covered", count) for count in re.findall(r"cov: (\d+)", done.stderr)]
+        return {"status": done.returncode} | {name: int(count) for name, count in counts}
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        print(json.dumps(dict(zip(TARGETS, pool.map(statistics, TARGETS), strict=True)), indent=1))
 
 
 def fuzz(target: str, seconds: int) -> int:

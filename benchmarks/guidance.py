@@ -25,10 +25,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks import evidence_data
-from benchmarks.evidence_data import row
-from benchmarks.evidence_page import write_page
-from benchmarks.evidence_rows import split
+from benchmarks import evidence
+from benchmarks.evidence import row, split
 from benchmarks.guidance_grid import GRIDS, Point, places, point
 from benchmarks.sampling import new_table
 from rich.console import Console
@@ -522,18 +520,17 @@ def main() -> None:
     sys.exit(failed > 0)
 
 
-def origin(options: str) -> evidence_data.Origin:
+def origin(options: str) -> evidence.Origin:
     """The origin of figures that this program begins to measure with these options."""
-    return evidence_data.origin(f"python -m benchmarks.guidance {options}")
+    return evidence.origin(f"python -m benchmarks.guidance {options}")
 
 
-def store(name: str, figures: Iterable[evidence_data.Row], begun: evidence_data.Origin) -> None:
+def store(name: str, figures: Iterable[evidence.Row], begun: evidence.Origin) -> None:
     """Write the rows of evidence of a measurement, and the page."""
-    evidence_data.write(f"guidance-{name}", figures, begun)
-    write_page()
+    evidence.write(f"guidance-{name}", figures, begun)
 
 
-def figure_row(about: str, flown: Row) -> evidence_data.Row:
+def figure_row(about: str, flown: Row) -> evidence.Row:
     """The row of evidence of a figure; a limit that is infinite is none."""
     name, unit = split(flown.figure.name)
     limit = None if flown.figure.limit == math.inf else flown.figure.limit
@@ -580,7 +577,7 @@ def fly_grid(name: str) -> int:
     return sum(place.result == "lost" for place in flown)
 
 
-def grid_rows(points: Sequence[Point]) -> Iterator[evidence_data.Row]:
+def grid_rows(points: Sequence[Point]) -> Iterator[evidence.Row]:
     """The rows of evidence of the points of a grid."""
     results = [flown.result for flown in points]
     yield row("points flown", results.count("ok"))

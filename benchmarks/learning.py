@@ -31,9 +31,8 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
-from benchmarks import evidence_data
-from benchmarks.evidence_data import row
-from benchmarks.evidence_page import write_page
+from benchmarks import evidence
+from benchmarks.evidence import row
 from matplotlib.figure import Figure
 from PIL import Image
 from rich.progress import track
@@ -463,7 +462,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
         writer.writerows((Row._fields, *sorted(rows, key=lambda each: (list(CELLS).index(each.cell), each.number))))
 
 
-def figures(rows: Sequence[Row]) -> Iterator[evidence_data.Row]:
+def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
     """The figures of every cell, with their goals."""
     for name, cell in CELLS.items():
         chosen = [each for each in rows if each.cell == name]
@@ -478,7 +477,7 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence_data.Row]:
             yield from CELL_FIGURES[cell.kind](name, cell, chosen)
 
 
-def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Scores beside those of the others."""
     yield from scores(name, chosen)
     known = [each for each in chosen if not math.isnan(each.true)]
@@ -497,7 +496,7 @@ def learn_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evid
         yield row(f"{name}: first model, median", float(np.median(begun)), "s")
 
 
-def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Lost flights, and mean and largest score of the flights to the end, of each."""
     for key, label in LABELS.items():
         values = np.array([getattr(each, key) for each in chosen])
@@ -510,7 +509,7 @@ def scores(name: str, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
             yield row(f"{name}: largest score, {label}", float(np.max(whole)))
 
 
-def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Scores from SETTLED on; whether a dead input was found in time."""
     yield from scores(name, chosen)
     yield row(
@@ -530,14 +529,14 @@ def damage_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evi
     yield row(f"{name}: another input found", float(sum(wrong)), at_most=0.0)
 
 
-def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence_data.Row]:
+def window_figures(name: str, label: str, values: FloatArray) -> Iterator[evidence.Row]:
     """Mean scores over WINDOWS of the flights to the end, of scores (N, W)."""
     if len(whole := values[np.isfinite(values).all(axis=1)]):
         for (first, end), mean in zip(WINDOWS, whole.mean(axis=0), strict=True):
             yield row(f"{name}: score from {first:g} to {end:g} s, {label}", float(mean))
 
 
-def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence_data.Row]:
+def alarm_figures(name: str, cell: Cell, chosen: Sequence[Row]) -> Iterator[evidence.Row]:
     """Alarms without damage."""
     yield row(f"{name}: flight time", ALARM_FLIGHT / 60.0 * len(chosen), "min")
     yield row(f"{name}: false alarms", float(sum(each.alarms + (each.found != "") for each in chosen)), at_most=0.0)
@@ -555,7 +554,7 @@ CELL_FIGURES = {
 }
 
 
-def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence_data.Row]:
+def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[evidence.Row]:
     """Scores of the laws of RIVALS in the flight with gusts, and the share that loses track there with u LATE.
 
     All aircraft have the same noise. Each law has its model and gains by the airframe file.
@@ -579,7 +578,7 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         yield row(f"{subject}: share lost with u {1e3 * LATE:.0f} ms late, {law.title}", lost)
 
 
-def damaged_rival_figures(name: str, numbers: Sequence[int]) -> Iterator[evidence_data.Row]:
+def damaged_rival_figures(name: str, numbers: Sequence[int]) -> Iterator[evidence.Row]:
     """Scores over WINDOWS of the laws of RIVALS, with the aircraft, wind, noise and damage of the cell `name`."""
     brief = learning(CELLS[name], 0, 0.1)
     model = tuning.build_benchmark(brief.vary(controller=start_of(brief))).model  # of the airframe file: one for all aircraft
@@ -653,9 +652,9 @@ def main(
     """
     if unknown := [name for name in cell if name not in CELLS]:
         raise typer.BadParameter(f"found {', '.join(unknown)}, expected cells among {', '.join(CELLS)}")
-    begun = evidence_data.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
-    flown_by = evidence_data.revision(*code())
-    rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence_data.DIRTY)]
+    begun = evidence.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
+    flown_by = evidence.revision(*code())
+    rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence.DIRTY)]
     known = {
         (each.cell, each.number)
         for each in rows
@@ -686,8 +685,7 @@ def main(
     for each in found:
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
     if found:
-        evidence_data.write("learning", found, begun)
-        write_page()
+        evidence.write("learning", found, begun)
     if set(airs) <= set(whole):
         rendered = BytesIO()
         plot(rows).savefig(rendered, dpi=110)

@@ -207,7 +207,10 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "xtrack": float(np.abs(xtrack).max()),
         "bank_deg": math.degrees(float(np.abs(log["pose.phi"]).max())),
         "V": float(log["y.V"].min()) + scenario.aircraft.channels().speed,
-        "memory": {name: [values[len(values) // 2], values[-1]] for name, values in memory.items()},
+        "memory": {
+            name: {"middle": values[len(values) // 2], "end": values[-1], "growth": values[-1] / values[len(values) // 2] - 1.0}
+            for name, values in memory.items()
+        },
         "report": {"size": (run / "report.html").stat().st_size, "written": written, "opened": opened(run / "report.html")},
     }
 

@@ -43,6 +43,7 @@ def main(
         "two": two,
         "lockstep": lockstep,
         "passed": len(rows) - len(failed),
+        "draws that fail": planned - len(rows) + len(failed),
     }
     result |= {"status": status, "cases": cases, "failed": failed}
     if file is not None:

@@ -19,8 +19,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks import evidence_data
-from benchmarks.evidence_page import write_page
+from benchmarks import evidence
 from benchmarks.guidance import AIRCRAFT, OTHERS, aircraft_of, turbulence
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -62,11 +61,11 @@ class Row(NamedTuple):
     altitude: float  # m, on the legs
 
     @property
-    def figure(self) -> evidence_data.Row:
+    def figure(self) -> evidence.Row:
         """The row of evidence; words that are no refusal do not meet the limit."""
         goal = None if self.result.startswith("refused") else self.limit
         value = self.xtrack if self.result == "flown" else self.result
-        return evidence_data.row(f"{self.case}: cross-track", value, "s" * (self.result == "flown"), at_most=goal)
+        return evidence.row(f"{self.case}: cross-track", value, "s" * (self.result == "flown"), at_most=goal)
 
 
 def of_radii(*places: tuple[float, float], altitudes: tuple[float, ...] = ()) -> Callable[[float], list[Waypoint]]:
@@ -190,15 +189,14 @@ def main() -> int:
     writer, failed = csv.writer(sys.stdout), False
     writer.writerow(Row._fields)
     for name in chosen.only:
-        begun, flown = evidence_data.origin(f"python -m benchmarks.routes --only {name}"), list[Row]()
+        begun, flown = evidence.origin(f"python -m benchmarks.routes --only {name}"), list[Row]()
         for title in chosen.cases:
             flown.append(row := fly(name, title, CASES[title]))
             writer.writerow(row)
             sys.stdout.flush()
             failed |= row.xtrack > row.limit or row.result.startswith(("missed", "lost"))
         if len(flown) == len(CASES):
-            evidence_data.write(f"guidance-routes-{name}", (row.figure for row in flown), begun)
-            write_page()
+            evidence.write(f"guidance-routes-{name}", (row.figure for row in flown), begun)
     return int(failed)
 
 

@@ -21,13 +21,12 @@ import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks import law, lockstep, receiver, recorder
+from benchmarks import evidence, law, lockstep, receiver, recorder
 from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.nodes import open_node, ticks
 from benchmarks.processes import PRIORITY, RISE_DI, Child, delay_monitors, real_time, threads_ns
@@ -63,6 +62,7 @@ IMPORTS = 9  # processes of each kind
 PROCESS, IMPORT = "processor time (ms)", "import (ms)"  # columns
 MATCHED_WITHIN = 20.0  # s
 OWN_MISSES = "missed excluding host delays"  # a column
+WITHOUT_BASELINE = ("missed", OWN_MISSES, "lost", "ticks", "max (us)", "answered (%)")
 
 
 @dataclass(frozen=True)
@@ -417,6 +417,18 @@ def recorder_rows(seconds: float, folder: Path) -> Iterator[Row]:
     yield Row("recorder, from topics to disk", figures | {"lost": sent["sent"] - count}, floor, (Goal("lost", 0),))
 
 
+def evidence_rows(rows: Sequence[Row]) -> Iterator[evidence.Row]:
+    """The rows of evidence; counts, single outliers and shares have no baseline."""
+    by_name = {row.what: row.figures for row in rows}
+    for row in rows:
+        goals = {goal.column: f"<= {goal.at_most:g}" + evidence.BASELINE * goal.of_floor for goal in row.goals}
+        for column, value in row.figures.items():
+            name, unit = evidence.split(column)
+            compared = row.floor != row.what and column in by_name.get(row.floor, {}) and column not in WITHOUT_BASELINE
+            baseline = f"{row.floor}: {name}" if compared else ""
+            yield evidence.Row(f"{row.what}: {name}", f"{value:.6g}", unit, baseline, goals.get(column, ""))
+
+
 Group = Callable[[float, Path], Iterator[Row]]
 GROUPS: dict[str, Group] = {
     "law": lambda seconds, folder: law_rows(),
@@ -460,14 +472,14 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.update(transport.environment())
     console = Console(width=None if sys.stdout.isatty() else 160)
-    measured: list[dict[str, Any]] = []
+    measured: list[evidence.Row] = []
     for name in [options.only] if options.only else GROUPS:
         with tempfile.TemporaryDirectory() as folder:
             rows = list(GROUPS[name](options.seconds, Path(folder)))
         show(console, name, rows)
-        measured += [{"group": name} | asdict(row) for row in rows]
+        measured += evidence_rows(rows)
     if options.json is not None:
-        options.json.write_text(json.dumps({"seconds": options.seconds, "rows": measured}, indent=1) + "\n", encoding="utf-8")
+        options.json.write_text(json.dumps({"evidence": measured}, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,36 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Every scenario flown in lockstep over topics and replayed from its log; prints JSON.
+
+python -m benchmarks.replays
+"""
+
+import json
+import subprocess
+import tempfile
+from typing import Any
+
+from benchmarks.processes import RISE_DI
+
+from flight_analysis.closed_loop.scenario_library import scenarios
+
+
+def _run(*command: str) -> dict[str, Any]:
+    """The JSON that a command prints; without any, the figure that misses the goal."""
+    done = subprocess.run((RISE_DI, *command, "--json"), check=False, capture_output=True, text=True)  # noqa: S603 - ours
+    return json.loads(done.stdout) if done.stdout.startswith("{") else {"differing": None, "error": done.stderr.strip()}
+
+
+def main() -> None:
+    """Fly and print the ticks that differ by scenario."""
+    results = {}
+    for name in scenarios():
+        with tempfile.TemporaryDirectory() as runs:
+            flight = _run("fly", name, "--one-process", "--runs", runs)
+            replayed = {"differing": 0} | _run("replay", f"{runs}/latest")
+        results[name] = replayed | {"completed": flight.get("outcome") == "completed"}
+    print(json.dumps(results, indent=1))
+
+
+if __name__ == "__main__":
+    main()
