@@ -6,6 +6,7 @@
 # make test-fast   the quick tests without ROS, for the inner loop
 # make test-sitl   fly a real autopilot in software: docs/autopilots.md
 # make docs   write the site of docs/ to site/; make docs ARGS=serve shows it while it is written
+# make mutants   change the law, the guard, the decomposition and the account in many places: each change must fail a test
 # make evidence   measure what has no file in docs/evidence/, write docs/evidence.md     make evidence ARGS="--again speed"
 # make foxglove   what `rise-di watch --foxglove` needs
 # make autopilot   what `rise-di import` and maps over MAVLink need
@@ -61,7 +62,9 @@ test-sitl: setup-all
 	$(BIN)/python -m pytest tests/sitl -m "not long" $(ARGS)
 
 mutants: setup-all
-	@$(BIN)/python -m benchmarks.mutants $(ARGS)
+	@rm -rf build/mutants && mkdir -p build/mutants
+	@cp -r ros_ws/src/rise_di_controller/rise_di_controller ros_ws/src/flight_analysis/flight_analysis benchmarks docs examples tests pyproject.toml build/mutants
+	cd build/mutants && OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run $(ARGS) && $(BIN)/mutmut results
 
 foxglove autopilot: setup
 	$(INSTALL) --extra $@
