@@ -83,7 +83,8 @@ class Airframe(Config):
     )
 
     def _check(self) -> None:
-        n, m = len(self.states), len(self.inputs)
+        n = len(self.states)
+        m = len(self.inputs)
         for key, columns in (("A", n), ("B", m)):
             shape = [len(row) for row in getattr(self, key)]
             require(shape == [columns] * n, key, f"rows of {shape} values", f"{n} rows of {columns}")
@@ -144,7 +145,8 @@ class Airframe(Config):
 
     def matrix_b(self) -> FloatArray:
         """B, shape (n, p), SI: B_ij unit_i / unit_j."""
-        row, column = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
+        row = _si(self.states.values())
+        column = _si(i.unit for i in self.inputs.values())
         matrix: FloatArray = np.array(self.B)
         return matrix * row[:, None] / column[None, :]
 
@@ -184,7 +186,8 @@ class Airframe(Config):
         `wind_factor`, shape (n, G), multiplies the effect of wind along the axes of `gusts`. Sampled and identified entries
         need not meet the identities of physics, so the copy is not checked for these.
         """
-        state, inputs = _si(self.states.values()), _si(i.unit for i in self.inputs.values())
+        state = _si(self.states.values())
+        inputs = _si(i.unit for i in self.inputs.values())
         values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
         gusts = {
             axis: {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
@@ -224,7 +227,9 @@ def check_identities(airframe: Airframe) -> None:
     if airframe.identities:
         effects = {name: given.positive for name, given in airframe.inputs.items()}
         units = tuple(given.unit for given in airframe.inputs.values())
-        A, B, gravity = np.array(airframe.A), np.array(airframe.B), airframe.matrix_gravity()
+        A = np.array(airframe.A)
+        B = np.array(airframe.B)
+        gravity = airframe.matrix_gravity()
         identities.check(identities.Model(airframe.name, airframe.states, effects, units, airframe.speed, A, B, gravity))
 
 

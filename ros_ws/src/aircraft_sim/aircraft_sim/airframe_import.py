@@ -94,14 +94,16 @@ def import_airframe(
             require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
         loaded = load_airframe(source)
         return (loaded.model_copy(update={"name": name}) if name else loaded), f"airframe file {label}"
-    named_states, named_inputs = _named(states, "states"), _named(inputs, "inputs")
+    named_states = _named(states, "states")
+    named_inputs = _named(inputs, "inputs")
     model = _model(source, named_states, named_inputs, given_speed, body)
     speed_used = given_speed if given_speed is not None else model.speed
     if speed_used is None:
         raise ParameterError("speed: found none, expected the trim speed, as 53.6 or 176 ft/s")
     title = name or Path(label).stem
     effects = {key: given.get("positive", "") for key, given in model.inputs.items()}
-    units, none = tuple(given["unit"] for given in model.inputs.values()), np.zeros_like(model.A)
+    units = tuple(given["unit"] for given in model.inputs.values())
+    none = np.zeros_like(model.A)
     identities.check(identities.Model(title, model.states, effects, units, speed_used, model.A, model.B, none))
     if thrust:
         model = _with_thrust(model)
@@ -208,14 +210,16 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
     require(
         not sampled, "source", f"a sampled system of period {sampled}", "a continuous one: control.d2c, or the model before c2d"
     )
-    A, B = _finite(system.A, "A"), _finite(system.B, "B")
+    A = _finite(system.A, "A")
+    B = _finite(system.B, "B")
     _square(A, B)
 
     def labels(attribute: str) -> list[str]:
         found = [str(label) for label in getattr(system, attribute, None) or ()]
         return [] if any(re.fullmatch(r"[a-z]+\[\d+\]", label) for label in found) else found
 
-    named, driven = labels("state_labels"), labels("input_labels")
+    named = labels("state_labels")
+    driven = labels("input_labels")
     known = _states(states, named, len(A)), _inputs(inputs, driven, B.shape[1])
     return Model(*known, A, B, _finite(system.C, "C"), _finite(system.D, "D"), tuple(labels("output_labels")))
 
@@ -311,10 +315,12 @@ def _avl_matrix(
     """AVL's system matrix, SI: the axes are those that physics confirms, x forward and z down, or x aft and z up."""
     line, names, controls = header
     require(bool(controls), "system matrix", "no controls after the states", "a geometry with CONTROL lines")
-    n, m = len(names), len(controls)
+    n = len(names)
+    m = len(controls)
     table = _rows([row.replace("|", " ") for row in text.splitlines()[line + 1 :]], n, n + m, "system matrix")
     kept = [i for i, name in enumerate(names) if name not in POSITIONS]
-    A, B = table[np.ix_(kept, kept)], table[kept][:, n:]
+    A = table[np.ix_(kept, kept)]
+    B = table[kept][:, n:]
     units = _states(states, [names[i] for i in kept], len(kept))
     given = _inputs(inputs or {_control(name): "deg" for name in controls}, (), m)
     V0 = float(np.hypot(A[1, 2], A[0, 2])) if speed is None else speed
@@ -417,7 +423,9 @@ def _airframe(model: Model, name: str, speed: float, outputs: str | Sequence[str
     wanted = wanted or _default_outputs(model)
     fewer = f"{len(model.inputs)} or fewer, as many as inputs or fewer"
     require(0 < len(wanted) <= len(model.inputs), "outputs", ", ".join(wanted) or "none", fewer)
-    rows, shown, units = [], [], {}
+    rows = []
+    shown = []
+    units = {}
     identity = model.C is not None and model.C.shape == (len(names),) * 2 and np.array_equal(model.C, np.eye(len(names)))
     labels = model.outputs if model.C is not None and len(model.outputs) == len(model.C) else ()
     for k, text in enumerate(wanted):
@@ -504,7 +512,9 @@ def _effect(model: Model, name: str) -> str:
 
 def _gusts(frame: Airframe) -> dict[str, dict[str, float]]:
     """What wind adds to x_dot, per w / V0: minus the column of the state that moves relative to the air; not to angles, h."""
-    A, names, gusts = frame.matrix_a(), list(frame.states), {}
+    A = frame.matrix_a()
+    names = list(frame.states)
+    gusts = {}
     for axis, states in AIR.items():
         state = next((state for state in states if state in names), None)
         if state is not None:

@@ -12,7 +12,10 @@ from aircraft_sim.plant import OverAirspeed
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
 
-SPEED, INCIDENCE, RATE, ANGLE = "speed", "incidence", "rate", "angle"
+SPEED = "speed"
+INCIDENCE = "incidence"
+RATE = "rate"
+ANGLE = "angle"
 STATES: Mapping[str, str] = {
     "V": SPEED,
     "alpha": INCIDENCE,
@@ -42,7 +45,10 @@ WIND_STATE = {"longitudinal": SPEED, "lateral": INCIDENCE, "vertical": INCIDENCE
 """Kind of the state in which wind along an axis acts, relative to the air."""
 
 TRIM_STEPS = 20  # of the airspeed: the trim from 1 to 1.4 V0 is exact to 1e-4 of it
-SLOWEST, FASTEST, SPACING = 0.5, 2.0, 0.05  # V / V0 of the trims of a simulated aircraft, linear in between
+# V / V0 of the trims of a simulated aircraft, linear in between
+SLOWEST = 0.5
+FASTEST = 2.0
+SPACING = 0.05
 
 
 class Exponents(NamedTuple):
@@ -59,7 +65,8 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
     unknown = [name for name in airframe.states if name not in STATES]
     require(not unknown, f"airframe {airframe.name}", f"the states {', '.join(unknown)}", f"some of {', '.join(STATES)}")
     kinds = [STATES[name] for name in airframe.states]
-    n, axes = len(kinds), [WIND_STATE[axis] for axis in airframe.gusts]
+    n = len(kinds)
+    axes = [WIND_STATE[axis] for axis in airframe.gusts]
     A = np.array([[EXPONENTS[row][column] for column in kinds] for row in kinds])
     B = np.array([[(OF_THRUST if name == thrust else OF_SURFACE)[row] for name in airframe.inputs] for row in kinds])
     gravity = np.array([[EXPONENTS[row][ANGLE]] * n for row in kinds])
@@ -93,15 +100,22 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
 
     with A, B of the airspeed and the least du where several inputs serve, in TRIM_STEPS steps. Raises as `exponents`.
     """
-    names, powers, width = list(airframe.states), exponents(airframe, thrust), (ratio - 1.0) / TRIM_STEPS
-    A, gravity, B = airframe.matrix_a(), airframe.matrix_gravity(), airframe.matrix_b()
+    names = list(airframe.states)
+    powers = exponents(airframe, thrust)
+    width = (ratio - 1.0) / TRIM_STEPS
+    A = airframe.matrix_a()
+    gravity = airframe.matrix_gravity()
+    B = airframe.matrix_b()
     faster, higher = (np.array([float(name in some) for name in names]) for some in (("V",), ("alpha", "theta")))
-    x, u = np.zeros(len(names)), np.zeros(B.shape[1])
+    x = np.zeros(len(names))
+    u = np.zeros(B.shape[1])
     for k in range(TRIM_STEPS):
         middle = 1.0 + width * (k + 0.5)
-        moved, dx = A * middle**powers.A + gravity * middle**powers.gravity, airframe.speed * width * faster
+        moved = A * middle**powers.A + gravity * middle**powers.gravity
+        dx = airframe.speed * width * faster
         change = np.linalg.lstsq(np.column_stack([moved @ higher, B * middle**powers.B]), -moved @ dx, rcond=None)[0]
-        x, u = x + dx + change[0] * higher, u + change[1:]
+        x = x + dx + change[0] * higher
+        u = u + change[1:]
     return x, u
 
 

@@ -19,19 +19,23 @@ class AppliedInput:
     """
 
     def __init__(self, m: int, hold_ns: int, ramp_ns: int) -> None:
-        self._hold_ns, self._ramp_ns = hold_ns, ramp_ns
+        self._hold_ns = hold_ns
+        self._ramp_ns = ramp_ns
         self._u = self._offset = np.zeros(m)
         self._u_ns = self._transfer_ns = 0
 
     def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
         """Take a received u. `transfer`: the publisher is new."""
         if transfer or self._scale(now_ns) < 1.0:
-            self._offset, self._transfer_ns = self.at(now_ns) - u, now_ns
-        self._u, self._u_ns = u, now_ns
+            self._offset = self.at(now_ns) - u
+            self._transfer_ns = now_ns
+        self._u = u
+        self._u_ns = now_ns
 
     def at(self, now_ns: int) -> FloatArray:
         """The applied u at an instant."""
-        scale, rest = self._scale(now_ns), failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
+        scale = self._scale(now_ns)
+        rest = failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
         u = self._u if scale == 1.0 else scale * self._u
         return u + rest * self._offset if rest > 0.0 and self._offset.any() else u
 

@@ -88,7 +88,8 @@ def kinematics(x: Array, params: EulerKinematics) -> Array:
     """  # noqa: D400, D415 - what follows is an equation
     xp = array_namespace(x)
     phi, theta, p, q, r = params.select @ x
-    sine, cosine = xp.sin(phi), xp.cos(phi)
+    sine = xp.sin(phi)
+    cosine = xp.cos(phi)
     rates = [
         params.turn_rate * (cosine * xp.cos(theta) - 1.0),
         p + xp.tan(theta) * (q * sine + r * cosine),

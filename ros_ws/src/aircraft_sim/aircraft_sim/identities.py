@@ -28,7 +28,9 @@ KINDS = {
 OF_RATES = {"theta": "q r phi", "phi": "p q r theta phi", "psi": "q r theta phi", "h": None, "altitude": None}
 """States whose derivative no force changes, and the named states that enter it; None: any."""
 
-TURNED, COUPLED, LIFT = (0.7, 1.02), (0.6, 1.35), (0.3, 2.8)
+TURNED = (0.7, 1.02)
+COUPLED = (0.6, 1.35)
+LIFT = (0.3, 2.8)
 """Accepted parts of an expected value: cos of a trim angle up to 45 deg; of V0 with the force of a rate, Z_q or Y_r; of the
 change of lift = weight with speed, which compressibility and thrust change: published aircraft have 0.78 to 1.02."""
 MANY = 4  # states of which every order is tried: 24
@@ -143,12 +145,16 @@ def contradictions(model: Model) -> Iterator[Finding]:
 
 def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
     """The model with the arrangement of A or B changed, and the sentence that says so."""
-    A, B = model.file_A, model.file_B
-    names, inputs, units = list(model.states), list(model.effects), list(model.states.items())
+    A = model.file_A
+    B = model.file_B
+    names = list(model.states)
+    inputs = list(model.effects)
+    units = list(model.states.items())
     yield "A is transposed: write a row a state derivative, a column a state", model._replace(file_A=A.T)
     one_order = "A and B need one order of the states"
     for order in _orders(len(A)):
-        listed, place = ", ".join(names[k] for k in order), np.argsort(order)
+        listed = ", ".join(names[k] for k in order)
+        place = np.argsort(order)
         renamed = model._replace(states=dict(units[k] for k in order), gravity=model.gravity[np.ix_(order, order)])
         yield f"the matrices have the states in the order {listed}: name the states so", renamed
         yield f"the rows of A have the order {listed}", model._replace(file_A=A[place])
@@ -179,7 +185,8 @@ def _dimensions(model: Model) -> Iterator[Finding]:
 
 
 def _entries(model: Model) -> Iterator[Finding]:
-    names, V0 = list(model.states), model.speed
+    names = list(model.states)
+    V0 = model.speed
     values = {
         "": 1.0,
         "g": GRAVITY,
@@ -192,15 +199,18 @@ def _entries(model: Model) -> Iterator[Finding]:
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
         if row not in names or column not in names or (V0 == 0.0 and "V0" in symbol):
             continue
-        found, expected = float(model.matrix_a()[names.index(row), names.index(column)]), sign * values[symbol]
+        found = float(model.matrix_a()[names.index(row), names.index(column)])
+        expected = sign * values[symbol]
         left_out = found == 0.0 and (symbol.startswith("2 g") or (symbol == "V0" and not model.angular))  # a multirotor hovers
         if least <= found / expected <= most or left_out:
             continue
         right[symbol] = False
-        key, mend = "A", _mend(found / expected)
+        key = "A"
+        mend = _mend(found / expected)
         if "V0" in symbol and right["g"] and found * sign > 0.0:
             fits = f", and A fits {abs(found):.4g} m/s" if symbol == "V0" else ""
-            key, mend = "speed", f"speed is in m/s{fits}; {row} and {column} need the units of A"
+            key = "speed"
+            mend = f"speed is in m/s{fits}; {row} and {column} need the units of A"
         about = f"{'-' if sign < 0.0 else ''}{symbol} = {expected:.4g}" if symbol else f"{sign:.0f}"
         yield Finding(key, f"{row}_dot = {found:.4g} {column} in SI", about, mend)
 
@@ -221,7 +231,8 @@ def _kinematic_rows(model: Model) -> Iterator[Finding]:
     names = list(model.states)
     scale = float(np.max(np.abs(model.matrix_b()), initial=0.0))
     for row in (name for name in OF_RATES if name in names):
-        i, entering = names.index(row), OF_RATES[row]
+        i = names.index(row)
+        entering = OF_RATES[row]
         for column in KINDS if entering is not None else ():
             value = (
                 float(model.matrix_a()[i, names.index(column)])
@@ -269,7 +280,8 @@ def _strengths(model: Model) -> Iterator[Finding]:
         flow = next((state for state in flows.split() if state in names), None)
         if name not in model.angular or rate not in names or flow is None:
             continue
-        i, j = names.index(rate), names.index(flow)
+        i = names.index(rate)
+        j = names.index(flow)
         stiffness = abs(model.matrix_a()[i, j]) * (model.speed if flow in "wv" else 1.0)
         scale = stiffness + abs(model.matrix_a()[i, i]) * (abs(model.matrix_a()[i, i]) + abs(model.matrix_a()[j, j]))
         ratio = abs(float(model.matrix_b()[i, k])) / scale if scale > 0.0 else least

@@ -23,7 +23,9 @@ from flight_core.vectors import FloatArray
 
 PREFIX = "jsbsim:"  # prefix of `airframe` in a scenario for an aircraft of JSBSim, as in jsbsim:c172p
 ROOT_VARIABLE = "JSBSIM_ROOT"  # environment: a folder with aircraft, engine and systems in place of the package's
-SUFFIX, MODEL_ELEMENT = ".xml", "fdm_config"  # of the file of a model
+# of the file of a model
+SUFFIX = ".xml"
+MODEL_ELEMENT = "fdm_config"
 
 
 class Command(NamedTuple):

@@ -82,7 +82,8 @@ def model_files(model: Path) -> ModelFiles:
     first = _Place(f"aircraft/{model.stem}/{model.name}", model)
     members: dict[str, bytes] = {}
     left_out: tuple[str, ...] = ()
-    waiting, missing = [first], dict[str, str]()
+    waiting = [first]
+    missing = dict[str, str]()
     while waiting:
         place = waiting.pop()
         if place.member in members:

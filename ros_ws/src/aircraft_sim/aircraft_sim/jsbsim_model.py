@@ -101,8 +101,11 @@ class JsbsimModel:
         Raises FlightEnded where JSBSim fails, an engine stops or the aircraft touches the ground: landed on the wheels with a
         sink of at most SOFT, else the aircraft has hit the ground.
         """
-        step_ns, model, sink = self.condition.step_ns, self._actuator_model, -FOOT * self._climb.get_double_value()
-        dt, steps = seconds(step_ns), divide(duration_ns, step_ns, "step", "the duration")
+        step_ns = self.condition.step_ns
+        model = self._actuator_model
+        sink = -FOOT * self._climb.get_double_value()
+        dt = seconds(step_ns)
+        steps = divide(duration_ns, step_ns, "step", "the duration")
         filters = self._wind_model.turbulence
         normals = () if filters is None else turbulence.normals(t_ns // step_ns, steps, filters.seed)
         for k in range(steps):
@@ -122,10 +125,12 @@ class JsbsimModel:
             try:
                 self._fdm.run()
             except jsbsim.BaseError as error:
-                title, after = self.condition.title, seconds(after_ns)
+                title = self.condition.title
+                after = seconds(after_ns)
                 raise FlightEnded(f"{title} failed at t = {after:.2f} s: {jsbsim_trim.error_text(error)}") from None
         self._x = self._deviations()
-        before, self._velocity = self._velocity, self._ground_velocity()
+        before = self._velocity
+        self._velocity = self._ground_velocity()
         self._position_ground = self._position_ground + seconds(duration_ns) / 2.0 * (before + self._velocity)
         now = f"at t = {seconds(t_ns + duration_ns):.2f} s"
         if self._height.get_double_value() < 0.0 or abs(self._contact.get_double_value()) > 0.0:
@@ -192,7 +197,8 @@ class JsbsimModel:
     def _apply_wind(self, wind: FloatArray) -> None:
         along, right, down = (wind / FOOT).tolist()
         heading = self._heading.get_double_value()
-        north, east = math.cos(heading), math.sin(heading)
+        north = math.cos(heading)
+        east = math.sin(heading)
         for node, value in zip(
             self._wind_nodes, (along * north - right * east, along * east + right * north, down), strict=True
         ):

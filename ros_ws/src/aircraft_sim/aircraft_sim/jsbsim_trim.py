@@ -31,7 +31,9 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
-HEADING, HEIGHT, CONTACT = "attitude/psi-rad", "position/h-agl-ft", "forces/fbz-gear-lbs"
+HEADING = "attitude/psi-rad"
+HEIGHT = "position/h-agl-ft"
+CONTACT = "forces/fbz-gear-lbs"
 FUEL = "propulsion/total-fuel-lbs"
 
 WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
@@ -47,8 +49,10 @@ FROZEN: Mapping[str, float] = {
 
 MIXTURE = 0.9  # of piston engines: rich
 BOTH_MAGNETOS = 3.0  # ignition of piston engines: 0 off, 1 left, 2 right
-SETTLE, SPIN_UP = 10.0, 30.0  # s of frozen flight: for running engines, and for engines that have just been started
-SLOW_SETTLE, SLOW_SPIN_UP = 80.0, 300.0
+SETTLE = 10.0  # s of frozen flight: for running engines
+SPIN_UP = 30.0  # and for engines that have just been started
+SLOW_SETTLE = 80.0
+SLOW_SPIN_UP = 300.0
 """The same for a propeller that is slow to reach its speed, such as one of an electric engine with a time constant of 10 s."""
 
 ATTEMPTS = ((SETTLE, SPIN_UP, 0.0), (SLOW_SETTLE, SLOW_SPIN_UP, 0.0), (SETTLE, SPIN_UP, 1.0), (SLOW_SETTLE, SLOW_SPIN_UP, 1.0))
@@ -60,7 +64,9 @@ IDLE = 0.01  # throttle below which an engine without thrust is no failure
 
 START = np.array([0.05, 0.7, 0.0, 0.0, 0.0, 0.0])  # alpha (rad), throttle, pitch trim, aileron, rudder (1), bank (rad)
 SCALE = np.array([0.1, 0.5, 0.5, 0.5, 0.5, 0.1])  # scales of these unknowns for the solver
-LOWEST, HIGHEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5), (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)  # of these unknowns
+# of these unknowns
+LOWEST = (-0.5, 0.0, -1.0, -1.0, -1.0, -0.5)
+HIGHEST = (0.5, 1.0, 1.0, 1.0, 1.0, 0.5)
 TOLERANCE = np.array([0.02, 0.02, 0.02, 0.002, 0.002, 0.002])  # m/s^2, rad/s^2: a tenth of a degree of attitude
 
 PROBE_TIME = 2.0  # s of the test flight in the isolated process
@@ -82,7 +88,8 @@ class _Log(jsbsim.FGLogger):
         self._message = ""
 
     def set_level(self, level: jsbsim.LogLevel) -> None:
-        self._level, self._message = level, ""
+        self._level = level
+        self._message = ""
 
     def file_location(self, filename: str, line: int) -> None:
         pass
@@ -165,7 +172,8 @@ def sideslip_zero(condition: FlightCondition) -> float:
             ends.append(_residuals(fdm)[[1, 3, 5]])
         return np.asarray((ends[0] - ends[1]) / (2.0 * step))
 
-    beta, u = derivative("beta", 0.01), np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
+    beta = derivative("beta", 0.01)
+    u = np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
     return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / condition.speed
 
 
@@ -235,7 +243,9 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
     try:
         if _jsbsim_trim(fdm):
             return None
-        nearest, left, problem = np.inf, np.inf, ""
+        nearest = np.inf
+        left = np.inf
+        problem = ""
         for settling, spin_up, by_elevator in ATTEMPTS:
             if spin_up == SLOW_SPIN_UP and left > NEAR:
                 continue
@@ -245,7 +255,8 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
                 return solution
             left = float(np.max(np.abs(_residuals(found)) / TOLERANCE))
             if left < nearest or not problem:
-                nearest, problem = left, _trim_failure(found)
+                nearest = left
+                problem = _trim_failure(found)
             fdm = _load(condition)  # a solver far from a trim may have left it with numbers that are not finite
     except jsbsim.BaseError as error:
         problem = error_text(error)
@@ -261,13 +272,15 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
             raise FlightEnded(f"{condition.title} cannot be loaded: {reason}") from None
     fdm.disable_output()
     fdm.set_dt(seconds(condition.step_ns))
-    manager, engines = fdm.get_property_manager(), engine_count(fdm)
+    manager = fdm.get_property_manager()
+    engines = engine_count(fdm)
     if not engines:
         raise FlightEnded(f"{condition.title} has no engine to control V with: no {INPUTS['throttle'].property}[0]")
     for path in _properties(engines):  # JSBSim creates a property that it does not have
         if not manager.hasNode(path):
             raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
-    fdm["ic/h-sl-ft"], fdm["ic/vt-fps"] = condition.altitude / FOOT, condition.speed / FOOT
+    fdm["ic/h-sl-ft"] = condition.altitude / FOOT
+    fdm["ic/vt-fps"] = condition.speed / FOOT
     fdm["ic/gamma-deg"] = fdm["ic/psi-true-deg"] = 0.0
     fdm["gear/gear-cmd-norm"] = fdm["gear/gear-pos-norm"] = 0.0  # up
     for i in range(engines):
@@ -351,14 +364,17 @@ def _start_engines(fdm: jsbsim.FGFDMExec) -> None:
 
 def _set_unknowns(fdm: jsbsim.FGFDMExec, scaled: FloatArray, by_elevator: float = 0.0) -> None:
     alpha, throttle, pitch_trim, aileron, rudder, bank = (START + (scaled - 1.0) * SCALE).tolist()
-    fdm["ic/alpha-rad"], fdm["ic/gamma-deg"], fdm["ic/phi-rad"] = alpha, 0.0, bank
+    fdm["ic/alpha-rad"] = alpha
+    fdm["ic/gamma-deg"] = 0.0
+    fdm["ic/phi-rad"] = bank
     fdm["ic/beta-rad"] = 0.0  # a change of alpha in a bank leaves some
     fdm.run_ic()
     for i in range(engine_count(fdm)):
         fdm[f"fcs/throttle-cmd-norm[{i}]"] = throttle
     fdm["fcs/pitch-trim-cmd-norm"] = (1.0 - by_elevator) * pitch_trim
     fdm["fcs/elevator-cmd-norm"] = by_elevator * pitch_trim
-    fdm["fcs/aileron-cmd-norm"], fdm["fcs/rudder-cmd-norm"] = aileron, rudder
+    fdm["fcs/aileron-cmd-norm"] = aileron
+    fdm["fcs/rudder-cmd-norm"] = rudder
 
 
 def _residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:

@@ -53,7 +53,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         self._truth_encoder = self.encoder(self._simulator.truth_names)
         if self.parameters.lockstep:
             self._number = 0  # of the next sample
-            self._u_received, self._completed = True, False
+            self._u_received = True
+            self._completed = False
             self._recorded_ns = 0
             self._control_ns = period_ns(self.parameters.control_rate, "control_rate")
             self._end_ns = nanoseconds(self.parameters.duration) or None
@@ -139,7 +140,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
         A message without channels is valid: the controller has no output at this instant of a lockstep flight.
         """
-        publisher, u = self._publisher_lock.publisher, self._u
+        publisher = self._publisher_lock.publisher
+        u = self._u
         valid = self._u_receiver.poll(now_ns, 1 if self.parameters.lockstep else None)  # in lockstep there is one u for each y
         if transfer := self._publisher_lock.publisher != publisher:
             self.get_logger().info(bounded(f"receiving u from {self._publisher_lock.publisher}"))
@@ -155,7 +157,8 @@ class AircraftNode(FlightNode[AircraftConfig]):
         return any(valid)
 
     def _accept_u(self, sample: StampedVector, now_ns: int) -> None:
-        self._u, self._timeout_logged = sample.value, False
+        self._u = sample.value
+        self._timeout_logged = False
         if not self.parameters.lockstep:
             self._ages_of_u.append(now_ns - sample.stamp_ns)
 
@@ -186,9 +189,11 @@ class AircraftNode(FlightNode[AircraftConfig]):
             return DiagnosticStatus.WARN, "no u received yet: flying in trim", {}
         if not self.parameters.lockstep and self._timed_out(self.now_ns()):
             return DiagnosticStatus.ERROR, self._failsafe_message, {}
-        ages, self._ages_of_u = self._ages_of_u, []
+        ages = self._ages_of_u
+        self._ages_of_u = []
         figures: dict[str, object] = {}
         if ages:
-            mean, largest = seconds(round(sum(ages) / len(ages))), seconds(max(ages))
+            mean = seconds(round(sum(ages) / len(ages)))
+            largest = seconds(max(ages))
             figures = {"age of u mean (s)": f"{mean:.4f}", "age of u max (s)": f"{largest:.4f}"}
         return DiagnosticStatus.OK, bounded(f"receiving u from {self._publisher_lock.publisher}"), figures

@@ -427,7 +427,8 @@ class AircraftConfig(NodeConfig):
 
     def drifted_airframe(self) -> Airframe:
         """The airframe in flight after its drift."""
-        airframe, chosen = self.sampled_airframe(), self.drift
+        airframe = self.sampled_airframe()
+        chosen = self.drift
         if chosen is None:
             return airframe
         return uncertainty.sample_airframe(airframe, chosen.A, chosen.B, chosen.seed, chosen.number, self.uncertainty.wind)
@@ -554,7 +555,8 @@ EULER_STATES = ("phi", "theta", "p", "q", "r")
 
 def _euler_kinematics(airframe: Airframe) -> EulerKinematics:
     require(airframe.speed > 0.0, "kinematics", "euler without a trim speed", "linear, or an airframe with `speed`")
-    unit, rows = np.eye(len(airframe.states)), airframe.matrix_a()
+    unit = np.eye(len(airframe.states))
+    rows = airframe.matrix_a()
     alpha, phi, theta = (airframe.index(name) for name in ("alpha", "phi", "theta"))
     return EulerKinematics(
         select=unit[[airframe.index(name) for name in EULER_STATES]],

@@ -70,7 +70,8 @@ def aircraft_at(t_ns: int, plant: PlantParams, x: Array | None = None) -> Aircra
     """
     if plant.over_airspeed is not None and x is not None:
         return _at_airspeed(x, plant.aircraft, plant.over_airspeed)
-    aircraft, drift = plant.aircraft, plant.drift
+    aircraft = plant.aircraft
+    drift = plant.drift
     if drift is None:
         return aircraft
     part = share(np.array(seconds(t_ns)), drift.start, drift.duration)
@@ -137,8 +138,10 @@ def advance(
     caller that has computed it. Raises ParameterError where the step does not divide the duration.
     """
     x, position, z = state
-    aircraft, filters = aircraft_at(t_ns, plant, x), plant.turbulence
-    steps, dt = divide(duration_ns, plant.step_ns, "step", "the duration"), seconds(plant.step_ns)
+    aircraft = aircraft_at(t_ns, plant, x)
+    filters = plant.turbulence
+    steps = divide(duration_ns, plant.step_ns, "step", "the duration")
+    dt = seconds(plant.step_ns)
     normals = () if filters is None else turbulence.normals(t_ns // plant.step_ns, steps, filters.seed)
 
     def x_dot(since: float, x: Array, forced: Array, params: Aircraft) -> Array:

@@ -40,11 +40,17 @@ def velocity(
     Source: B. L. Stevens, F. L. Lewis, Aircraft Control and Simulation, 2nd ed. (2003), eqs. (1.3-20), (2.3-6).
     """
     xp = array_namespace(phi)
-    sin, cos = xp.sin, xp.cos
-    u, v, w = speed * cos(alpha) * cos(beta), speed * sin(beta), speed * sin(alpha) * cos(beta)
-    right, down = v * cos(phi) - w * sin(phi), v * sin(phi) + w * cos(phi)
-    forward, climb = u * cos(theta) + down * sin(theta), u * sin(theta) - down * cos(theta)
-    north, east = cos(psi), sin(psi)
+    sin = xp.sin
+    cos = xp.cos
+    u = speed * cos(alpha) * cos(beta)
+    v = speed * sin(beta)
+    w = speed * sin(alpha) * cos(beta)
+    right = v * cos(phi) - w * sin(phi)
+    down = v * sin(phi) + w * cos(phi)
+    forward = u * cos(theta) + down * sin(theta)
+    climb = u * sin(theta) - down * cos(theta)
+    north = cos(psi)
+    east = sin(psi)
     return forward * north - right * east, forward * east + right * north, climb
 
 
@@ -63,11 +69,14 @@ def over_ground(pose: FloatArray, t: float, wind: Sequence[float], start: Start)
     """
     moved = pose.copy()
     if start.heading:
-        sin, cos = math.sin(start.heading), math.cos(start.heading)
+        sin = math.sin(start.heading)
+        cos = math.cos(start.heading)
         for first in ("north", "v_north"):
             i = POSE.index(first)
-            north, east = pose[i], pose[i + 1]
-            moved[i], moved[i + 1] = cos * north - sin * east, sin * north + cos * east
+            north = pose[i]
+            east = pose[i + 1]
+            moved[i] = cos * north - sin * east
+            moved[i + 1] = sin * north + cos * east
         psi = POSE.index("psi")
         moved[psi] = wrapped(float(pose[psi]) + start.heading)
     for i, (speed, place) in enumerate(zip(wind, (start.north, start.east), strict=True)):

@@ -83,8 +83,11 @@ class StateSpaceModel:
             (POSE_STATES.index(name), self._axes.index(axis) if axis in self._axes else None)
             for name, axis in zip(vanes.ANGLES, ("vertical", "lateral"), strict=True)
         ]
-        self._speed, self._euler = airframe.speed, parameters.kinematics == "euler"
-        self._psi, self._position = 0.0, [0.0, 0.0, 0.0]  # north, east, altitude
+        self._speed = airframe.speed
+        self._euler = parameters.kinematics == "euler"
+        # north, east, altitude
+        self._psi = 0.0
+        self._position = [0.0, 0.0, 0.0]
         self._psi_dot, self._velocity = self._heading_rate(self._states()), self._air_velocity(self._states())
 
     def advance(self, t_ns: int, u: FloatArray, duration_ns: int) -> None:
@@ -92,11 +95,14 @@ class StateSpaceModel:
         steps = divide(duration_ns, self._plant.step_ns, "step", "the duration")
         begin = (t_ns - self._block_ns) // self._plant.step_ns
         if not 0 <= begin <= begin + steps <= BLOCK or self._drifts(t_ns):
-            self._block_ns, begin = t_ns, 0
+            self._block_ns = t_ns
+            begin = 0
             self._block = plant.forcing(t_ns, max(steps, BLOCK), self._plant, self._state.x)
         forced = Forcing(*(part[2 * begin : 2 * (begin + steps) + 1] for part in self._block))
         self._state = plant.advance(t_ns, self._state, u, duration_ns, self._plant, forced)
-        half, psi_dot, velocity = seconds(duration_ns) / 2.0, self._psi_dot, self._velocity
+        half = seconds(duration_ns) / 2.0
+        psi_dot = self._psi_dot
+        velocity = self._velocity
         states = self._states()
         self._psi_dot = self._heading_rate(states)
         self._psi += half * (psi_dot + self._psi_dot)
@@ -139,7 +145,8 @@ class StateSpaceModel:
 
     def air_angles(self, t_ns: int) -> FloatArray:
         """See FlightDynamicsModel: x less the wind along the axis of the angle over V0, `disturbance.AIR_STATE`."""
-        x, wind = self._states(), self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]
+        x = self._states()
+        wind = self._block.wind[2 * ((t_ns - self._block_ns) // self._plant.step_ns)]
         if self._plant.turbulence is not None:
             wind = wind + turbulence.wind(self._state.turbulence, self._plant.turbulence)
         return np.array([x[place] - (0.0 if axis is None else wind[axis] / self._speed) for place, axis in self._angles])
@@ -168,7 +175,8 @@ class Simulator:
 
     def __init__(self, parameters: AircraftConfig) -> None:
         channels = parameters.channels()
-        self.outputs, self.inputs = tuple(channels.outputs), tuple(channels.inputs)
+        self.outputs = tuple(channels.outputs)
+        self.inputs = tuple(channels.inputs)
         self.period_ns = period_ns(parameters.rate, "rate")
         self._largest = plausible.largest(self.outputs)
         self._model: FlightDynamicsModel  # in trim at t = 0
@@ -178,17 +186,22 @@ class Simulator:
             self._model = JsbsimModel(parameters.flight_condition(), parameters.actuator_model(), parameters.wind_model())
         else:
             self._model = StateSpaceModel(parameters)
-        self._wind, self._gusts, self._speed = parameters.wind, parameters.gusts, channels.speed
+        self._wind = parameters.wind
+        self._gusts = parameters.gusts
+        self._speed = channels.speed
         self._drift_section = parameters.drift
         self._start = pose.Start(**parameters.start.model_dump())
-        self._pose_every, self._pose_sensors = parameters.pose_every(), parameters.pose_sensors()
+        self._pose_every = parameters.pose_every()
+        self._pose_sensors = parameters.pose_sensors()
         self._poses: DelayLine = ()
-        self._sensors, self._vanes = parameters.sensor_arrays(), parameters.vane_arrays()
+        self._sensors = parameters.sensor_arrays()
+        self._vanes = parameters.vane_arrays()
         self._vane_state = None if self._vanes is None else vanes.initial_state(self._vanes)
         self.truth_names = ("t", *self._model.truth_names, *(f"noise.{name}" for name in self.outputs))
         if self._pose_sensors is not None:
             self.truth_names += tuple(f"noise.pose.{name}" for name in POSE)
-            self._pose_drift, self._pose_error = sensors.initial_drift(self._pose_sensors), np.zeros(len(POSE))
+            self._pose_drift = sensors.initial_drift(self._pose_sensors)
+            self._pose_error = np.zeros(len(POSE))
         self._drift = sensors.initial_drift(self._sensors)
         self._delay_line: DelayLine = ()
         self._error = np.zeros(len(self.outputs))
@@ -213,8 +226,10 @@ class Simulator:
             require(drift is None or drift.start >= t, "drift.start", f"{drift and drift.start:g} s", f"at least t = {t:g} s")
             acts = before is not None and before.start < t
             require(not acts, "drift", "a change of a drift that acts", "one before its start")
-        self._drift_section, self._gusts = drift, parameters.gusts
-        self._sensors, self._vanes = parameters.sensor_arrays(), parameters.vane_arrays()
+        self._drift_section = drift
+        self._gusts = parameters.gusts
+        self._sensors = parameters.sensor_arrays()
+        self._vanes = parameters.vane_arrays()
         self._model.retune(now_ns, parameters)
 
     def sample(self, number: int, u: FloatArray) -> DelayLine:
@@ -255,7 +270,8 @@ class Simulator:
 
     def poses(self) -> DelayLine:
         """The poses that arrive at the instant of the last sample, the oldest first, as measured; stamps are flight time."""
-        due, t_ns = self._number % self._pose_every == 0, self._number * self.period_ns
+        due = self._number % self._pose_every == 0
+        t_ns = self._number * self.period_ns
         if self._pose_sensors is None:
             return (StampedVector(t_ns, self.pose()),) if due else ()
         measured = None

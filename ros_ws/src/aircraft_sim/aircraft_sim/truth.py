@@ -30,5 +30,6 @@ def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: Plan
         f = f + plant.aircraft.trim
     if plant.turbulence is not None:
         turbulent = turbulence.wind(state.turbulence, plant.turbulence)
-        wind, f = wind + turbulent, f + plant.aircraft.gust_direction @ turbulent
+        wind = wind + turbulent
+        f = f + plant.aircraft.gust_direction @ turbulent
     return np.concatenate([state.x, f, wind, state.position])

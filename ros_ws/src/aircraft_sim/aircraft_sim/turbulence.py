@@ -21,12 +21,15 @@ from aircraft_sim import random_streams
 from flight_core.vectors import Array, FloatArray
 
 FOOT = 0.3048  # m, exact
-LOWEST, LOW, HIGH = 10.0 * FOOT, 1000.0 * FOOT, 2000.0 * FOOT
+LOWEST = 10.0 * FOOT
+LOW = 1000.0 * FOOT
+HIGH = 2000.0 * FOOT
 """m. The low model holds from LOWEST to LOW, the high one from HIGH on; MIL-F-8785C 3.7.3.4, 3.7.2."""
 
 HIGH_LENGTH = 1750.0 * FOOT  # m, MIL-F-8785C 3.7.2.1, Dryden form
 
-MODERATE_WIND, MODERATE_SIGMA = 15.4, 3.05
+MODERATE_WIND = 15.4
+MODERATE_SIGMA = 3.05
 """m/s, of moderate turbulence: W_20 of 30 kt (MIL-F-8785C 3.7.3.4), and the intensity at high altitude, 10 ft/s."""
 
 MODERATE = {"altitude": 100.0, "wind": MODERATE_WIND}  # m above the ground, m/s
@@ -96,7 +99,8 @@ def filters(spectrum: Dryden, airspeed: float, dt: float, axes: Sequence[int], s
     Arguments: `airspeed` V0, m/s; `dt` in s; `axes` the required ones, as indices in AXES. Source: MIL-F-8785C, 3.7.1.2.
     """
     steps = airspeed / spectrum.length * dt
-    p, q = np.sqrt(1.5), (1.0 - np.sqrt(3.0)) / np.sqrt(2.0)
+    p = np.sqrt(1.5)
+    q = (1.0 - np.sqrt(3.0)) / np.sqrt(2.0)
     output = np.array([[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, p, q, 0.0, 0.0], [0.0, 0.0, 0.0, p, q]]) * spectrum.sigma[:, None]
     return Turbulence(
         _axes([np.exp(-h) * np.array([[1.0, 0.0], [h, 1.0]]) for h in steps]),

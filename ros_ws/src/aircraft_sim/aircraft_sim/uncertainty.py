@@ -80,7 +80,8 @@ def wind_factors(airframe: Airframe, A: FloatArray, wind: WindEffect) -> FloatAr
 
     A published effect equal to minus the published column, per w / V0 or w, then equals minus the aircraft's own column.
     """
-    published, factors = airframe.matrix_a(), np.ones((len(A), len(airframe.states), len(airframe.gusts)))
+    published = airframe.matrix_a()
+    factors = np.ones((len(A), len(airframe.states), len(airframe.gusts)))
     for k, axis in enumerate(airframe.gusts):
         if wind == AIR_RELATIVE and AIR_STATE[axis] in airframe.states:
             j = airframe.index(AIR_STATE[axis])
@@ -110,7 +111,8 @@ def sampled_matrices(
         parts[matrix][i, j] = part
     for part in (of_A, of_B, *spread.entries.values()):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
-    A, B = airframe.matrix_a(), airframe.matrix_b()
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
     uniform = random_streams.uniform(first, count, A.size + B.size, random_streams.AIRFRAME, seed)
     known = np.array([[float(state not in KINEMATIC)] for state in airframe.states])
 
@@ -156,7 +158,8 @@ def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
 
 def with_entries(airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE) -> Airframe:
     """The airframe with entries multiplied by 1 + deviation, named as in `drawn_entries`; wind as in `wind_factors`."""
-    matrices, places = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}, _drawn_places(airframe)
+    matrices = {"A": airframe.matrix_a().copy(), "B": airframe.matrix_b().copy()}
+    places = _drawn_places(airframe)
     for name, deviation in deviations.items():
         matrix, i, j = places[name]
         matrices[matrix][i, j] *= 1.0 + deviation

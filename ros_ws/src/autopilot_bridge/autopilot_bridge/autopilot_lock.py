@@ -64,7 +64,8 @@ class AutopilotLock:
         known = self._starts.publisher is not None
         boot_ns = now_ns - since_boot_ns
         if self._starts.refresh(self._start(since_boot_ns, now_ns), now_ns):
-            self._newest_ns, self._boot_ns = since_boot_ns, boot_ns
+            self._newest_ns = since_boot_ns
+            self._boot_ns = boot_ns
             return changed or known
         self._newest_ns, self._boot_ns = max(self._newest_ns, since_boot_ns), min(self._boot_ns, boot_ns)
         return changed

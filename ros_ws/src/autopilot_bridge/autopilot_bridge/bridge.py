@@ -57,7 +57,8 @@ class Bridge:
     def __init__(self, channel_map: ChannelMap, *, dry_run: bool) -> None:
         self.channel_map = channel_map
         self.dry_run = dry_run
-        self.outputs, self.inputs = tuple(channel_map.outputs), tuple(channel_map.inputs)
+        self.outputs = tuple(channel_map.outputs)
+        self.inputs = tuple(channel_map.inputs)
         self.phase = Phase.DISENGAGED
         self.reason = "not engaged yet"  # why the bridge is not engaged, what an engagement waits for, or lacks
         self.conflict = ""  # what refuses and ends an engagement, such as another publisher, as a sentence; set by the node
@@ -100,7 +101,8 @@ class Bridge:
             hint = "" if row.stamp == "arrival" else "; set stamp: arrival in the map if the autopilot has another clock"
             side = "before" if stamp_ns < now_ns else "after"
             raise ChannelError("stamp", f"{name} is stamped {seconds(abs(now_ns - stamp_ns)):.3f} s {side} now{hint}")
-        last, value = self._readings.get(name), to_channel(raw, row.line)
+        last = self._readings.get(name)
+        value = to_channel(raw, row.line)
         if last is not None:
             require_newer(stamp_ns, last.stamp_ns, name)
             if isinstance(row, OutputRow) and row.low_pass > 0.0:
@@ -196,7 +198,8 @@ class Bridge:
 
     def _is_active(self, name: str, now_ns: int) -> bool:
         """Whether a pilot override is active. It ends with its topic: an old one does not block an engagement."""
-        row, reading = self.channel_map.overrides[name], self._overrides.get(name)
+        row = self.channel_map.overrides[name]
+        reading = self._overrides.get(name)
         if reading is None or self._is_silent(name, now_ns):
             return False
         engaged = self.phase in {Phase.ENGAGED, Phase.NEUTRAL}
@@ -298,7 +301,8 @@ class Bridge:
 
     def _beyond_range(self, name: str) -> str:
         """Why the limits around the trim of a captured input leave the range of its field; empty where they do not."""
-        row, trim = self.channel_map.inputs[name], self.trim(name)
+        row = self.channel_map.inputs[name]
+        trim = self.trim(name)
         (low, high), ends = row.range, (trim + row.lower, trim + row.upper)
         if all(low - ROUNDING <= to_raw(end, row.line) <= high + ROUNDING for end in ends):
             return ""
@@ -315,7 +319,8 @@ class Bridge:
             self._begin_time(now_ns)
         if self.phase in {Phase.ENGAGED, Phase.ENGAGING}:
             return ""
-        before, self._blind = self._blind, blind
+        before = self._blind
+        self._blind = blind
         if refusal := self.refusal(now_ns):
             self._blind = before
         else:
@@ -408,7 +413,8 @@ class Bridge:
 
     def trim(self, name: str) -> float:
         """The trim of an input: captured at engagement where `trims` has its source, which it follows until then."""
-        row, source = self.channel_map.inputs[name], self._readings.get(trim_key(name))
+        row = self.channel_map.inputs[name]
+        source = self._readings.get(trim_key(name))
         if name in self._trim and self._is_captured():
             return self._trim[name]
         return row.trim if source is None else to_channel(source.value, row.line)
@@ -453,7 +459,8 @@ class Bridge:
         """Whether a message of the map is sent now. A dry run sends none."""
         if self.dry_run:
             return False
-        when, phase = self.channel_map.messages[name].when, self.phase
+        when = self.channel_map.messages[name].when
+        phase = self.phase
         if when == "heartbeat":
             return phase in {Phase.ENGAGING, Phase.ENGAGED, Phase.NEUTRAL}
         if when == "engaging":
@@ -475,7 +482,8 @@ class Bridge:
         return any(reading is not None and not row.holds(reading.value) for row, reading in readings)
 
     def _enter(self, phase: Phase, now_ns: int) -> None:
-        self.phase, self._phase_ns = phase, now_ns
+        self.phase = phase
+        self._phase_ns = now_ns
         if phase in {Phase.ENGAGING, Phase.ENGAGED}:
             self._keeps_mode = phase is Phase.ENGAGING
         if phase is Phase.ENGAGED:

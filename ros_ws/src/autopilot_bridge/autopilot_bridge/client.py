@@ -13,7 +13,9 @@ from flight_ros.client import SERVICE_TIMEOUT, Client
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.topics import ENGAGEMENT, NEWEST_SAMPLES, PUBLISH, U
 
-ENGAGE, ENGAGE_BLIND = "bridge/engage", "bridge/engage_blind"  # services
+# services
+ENGAGE = "bridge/engage"
+ENGAGE_BLIND = "bridge/engage_blind"
 WITHDRAW_TIMEOUT = 1.0  # s
 U_TIMEOUT = 30.0  # s: the nodes of a flight start, and the autopilot may send its first messages late
 TRIM_SAMPLES = 20  # equal samples of u in a row: u has reached trim

@@ -124,7 +124,8 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
     version = next((value for name, _, value in known[kind][0] if name == VERSION), 0)
     if (expected := versioned_topic(topic, version)) != topic:
         return f"{topic}: version {version}, whose topic is {expected}"
-    at, field = kind, (Nodetype.NAME, kind)
+    at = kind
+    field = (Nodetype.NAME, kind)
     for step in path.split("."):
         match = STEP.fullmatch(step)
         fields = dict(known[at][1]) if at in known else {}

@@ -33,9 +33,12 @@ DIALECT = "ardupilotmega"
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1
 COMPANION = 194  # MAV_COMP_ID_ONBOARD_COMPUTER4: other companions mostly have 191. With the component of the ground station,
 # such as 0 or 190, ArduPilot would not forward the station's heartbeats any more (MAVLink_routing.cpp, handle_heartbeat)
-SET_MESSAGE_INTERVAL, ACCEPTED = 511, 0  # MAV_CMD, MAV_RESULT
+SET_MESSAGE_INTERVAL = 511  # MAV_CMD
+ACCEPTED = 0  # MAV_RESULT
 SIGNED = 1  # MAVLINK_IFLAG_SIGNED, of a header
-GCS, ONBOARD, INVALID = 6, 18, 8  # MAV_TYPE_GCS, MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID
+GCS = 6  # MAV_TYPE_GCS
+ONBOARD = 18  # MAV_TYPE_ONBOARD_CONTROLLER
+INVALID = 8  # MAV_AUTOPILOT_INVALID
 STICKS = frozenset({"RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"})  # messages of a joystick
 BEAT = 1.0  # s
 ANSWER = 1.0  # s, for an answer to a request, which is then repeated
@@ -128,7 +131,8 @@ class Link:
         self._parser = self._new_parser(self._connection.mav.signing)
         self._lock = AutopilotLock(nanoseconds(SILENCE))
         self._clash = ""  # what ends with another configuration alone
-        self._second, self._second_at = "", 0.0  # the sentence on a second sender, and when it sent last
+        self._second = ""  # the sentence on a second sender
+        self._second_at = 0.0  # and when it sent last
         self.stations: set[int] = set()  # systems of ground stations beside this bridge
         self._refused = ""  # why the last message was refused, for its signature
         self._queues: dict[str, deque[ReceivedMessage]] = {}
@@ -137,11 +141,14 @@ class Link:
         self._to_request = dict(config.rates)
         self._requested: tuple[str, float] | None = None  # the message whose interval was requested, and when
         self._denied: dict[str, str] = {}
-        self._beat, self._alive, self._began = 0.0, 0.0, time.monotonic()
+        self._beat = 0.0
+        self._alive = 0.0
+        self._began = time.monotonic()
         self._rates = MessageRates(config.rates, self._began)
         self._read = 0.0  # when the parameters were requested
         self._station_heard: float | None = None  # the ground station with the number of the RC overrides
-        self._sending, self._closed = Lock(), Event()
+        self._sending = Lock()
+        self._closed = Event()
         self._thread = Thread(target=self._receive, name="mavlink", daemon=True)
 
     @property
@@ -198,7 +205,8 @@ class Link:
 
     def station(self) -> str:
         """What the autopilot's failsafe FS_GCS_ENABL watches while RC overrides are sent, as a sentence."""
-        system, limit = self._config.source_system, self._config.station_silence
+        system = self._config.source_system
+        limit = self._config.station_silence
         counted = f"FS_GCS_ENABL takes RC overrides for heartbeats of ground station {system}"
         if self._station_heard is None:
             return (
@@ -219,7 +227,8 @@ class Link:
     def _receive(self) -> None:
         now = time.monotonic()
         while not self._closed.is_set():
-            before, now = now, time.monotonic()
+            before = now
+            now = time.monotonic()
             self._lock.overran(max(0, nanoseconds(now - before - POLL)))
             if now - self._beat >= BEAT:
                 self._beat = now
@@ -253,11 +262,13 @@ class Link:
 
     def _new_parser(self, signing: Any) -> Any:
         parser = type(self._connection.mav)(None)
-        parser.robust_parsing, parser.signing = True, signing
+        parser.robust_parsing = True
+        parser.signing = signing
         return parser
 
     def _take(self, message: Any, address: Address, received_ns: int) -> None:
-        name, now = message.get_type(), time.monotonic()
+        name = message.get_type()
+        now = time.monotonic()
         system = message.get_srcSystem()
         is_station = name == "HEARTBEAT" and message.type == GCS
         if system == self._config.source_system and (name in STICKS or (name == "HEARTBEAT" and not is_station)):
@@ -289,24 +300,30 @@ class Link:
 
     def _admits(self, message: Any, address: Address, now: float) -> bool:
         """Whether a message of the autopilot is from the locked sender. Rates are requested from a new sender."""
-        sender, before, now_ns = _text(address), self._lock.address, nanoseconds(now)
+        sender = _text(address)
+        before = self._lock.address
+        now_ns = nanoseconds(now)
         milliseconds = getattr(message, "time_boot_ms", None) if message.get_type() in self._queues else None
         since_boot_ns = None if milliseconds is None else 1_000_000 * milliseconds
         try:
             self._lock.check(sender, since_boot_ns, now_ns)
         except ChannelError as error:
-            self._second, self._second_at = str(error), now
+            self._second = str(error)
+            self._second_at = now
             return False
         changed = self._lock.refresh(sender, since_boot_ns, now_ns)
         if changed:
             self._parser = self._new_parser(self._connection.mav.signing)
             if before is not None:
-                self._second, self._second_at = f"the autopilot at {sender} is new, or has started again; before: {before}", now
+                self._second = f"the autopilot at {sender} is new, or has started again; before: {before}"
+                self._second_at = now
         if changed and self._is_udp:
             with self._sending:
                 self._connection.clients = {address}
         if changed or now - self._alive > SILENCE:
-            self._to_request, self._denied, self._began = dict(self._config.rates), {}, now
+            self._to_request = dict(self._config.rates)
+            self._denied = {}
+            self._began = now
             self._rates.begin(now)
             self.parameters.clear()
         return True
@@ -336,7 +353,8 @@ class Link:
     def _answered(self, result: int) -> None:
         if self._requested is None:
             return
-        name, self._requested = self._requested[0], None
+        name = self._requested[0]
+        self._requested = None
         rate = self._to_request.pop(name, 0.0)
         if result != ACCEPTED:
             self._denied[name] = (
@@ -348,8 +366,11 @@ class MavlinkReader:
     """A message of a link in the place of a subscription."""
 
     def __init__(self, link: Link, topic: Any) -> None:
-        self.link, self.topic, self.name = link, topic, str(topic.name)
-        self.message_name, self.fields = topic.type.__name__, tuple(topic.type.fields)
+        self.link = link
+        self.topic = topic
+        self.name = str(topic.name)
+        self.message_name = topic.type.__name__
+        self.fields = tuple(topic.type.fields)
         self._queue = link.listen(self.message_name)
 
     def take(self) -> list[ReceivedMessage]:
@@ -361,7 +382,8 @@ class MavlinkPublisher:
     """A message of a link in the place of a publisher."""
 
     def __init__(self, link: Link, topic: str) -> None:
-        self._link, self.topic_name = link, topic
+        self._link = link
+        self.topic_name = topic
 
     def publish(self, message: Any) -> None:
         """Send a message."""

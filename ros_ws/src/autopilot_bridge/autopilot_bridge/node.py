@@ -108,7 +108,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self.create_service(SetBool, "~/engage", self._engage)
         self.create_service(Trigger, "~/engage_blind", self._engage_blind)
         self._engagement = self.create_publisher(ENGAGEMENT.type, ENGAGEMENT.name, PUBLISH)
-        self._first_y, self._start_ns = False, 0
+        self._first_y = False
+        self._start_ns = 0
         self._report_ns = 0  # of the last report on the engagement
         self._controller = self.create_client(ChangeState, "controller/change_state")
         self._controller_state = self.create_client(GetState, "controller/get_state")
@@ -276,7 +277,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if self._activation is None:
             return
         if self._activation.done():
-            success, self._activation = self._activation.result().success, None
+            success = self._activation.result().success
+            self._activation = None
             if not success:
                 self._bridge.disengage("the controller refused to activate, or was active already: see its log", now_ns)
         elif now_ns - self._activation_ns > ACTIVATION_TIMEOUT_NS:
@@ -285,12 +287,14 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _report(self, now_ns: int) -> None:
         """Publish the phase and its reason; once a second also what would refuse an engagement."""
-        bridge, self._report_ns = self._bridge, now_ns
+        bridge = self._bridge
+        self._report_ns = now_ns
         refusal = "" if bridge.phase in {Phase.ENGAGED, Phase.ENGAGING} else bridge.refusal(now_ns)
         sentence = "; would refuse: ".join(filter(None, (bridge.reason, refusal)))
         self._engagement.publish(KeyValue(key=bridge.phase.name, value=sentence))
         ready = self._controller.service_is_ready() and self._controller_state.service_is_ready()
-        before, self._u_sender = self._u_sender, bridge.u_lock.publisher
+        before = self._u_sender
+        self._u_sender = bridge.u_lock.publisher
         restarted = bool(before) and self._u_sender != before  # it can take less time than the loss of the service
         if ready and (restarted or not self._controller_ready) and bridge.phase is not Phase.ENGAGED:
             self._controller_state.call_async(GetState.Request()).add_done_callback(self._deactivate_unengaged)
@@ -304,7 +308,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             self._activate(active=False)
 
     def _log_phase(self) -> None:
-        phase, reason = self._bridge.phase, self._bridge.reason
+        phase = self._bridge.phase
+        reason = self._bridge.reason
         before, lacked = self._logged
         self._logged = phase, reason
         if phase is before and (phase is not Phase.ENGAGED or reason == lacked):
@@ -406,7 +411,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _watch_link(self) -> None:
         """Tell the bridge what is wrong with topics and link, and the parameters of the autopilot."""
-        bridge, link = self._bridge, self._link
+        bridge = self._bridge
+        link = self._link
         bridge.conflict = self._conflict
         if link is None:
             return
@@ -416,7 +422,8 @@ class BridgeNode(FlightNode[BridgeConfig]):
             bridge.take_parameter(name, value)
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:
-        bridge, now_ns = self._bridge, self.now_ns()
+        bridge = self._bridge
+        now_ns = self.now_ns()
         refusal = "" if bridge.phase is Phase.ENGAGED else bridge.refusal(now_ns)
         level = DiagnosticStatus.OK if bridge.phase is Phase.ENGAGED and not bridge.reason else DiagnosticStatus.WARN
         sentence = ": ".join(filter(None, (bridge.phase.name, bridge.reason)))
@@ -436,7 +443,8 @@ class ServiceCaller:
     """A service of the autopilot in the place of a publisher."""
 
     def __init__(self, client: Client) -> None:
-        self._client, self.topic_name = client, str(client.srv_name)
+        self._client = client
+        self.topic_name = str(client.srv_name)
 
     def publish(self, request: Any) -> None:
         """Request it, without regard to the answer. Raises ChannelError without the service."""
@@ -449,8 +457,10 @@ class OutgoingMessage:
     """A message to the autopilot and its publisher. Its constant fields are set once."""
 
     def __init__(self, publisher: Any, message: Any, row: MessageRow, inputs: list[tuple[int, InputRow]]) -> None:
-        self.publisher, self.row = publisher, row
-        self._message, self._inputs = message, inputs
+        self.publisher = publisher
+        self.row = row
+        self._message = message
+        self._inputs = inputs
         self._period_ns = nanoseconds(1.0 / row.rate)
         self._sent_ns = 0
 

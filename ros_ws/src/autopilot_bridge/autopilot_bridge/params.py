@@ -321,7 +321,8 @@ class ChannelMap(Config):
     link: LinkConfig | None = Field(default=None, description="the MAVLink link of rows with a type mavlink/msg/NAME")
 
     def _check(self) -> None:
-        outputs, messages = ", ".join(self.outputs), ", ".join(self.messages)
+        outputs = ", ".join(self.outputs)
+        messages = ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
         own = self.outputs[self.instant]
         require(not own.held, f"outputs.{self.instant}.held", "true", "false: its stamp is that of y")
@@ -331,7 +332,8 @@ class ChannelMap(Config):
         for name, row in self.inputs.items():
             key = f"inputs.{name}"
             require(row.message in self.messages, f"{key}.message", f"{row.message!r}", f"one of the messages {messages}")
-            when, moving = self.messages[row.message].when, "one sent when engaged: it moves the aircraft"
+            when = self.messages[row.message].when
+            moving = "one sent when engaged: it moves the aircraft"
             require(when == "engaged", f"{key}.message", f"one sent when {when}", moving)
             other = owners.setdefault((row.message, row.field), name)
             require(other == name, f"{key}.field", f"{row.field}, that of {other}", "a field of its own")

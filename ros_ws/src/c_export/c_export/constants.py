@@ -68,7 +68,8 @@ def sizes(controller: RiseDiConfig) -> Sizes:
 
 def constants(controller: RiseDiConfig) -> list[Constant]:
     """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no limit."""
-    guard, law = controller.guard(), controller.law_params()
+    guard = controller.guard()
+    law = controller.law_params()
     of_law = controller.tuned_law().params
     period = seconds(guard.period_ns)
     whole: dict[str, int | tuple[int, ...]] = {
@@ -180,7 +181,8 @@ def _initialiser(name: str, value: int | tuple[int, ...] | FloatArray, numbers: 
         return f"{{{', '.join(map(str, value))}}}"
     if name in SCALARS:
         return numbers(value)
-    begin, end = name.endswith(".lower"), name.endswith(".rate")
+    begin = name.endswith(".lower")
+    end = name.endswith(".rate")
     return f"{'{' * begin}{{{numbers(value)}}}{'}' * end}"
 
 

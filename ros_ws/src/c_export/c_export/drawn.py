@@ -26,12 +26,15 @@ EPOCH_NS = 1_795_000_000_000_000_000  # start of the drawn stamps: float64 does 
 
 def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recording:
     """Drawn samples: jitter, lost, late, early, repeated stamps, errors of any size, jumps, new parameters, deactivation."""
-    rng, controller = np.random.default_rng(seed), sets[0]
-    m, period_ns = len(controller.outputs), controller.guard().period_ns
+    rng = np.random.default_rng(seed)
+    controller = sets[0]
+    m = len(controller.outputs)
+    period_ns = controller.guard().period_ns
     unit = controller.law_params().eps
     schedule = controller.schedule
     airspeed = np.array([0.0 if schedule is None else schedule.speed * (name == "V") for name in controller.outputs])
-    recorder, now_ns = Recorder(sets), EPOCH_NS
+    recorder = Recorder(sets)
+    now_ns = EPOCH_NS
     y_m, size, inactive, silence = np.zeros(m), unit, 0, 0
     jumps = _jumps(unit, np.random.default_rng([seed, 1]))
     stamp_m_ns = now_ns
@@ -75,7 +78,8 @@ def drawn_calls(sets: Sequence[RiseDiConfig], ticks: int, seed: int) -> Recordin
 
 def _jumps(unit: FloatArray, rng: np.random.Generator) -> Iterator[FloatArray]:
     """What is added to samples of y, (m,): in one of 50, and in some after it, up to 10^5 units, so that they are lost."""
-    m, off = len(unit), np.zeros_like(unit)
+    m = len(unit)
+    off = np.zeros_like(unit)
     while True:
         if rng.random() < 0.02:
             off = np.where(rng.random(m) < 0.3, unit * 10.0 ** rng.uniform(0.0, 5.0, m), 0.0)
@@ -100,10 +104,16 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     integers = zero + np.array([1, 0, Mode.ENGAGED, 1, 0, 0, 0, 0, 0])
     integers[:, 4] = integers[:, 8] = EPOCH_NS + dt_ns
     events = np.zeros(2 * steps + 1, dtype=event_type(len(y)))
-    events[0]["kind"], events[0]["flag"] = START, index
-    load, tick = events[1::2], events[2::2]
-    load["kind"], load["stamp_ns"] = LOAD, EPOCH_NS
-    tick["kind"], tick["flag"], tick["y"], tick["y_m"] = GUARD_TICK, 3, y.T, y_m.T
+    events[0]["kind"] = START
+    events[0]["flag"] = index
+    load = events[1::2]
+    tick = events[2::2]
+    load["kind"] = LOAD
+    load["stamp_ns"] = EPOCH_NS
+    tick["kind"] = GUARD_TICK
+    tick["flag"] = 3
+    tick["y"] = y.T
+    tick["y_m"] = y_m.T
     tick["now_ns"] = tick["stamp_ns"] = EPOCH_NS + dt_ns
     reals, loaded = (np.ascontiguousarray(np.vstack([values[name] for name in groups]).T) for values in (after, before))
     return Recording(f"drawn steps, parameters {index}", events, integers, reals, loaded)
@@ -113,8 +123,10 @@ def _drawn_states(
     controller: RiseDiConfig, rng: np.random.Generator, dt_ns: NDArray[np.int64]
 ) -> tuple[dict[str, FloatArray], FloatArray, FloatArray]:
     """States by group, y and y_m, of shape (values, steps)."""
-    m, steps = len(controller.outputs), len(dt_ns)
-    eps, scale = controller.law_params().eps[:, None], np.array(controller.input_scale)[:, None]
+    m = len(controller.outputs)
+    steps = len(dt_ns)
+    eps = controller.law_params().eps[:, None]
+    scale = np.array(controller.input_scale)[:, None]
     size = eps * 10.0 ** rng.uniform(-3.0, 2.5, (1, steps)) * 10.0 ** rng.uniform(-1.0, 0.0, (m, steps))
     u_size = 10.0 * scale * size
     of_groups = {
@@ -143,16 +155,22 @@ def _stepped(
     controller: RiseDiConfig, before: Mapping[str, FloatArray], y: FloatArray, y_m: FloatArray, dt_ns: NDArray[np.int64]
 ) -> dict[str, FloatArray]:
     """States after a step of the guard, by the functions of the guard over all columns."""
-    guard, law = controller.guard(), controller.tuned_law()
+    guard = controller.guard()
+    law = controller.tuned_law()
     period = seconds(guard.period_ns)
     dt = np.minimum(np.maximum(dt_ns / NANOSECONDS, DT_RANGE[0] * period), DT_RANGE[1] * period)
-    params, limits, zero = _columns(law.params), _columns(guard.limits), np.zeros_like(y)
-    state, u_before = restored(law.control_law, before), before["u"]
+    params = _columns(law.params)
+    limits = _columns(guard.limits)
+    zero = np.zeros_like(y)
+    state = restored(law.control_law, before)
+    u_before = before["u"]
     held = Measurements(before["y"], before["y_m"], zero, before["u_trim"] + before["u_ff"], u_before)
     missed = np.round(dt / period) - 1.0
     for k in range(round(DT_RANGE[1])):
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
-    u_trim, u_ff, of_model = before["u_trim"], before["u_ff"], {}
+    u_trim = before["u_trim"]
+    u_ff = before["u_ff"]
+    of_model = {}
     if guard.nominal is not None:
         x, u, dt_before, ticks, u_0 = (before[f"feedforward.{name}"] for name in FeedforwardState._fields)
         now, u_ff = feedforward.step(FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal))

@@ -82,7 +82,8 @@ class Recorder(Controller):
         self, sets: Sequence[RiseDiConfig], before_tick: Callable[["Recorder", int], bool] = lambda recorder, now_ns: True
     ) -> None:
         super().__init__(sets[0])
-        self.sets, self._before_tick = sets, before_tick
+        self.sets = sets
+        self._before_tick = before_tick
         self.silent: frozenset[str] = frozenset()  # samples that get lost: y, y_m
         self._events: list[tuple[Any, ...]] = []
         self._integers: list[tuple[int, ...]] = []
@@ -148,13 +149,15 @@ class Recorder(Controller):
 
     def guard_tick(self, now_ns: int, sample: tuple[int, FloatArray, FloatArray, int] | None, *, active: bool) -> None:
         """A tick with stamp, y, y_m at the stamp, and the distance of the newest y_m in ns; None without samples."""
-        y, y_m = None, []
+        y = None
+        y_m = []
         if sample is None:
             self._add(GUARD_TICK, now_ns, flag=int(active))
         else:
             stamp_ns, y_value, y_m_value, offset_ns = sample
             self._add(GUARD_TICK, now_ns, stamp_ns, int(active) + 2, offset_ns, y_value, y_m_value)
-            y, y_m = StampedVector(stamp_ns, y_value), [StampedVector(stamp_ns, y_m_value)]
+            y = StampedVector(stamp_ns, y_value)
+            y_m = [StampedVector(stamp_ns, y_m_value)]
             if offset_ns > 0:
                 y_m.append(StampedVector(stamp_ns + offset_ns, y_m_value))
         self._state, inputs = guard.tick(self._state, now_ns, y, y_m, self._guard, self._law, active)
@@ -243,10 +246,8 @@ def _flown(name: str, scenario: Scenario, recorder: Recorder) -> Recording:
 def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder, int], bool]:
     """What happens before a tick of the flight with faults."""
     controller = sets[0]
-    within_hold, in_ramp = (
-        controller.max_age + 0.5 * controller.hold,
-        controller.max_age + controller.hold + 0.5 * controller.ramp,
-    )
+    within_hold = controller.max_age + 0.5 * controller.hold
+    in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
     beyond = controller.max_age + controller.hold + controller.ramp + 0.2
     lost = {0.25: ({"y"}, within_hold), 0.35: ({"y_m"}, in_ramp), 0.5: ({"y"}, beyond), 0.7: ({"y", "y_m"}, in_ramp)}
     retuned = {0.05 + 0.9 * k / len(sets): k for k in range(1, len(sets))}
@@ -278,7 +279,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
     log = run.tape["internals"]
     of_command = "u" if sets[0].allocation is None else internals.EFFECTOR
     groups = {name: log.group(name).values for name in ("y", "y_m", of_command)}
-    recorder, equal = Recorder(sets), 0
+    recorder = Recorder(sets)
+    equal = 0
     now_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
     for k in np.argsort(now_ns, kind="stable").tolist():
         if log["number"][k] == 1 and k:

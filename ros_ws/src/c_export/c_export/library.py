@@ -26,7 +26,8 @@ class CController:
     """A controller in C, with the calls of `rise_di_controller.controller.Controller`; p values of u."""
 
     def __init__(self, library: Path, p: int) -> None:
-        self._p, self._library = p, ctypes.CDLL(str(library))
+        self._p = p
+        self._library = ctypes.CDLL(str(library))
         self._library.library_bytes.restype = ctypes.c_int64
         self._memory = ctypes.create_string_buffer(self._library.library_bytes())
         self._u = np.zeros(p)

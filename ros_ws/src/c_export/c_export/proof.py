@@ -24,7 +24,9 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 SOURCE = Path(str(files("c_export"))) / "source"
 CODE = ("rise_di.h", "rise_di.c")
 PARAMETERS = "rise_di_parameters.h"
-REPORT, FMU = "proof.txt", "rise_di.fmu"  # beside the code
+# beside the code
+REPORT = "proof.txt"
+FMU = "rise_di.fmu"
 COMPILERS = ("gcc", "clang")
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
 COUNTING_FLAGS = ("-x", "c++", "-std=c++20", "-O2", "-include", "counting.h")
@@ -102,7 +104,8 @@ class Program:
         flags: Sequence[str] = FLAGS, source: str | None = None,
     ) -> None:  # fmt: skip
         """Compile; `source` replaces the text of rise_di.c. Raises ParameterError with the words of the compiler."""
-        self._folder, self._float32 = folder, float32
+        self._folder = folder
+        self._float32 = float32
         folder.mkdir(parents=True, exist_ok=True)
         for path in (code / "rise_di.h", code / "rise_di.c", code / PARAMETERS, SOURCE / "proof.c", SOURCE / "counting.h"):
             shutil.copyfile(path, folder / path.name)
@@ -129,7 +132,8 @@ class Program:
             raise ParameterError(f"compiler: {found}, expected a compiler for this machine") from None
         if done.returncode:
             raise ParameterError(f"the exported code: {(done.stderr or 'the program failed').strip()[-2000:]}")
-        whole, reals = len(INTEGERS), len(real_names(self._sets[0]))
+        whole = len(INTEGERS)
+        reals = len(real_names(self._sets[0]))
         words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, whole + reals)
         return words[:, :whole], words[:, whole:].view(np.float64), json.loads(done.stdout)
 

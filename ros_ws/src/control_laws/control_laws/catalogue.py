@@ -55,7 +55,9 @@ INITIAL_WIND_GAINS = {"gust": 0.5, "wind_time": 2.0}
 4 s vertically and 10 s along the flight; a design gust of 15 m peaks after 0.6 s."""
 
 
-NONE, AIRCRAFT, INTEGRATORS = "none", "aircraft", "integrators"
+NONE = "none"
+AIRCRAFT = "aircraft"
+INTEGRATORS = "integrators"
 """Models of a feedforward: none, A, B and f of the nominal aircraft, y_dot = Omega u."""
 
 
@@ -101,11 +103,13 @@ def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
     return lambda _: law
 
 
-_rise_gains, _observer_gains = ("K", "Lambda", "beta", "softening"), ("effort", "gust", "wind_time", "drift", "loose")
+_rise_gains = ("K", "Lambda", "beta", "softening")
+_observer_gains = ("effort", "gust", "wind_time", "drift", "loose")
 _soft, _implicit = (_fixed(rise.CONTROL_LAWS[sign]) for sign in (Sign.SOFT, Sign.IMPLICIT))
 _filtered, _ideal = (partial(mackunis.control_law, ideal=ideal) for ideal in (False, True))
 _l1, _l1_ff = (_fixed(l1.CONTROL_LAWS[feedforward]) for feedforward in (False, True))
-_model, _wind = "A, B, f", "A, B, f, wind, lags, noise"
+_model = "A, B, f"
+_wind = "A, B, f, wind, lags, noise"
 
 FULL_STATE: dict[str, tuple[str, Callable[..., ControlLaw], Callable[[Gains, NominalModel], Any], tuple[str, ...]]] = {
     "di": ("dynamic inversion", inversion.control_law, inversion.inversion_params, ("K",)),

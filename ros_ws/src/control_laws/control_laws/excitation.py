@@ -114,7 +114,9 @@ class ExcitationConfig(ControllerConfig):
         nyquist = self.rate / 2.0
         for i, name in enumerate(self.inputs):
             low, high = ((limit or (np.inf,) * len(self.inputs))[i] for limit in (self.lower, self.upper))
-            room, slowest, fastest = min(abs(low), abs(high)), self.lowest[i], self.highest[i]
+            room = min(abs(low), abs(high))
+            slowest = self.lowest[i]
+            fastest = self.highest[i]
             require(self.amplitude[i] <= room, f"amplitude[{i}]", self.amplitude[i], f"at most {room:g}, the limits of {name}")
             require(slowest <= fastest, f"lowest[{i}]", slowest, f"at most highest[{i}] = {fastest:g} Hz")
             require(fastest < nyquist, f"highest[{i}]", fastest, f"below half the rate of the law, {nyquist:g} Hz")

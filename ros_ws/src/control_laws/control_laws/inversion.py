@@ -34,8 +34,10 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     The integral is a trapezoid with conditional integration (anti-windup). Source: B. L. Stevens, F. L. Lewis, E. N. Johnson,
     "Aircraft Control and Simulation", 5.8.
     """
-    drift, gravity = model.C @ model.A, model.C @ model.gravity
-    Omega, inverse = model.Omega, model.inverse
+    drift = model.C @ model.A
+    gravity = model.C @ model.gravity
+    Omega = model.Omega
+    inverse = model.inverse
 
     def limited(
         state: ErrorIntegral, measured: Measurements, dt: Array, params: InversionParams, limits: Limits

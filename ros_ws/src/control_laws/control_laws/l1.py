@@ -62,7 +62,8 @@ def _control_law(*, feedforward: bool) -> ControlLaw:
         state: L1State, measured: Measurements, dt: Array, params: L1Params, limits: Limits
     ) -> tuple[L1State, Array, Array]:
         xp = array_namespace(measured.y)
-        e, error = measured.y - measured.y_m, state.y_before + dt * state.y_dot_u - measured.y
+        e = measured.y - measured.y_m
+        error = state.y_before + dt * state.y_dot_u - measured.y
         a = ADAPTATION_POLE + xp.zeros_like(params.K)
         sigma_hat = -a * xp.exp(-a * dt) / filter_gain(a, dt) * error
         u_r = measured.u_trim if feedforward else measured.u_trim + params.inverse @ measured.y_m_dot

@@ -78,13 +78,17 @@ def design(model: NominalModel, fade: float) -> tuple[FloatArray, FloatArray, Fl
     motion = np.zeros((n + 3 * m, n + 3 * m))
     x, y_m, w, integral = np.split(np.arange(n + 3 * m), [n, n + m, n + 2 * m])
     motion[np.ix_(x, x)] = free * (model.A + model.gravity) - LEAK * np.diag(model.kinematic)
-    motion[y_m, y_m], motion[y_m, w], motion[w, w] = -LEAK, 1.0, -fade
+    motion[y_m, y_m] = -LEAK
+    motion[y_m, w] = 1.0
+    motion[w, w] = -fade
     motion[np.ix_(integral, x)] = model.C
     motion[integral, y_m] = -1.0
     drive = np.vstack([free * model.B, np.zeros((3 * m, m))])
     F, G = zero_order_hold(motion, drive, model.period)
     E = np.zeros((2 * m, n + 3 * m))
-    E[:m, x], E[np.arange(m), y_m], E[np.arange(m, 2 * m), integral] = model.C, -1.0, 1.0
+    E[:m, x] = model.C
+    E[np.arange(m), y_m] = -1.0
+    E[np.arange(m, 2 * m), integral] = 1.0
     return F, G, E
 
 

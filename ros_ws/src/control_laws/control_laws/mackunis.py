@@ -42,7 +42,8 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
     a filtered difference, e_dot += (1 - exp(-bandwidth dt)) ((e - e_p) / dt - e_dot).
     Source: W. MacKunis, P. M. Patre, M. K. Kaiser, W. E. Dixon, IEEE TCST 18(6), 2010, with the matrices of this module.
     """
-    Omega, inverse = model.Omega, model.inverse
+    Omega = model.Omega
+    inverse = model.inverse
 
     def engage(measured: Measurements, params: MacKunisParams) -> MacKunisState:
         e = measured.y - measured.y_m
@@ -59,7 +60,8 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         unit = xp.ones_like(e)
         Pi_step = dt * params.beta * xp.minimum(xp.maximum(r / params.eps, -unit), unit)
         increment = dt * (e + state.e) / 2.0
-        integral_e, Pi = state.integral_e + increment, state.Pi + Pi_step
+        integral_e = state.integral_e + increment
+        Pi = state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
         u_free = measured.u_trim + inverse @ nu
         u, beyond = saturate(u_free, measured, dt, limits)
@@ -76,6 +78,7 @@ def mackunis_params(gains: dict[str, FloatArray], model: NominalModel) -> MacKun
 
     eps = beta / K softening: inside eps the sign adds K / softening to K.
     """
-    K, beta = gains["K"], gains["beta"]
+    K = gains["K"]
+    beta = gains["beta"]
     eps = beta / K * gains["softening"]
     return MacKunisParams(K, gains["Lambda"], beta, eps, gains.get("filter", 0.0) + 0.0 * K)

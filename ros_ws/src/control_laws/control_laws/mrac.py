@@ -37,11 +37,14 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
     Anti-windup: a saturated channel does not adapt. Source: E. Lavretsky, K. A. Wise, "Robust and Adaptive Control",
     ch. 9 to 11; P. A. Ioannou, P. V. Kokotovic, Automatica 20(5), 1984, for the leak.
     """
-    drift, gravity = model.C @ model.A, model.C @ model.gravity
-    inverse, size = model.inverse, model.size[:, None]
+    drift = model.C @ model.A
+    gravity = model.C @ model.gravity
+    inverse = model.inverse
+    size = model.size[:, None]
 
     def engage(measured: Measurements, params: MracParams) -> MracState:
-        xp, x = array_namespace(measured.y), state_of(measured)
+        xp = array_namespace(measured.y)
+        x = state_of(measured)
         return MracState(xp.zeros_like(measured.y[:, None, :] * xp.concat([x, x[:1]])[None, :, :]))
 
     def limited(

@@ -19,7 +19,9 @@ from flight_core.vectors import FloatArray
 from rise_di_controller.observer import ObserverParams
 from rise_di_controller.saturation import Limits
 
-PART, WITHIN, FADE = 0.6, 0.1, 1.0
+PART = 0.6
+WITHIN = 0.1
+FADE = 1.0
 """Bound of u_o as a part of the limits of u, the time from 0 to it, s, and the time of the fade-in, s: the defaults of
 `ObserverConfig`."""
 
@@ -30,7 +32,8 @@ def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: fl
     def last(matrices: FloatArray) -> FloatArray:
         return np.moveaxis(matrices, 0, -1) if matrices.ndim > 2 else matrices
 
-    lower, upper = part * model.lower[:, None], part * model.upper[:, None]
+    lower = part * model.lower[:, None]
+    upper = part * model.upper[:, None]
     limits = Limits(lower, upper, (upper - lower) / 2.0 / WITHIN)
     Phi, Gamma, H, L, F = (last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F))
     return ObserverParams(of_law, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))

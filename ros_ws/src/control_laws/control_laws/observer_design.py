@@ -87,9 +87,12 @@ def aircraft_model(model: NominalModel, names: Names, wind_time: FloatArray) -> 
     x, p, w, d = np.split(np.arange(n + m + G + m), [n, n + m, n + m + G])
     batch = np.broadcast_shapes(A.shape[:-2], model.B.shape[:-2], model.wind.shape[:-2], wind_time.shape[:-1])
     motion = np.zeros((*batch, n + m + G + m, n + m + G + m))
-    motion[..., x[:, None], x], motion[..., x[:, None], p], motion[..., x[:, None], w] = A, model.B, model.wind
+    motion[..., x[:, None], x] = A
+    motion[..., x[:, None], p] = model.B
+    motion[..., x[:, None], w] = model.wind
     motion[..., x[:, None], d] = model.C.T
-    motion[..., w, w], motion[..., d, d] = -1.0 / wind_time, -LEAK
+    motion[..., w, w] = -1.0 / wind_time
+    motion[..., d, d] = -LEAK
     groups = {"x": names.states, "position": names.inputs, "wind": names.winds, "disturbance": names.outputs}
     return _sampled(groups, motion, p, model.C, model)
 
@@ -106,8 +109,11 @@ def extended_state_model(model: NominalModel, names: Names, decay: FloatArray) -
     m = len(model.C)
     x, p, d, rate = np.split(np.arange(4 * m), 4)
     motion = np.zeros((*np.broadcast_shapes(model.Omega.shape[:-2], decay.shape[:-1]), 4 * m, 4 * m))
-    motion[..., x[:, None], p], motion[..., x, d], motion[..., d, rate] = model.Omega, 1.0, 1.0
-    motion[..., d, d], motion[..., rate, rate] = -LEAK, -decay
+    motion[..., x[:, None], p] = model.Omega
+    motion[..., x, d] = 1.0
+    motion[..., d, rate] = 1.0
+    motion[..., d, d] = -LEAK
+    motion[..., rate, rate] = -decay
     groups = {"x": names.outputs, "position": names.inputs, "disturbance": names.outputs, "disturbance_rate": names.outputs}
     return _sampled(groups, motion, p, np.eye(m), model)
 
@@ -117,8 +123,11 @@ def _sampled(
 ) -> ObserverModel:
     """A model in discrete time; the actuators' positions are the states p, the first states have the outputs C."""
     lag, (m, n) = np.maximum(model.lag, MIN_LAG), C.shape
-    drive, H = np.zeros((motion.shape[-1], m)), np.zeros((m, motion.shape[-1]))
-    motion[..., p, p], drive[p, np.arange(m)], H[:, :n] = -1.0 / lag, 1.0 / lag, C
+    drive = np.zeros((motion.shape[-1], m))
+    H = np.zeros((m, motion.shape[-1]))
+    motion[..., p, p] = -1.0 / lag
+    drive[p, np.arange(m)] = 1.0 / lag
+    H[:, :n] = C
     states = tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
     return ObserverModel(states, *zero_order_hold(motion, drive, model.period), H)
 
@@ -159,7 +168,8 @@ def vane_correction(
 
 def extended_state_observer(model: NominalModel, names: Names, weights: ExtendedStateWeights) -> ObserverDesign:
     """The observer over `extended_state_model`, with gains as in `aircraft_observer`."""
-    sampled, size = extended_state_model(model, names, weights.decay), model.C @ model.size
+    sampled = extended_state_model(model, names, weights.decay)
+    size = model.C @ model.size
     intensities = [0.0 * size, np.full(len(size), ACTUATOR_NOISE), weights.drift * size, weights.rate_drift * size]
     L = _correction(sampled, model, intensities)
     return ObserverDesign(*sampled, L, feedback_gain(sampled, model, weights.effort))

@@ -24,7 +24,8 @@ def riccati(F: FloatArray, G: FloatArray, Q: FloatArray, R: FloatArray) -> Float
     """
     batch = np.broadcast_shapes(*(matrix.shape[:-2] for matrix in (F, G, Q, R)))
     F, G, P, R = (np.broadcast_to(matrix, (*batch, *matrix.shape[-2:])) for matrix in (F, G, Q, R))
-    eye, transition = np.eye(F.shape[-1]), F
+    eye = np.eye(F.shape[-1])
+    transition = F
     gramian = G @ np.linalg.solve(R, transpose(G))
     for _ in range(MAX_DOUBLINGS):
         solved = np.linalg.solve(eye + gramian @ P, np.concatenate([transition, gramian], axis=-1))
@@ -81,7 +82,8 @@ def corrections_near(F: FloatArray, H: FloatArray, process: FloatArray, noise: F
     A = F[:1] @ kept
     for _ in range(MAX_DOUBLINGS):
         more = A @ change @ transpose(A)
-        change, A = change + more, A @ A
+        change = change + more
+        A = A @ A
         if np.all(np.abs(more) <= 1e-10 * np.max(np.abs(change), axis=(-1, -2), keepdims=True)):
             break
     S = S + change

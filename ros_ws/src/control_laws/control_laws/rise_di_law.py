@@ -14,7 +14,8 @@ def params_of(gains: dict[str, FloatArray], model: NominalModel) -> LawParams:
 
     eps = beta / K softening total_lag.
     """
-    K, beta = gains["K"], gains["beta"]
+    K = gains["K"]
+    beta = gains["beta"]
     eps = beta / K * gains["softening"] * model.total_lag[:, None] if "softening" in gains else np.ones_like(K)
     omega = gains.get("omega", 1.0) + 0.0 * K
     return LawParams(K, gains["Lambda"], beta, model.D[:, None], model.input_scale[:, None], omega, eps, sign=None)

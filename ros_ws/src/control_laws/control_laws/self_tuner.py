@@ -64,7 +64,8 @@ def control_law(model: NominalModel) -> ControlLaw:
     """
     m = len(model.D)
     size = (model.C @ model.size)[:, None]
-    unit, nominal = model.input_scale[:, None] * size, nominal_theta(model)[..., None]
+    unit = model.input_scale[:, None] * size
+    nominal = nominal_theta(model)[..., None]
     inverse_lag = 1.0 / np.maximum(model.total_lag - 1.5 * model.period, 1e-6)[:, None]  # the hold is in the difference
 
     def covariance(params: SelfTunerParams) -> Array:
@@ -74,7 +75,9 @@ def control_law(model: NominalModel) -> ControlLaw:
 
     def engage(measured: Measurements, params: SelfTunerParams) -> SelfTunerState:
         zero = array_namespace(measured.y).zeros_like(measured.y)
-        e, u, none = measured.y - measured.y_m, measured.u_before + zero, zero[None, :1, :]
+        e = measured.y - measured.y_m
+        u = measured.u_before + zero
+        none = zero[None, :1, :]
         return SelfTunerState(e, zero, u, u, measured.y, nominal + none, covariance(params) + none)
 
     def limited(
@@ -87,8 +90,10 @@ def control_law(model: NominalModel) -> ControlLaw:
         u_f = state.u_f + a * (u_late - state.u_f)
         y_dot = a * (measured.y - state.y_f) / dt / size
         phi = xp.concat([state.y_f / size, u_f / unit, xp.ones_like(e[:1])])
-        kept, P_0 = xp.exp(-dt / params.memory)[None, :, :], covariance(params)
-        theta, P = nominal + kept * (state.theta - nominal), P_0 + kept**2 * (state.P - P_0)
+        kept = xp.exp(-dt / params.memory)[None, :, :]
+        P_0 = covariance(params)
+        theta = nominal + kept * (state.theta - nominal)
+        P = P_0 + kept**2 * (state.P - P_0)
         P_phi = xp.sum(P * phi[None, :, :], axis=1)
         gain = dt * P_phi / (1.0 + dt * xp.sum(phi * P_phi, axis=0))
         theta = theta + (y_dot - xp.sum(theta * phi[None, :, :], axis=1))[:, None, :] * gain[None, :, :]
@@ -109,7 +114,8 @@ def control_law(model: NominalModel) -> ControlLaw:
 def nominal_theta(model: NominalModel) -> FloatArray:
     """[C A C', Omega, 0] in scaled units, 1/s, shape (m, 2 m + 1): sizes of y and inputs of abs(Omega_ii) = 1."""
     size = model.C @ model.size
-    drift, effect = model.C @ model.A @ model.C.T * size, model.Omega * (model.input_scale * size)
+    drift = model.C @ model.A @ model.C.T * size
+    effect = model.Omega * (model.input_scale * size)
     return np.concatenate([drift, effect, np.zeros((len(size), 1))], axis=1) / size[:, None]
 
 

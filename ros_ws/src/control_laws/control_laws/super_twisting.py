@@ -33,7 +33,8 @@ def control_law(model: NominalModel) -> ControlLaw:
     beta > L and root^2 > 2 (beta + L)^2 / (beta - L). Source: A. Levant, Int. J. Control 58(6), 1993; J. A. Moreno,
     M. Osorio, IEEE TAC 57(4), 2012; Y. Shtessel et al., "Sliding Mode Control and Observation", 4.3.
     """
-    Omega, inverse = model.Omega, model.inverse
+    Omega = model.Omega
+    inverse = model.inverse
 
     def engage(measured: Measurements, params: TwistingParams) -> TwistingState:
         return TwistingState(array_namespace(measured.y).zeros_like(measured.y))

@@ -35,7 +35,9 @@ MAX_DEVIATION = 0.15  # of the value of an entry that the flight shows: half of 
 LONGEST_INTERVAL = 1.0
 """s. A sample stands for no longer time: a longer interval is a gap of the log, over which no figure is taken."""
 
-TRUE_ERROR, MEASURED_ERROR = "true error", "measured error"  # names that `best_error` returns
+# names that `best_error` returns
+TRUE_ERROR = "true error"
+MEASURED_ERROR = "measured error"
 
 PARTS_LEGEND = (
     f"command: from an edge of a command to {SETTLING_DWELL:g} s after its end; gust: from the entry of a gust to"
@@ -145,7 +147,8 @@ def true_error(tape: Tape) -> Signal | None:
     """
     if "truth" not in tape:
         return None
-    truth, names = tape["truth"], _controlled(tape)
+    truth = tape["truth"]
+    names = _controlled(tape)
     states = [f"x.{name}" for name in names]
     if not set(states) <= set(truth.names):
         return None
@@ -161,12 +164,15 @@ def best_error(tape: Tape) -> tuple[str, Signal]:
 def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     if len(y.stamp_ns) == 0 or len(y_m.stamp_ns) == 0:
         return Signal(np.zeros(0, dtype=np.int64), y.names, np.zeros((0, len(y.names))))
-    first, end = np.searchsorted(y.stamp_ns, y_m.stamp_ns[0]), np.searchsorted(y.stamp_ns, y_m.stamp_ns[-1], side="right")
-    stamps, values = y.stamp_ns[first:end], y.values[first:end]
+    first = np.searchsorted(y.stamp_ns, y_m.stamp_ns[0])
+    end = np.searchsorted(y.stamp_ns, y_m.stamp_ns[-1], side="right")
+    stamps = y.stamp_ns[first:end]
+    values = y.values[first:end]
     if np.array_equal(stamps, y_m.stamp_ns):
         return Signal(stamps, y.names, values - _columns(y_m, y.names))
     # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
-    at, knots = (stamps - y_m.stamp_ns[0]).astype(float), (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
+    at = (stamps - y_m.stamp_ns[0]).astype(float)
+    knots = (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
     reference = np.stack([np.interp(at, knots, y_m[name]) for name in y.names]).T
     return Signal(stamps, y.names, values - reference)
 
@@ -208,7 +214,8 @@ def live_commands(tape: Tape) -> list[Transient]:
     """Changes of a live command, from `u_m`. Changes of a channel less than SETTLING_DWELL apart are a single transient."""
     if "u_m" not in tape:
         return []
-    t, u_m = tape.time("u_m"), tape["u_m"]
+    t = tape.time("u_m")
+    u_m = tape["u_m"]
     commands: list[Transient] = []
     attitude = () if "y_m" not in tape else set(u_m.names) - set(tape["y_m"].names)  # the attitude, which never rests
     for name in [name for name in u_m.names if name not in attitude]:
@@ -226,8 +233,10 @@ def guided_transients(tape: Tape) -> list[Transient]:
     """
     if "guidance" not in tape:
         return []
-    t, commands = tape.time("guidance"), tape["guidance"]
-    speed, turns = commands["V_c"], np.abs(commands["phi_c"]) > TURN_BANK
+    t = tape.time("guidance")
+    commands = tape["guidance"]
+    speed = commands["V_c"]
+    turns = np.abs(commands["phi_c"]) > TURN_BANK
     captures = np.abs(commands["climb_c"]) > speed * math.sin(CAPTURE_ANGLE)
     captures |= np.abs(commands["xtrack"]) > CAPTURE_TIME * speed
     captures |= np.diff(speed, prepend=speed[:1]) != 0.0
@@ -311,7 +320,9 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     if "learned" not in tape or "internals" not in tape:
         return []
     _, error = best_error(tape)
-    t, ticks, flown = (error.stamp_ns - tape.start_ns) / 1e9, tape.time("internals"), tape["internals"]["parameters"]
+    t = (error.stamp_ns - tape.start_ns) / 1e9
+    ticks = tape.time("internals")
+    flown = tape["internals"]["parameters"]
     changes = np.flatnonzero(np.diff(flown, prepend=np.nan) != 0.0)
     digests = list(dict.fromkeys(flown[changes].tolist()))
     engaged = tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)] == Mode.ENGAGED
@@ -326,7 +337,8 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
 
 def known_entries(learned: Signal) -> list[str]:
     """Entries of A and B in samples of `learned` whose least deviation is below MAX_DEVIATION of the value."""
-    values, deviations = learned.group("value"), learned.group("deviation")
+    values = learned.group("value")
+    deviations = learned.group("deviation")
     return [name for name in values.names if np.any(deviations[name] < MAX_DEVIATION * np.abs(values[name]))]
 
 
@@ -396,13 +408,16 @@ def settling_times(tape: Tape, transients: Sequence[Transient]) -> list[Settling
     turns and captures, whose commands move to the end.
     """
     _, error = best_error(tape)
-    t, bands = (error.stamp_ns - tape.start_ns) / 1e9, settling_bands(tape)
+    t = (error.stamp_ns - tape.start_ns) / 1e9
+    bands = settling_bands(tape)
     end = float(t[-1]) if len(t) else 0.0
     results = []
     judged = [transient for transient in transients if transient.start <= end and transient.kind not in {"turn", "capture"}]
     for transient in sorted(judged, key=attrgetter("start")):
-        start, leaves = transient.start, transient.stop + SETTLING_DWELL - transient.start
-        until, times = {}, {}
+        start = transient.start
+        leaves = transient.stop + SETTLING_DWELL - transient.start
+        until = {}
+        times = {}
         for name in filter(transient.excites, error.names):
             until[name] = min([later.start for later in transients if later.excites(name) and later.start > start] + [end])
             inside = (t >= start) & ((t < until[name]) | (until[name] == end))
@@ -420,8 +435,10 @@ def inputs_by_part(
     """
     if topic not in tape:
         return {}
-    u, t = tape[topic], tape.time(topic)
-    masks, times = part_masks(t, transients, settle), sample_times(u.stamp_ns)
+    u = tape[topic]
+    t = tape.time(topic)
+    masks = part_masks(t, transients, settle)
+    times = sample_times(u.stamp_ns)
 
     def metrics(values: FloatArray, mask: NDArray[np.bool_]) -> InputMetrics:
         steps = mask[1:]

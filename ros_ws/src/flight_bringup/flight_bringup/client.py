@@ -47,7 +47,8 @@ class FlightGearClient(Client):
 
     def __init__(self, namespace: str) -> None:
         super().__init__("flightgear", namespace, rosout=False)
-        self._pose, self._decoder = PolledSubscription(self._node, POSE, NEWEST_SAMPLES, raw=True), NamedDecoder()
+        self._pose = PolledSubscription(self._node, POSE, NEWEST_SAMPLES, raw=True)
+        self._decoder = NamedDecoder()
         self._newest: dict[str, float] = {}
 
     def wait(self) -> None:
@@ -71,7 +72,8 @@ class FlightGearClient(Client):
         for received in self._pose.take():
             with suppress(ChannelError):
                 if channels := self._decoder.decode(received.message).channels:
-                    self._newest, came = channels, True
+                    self._newest = channels
+                    came = True
         return came
 
 

@@ -196,7 +196,8 @@ class _Flight:
 
     def end(self, outcome: str) -> None:
         """Stop the processes, in another thread: a recorder takes a while to close a log, and the fleet flies on."""
-        self.outcome, self.steps = outcome, None
+        self.outcome = outcome
+        self.steps = None
         self.progress(self.member.scenario.flight.duration if outcome == COMPLETED else 0.0, outcome)
         if self.processes is not None and self.stopping is None:
             self.processes.outcome = outcome
@@ -238,7 +239,8 @@ def fly_fleet(fleet: Fleet, runs: Sequence[Path], progress: Callable[[str, float
     with handle_signals(interrupt), ExitStack() as stack:
         try:
             for member, run in zip(fleet.members, runs, strict=True):
-                outputs, namespace = member.scenario.controller.outputs, absolute_namespace(member.name)
+                outputs = member.scenario.controller.outputs
+                namespace = absolute_namespace(member.name)
                 monitor = stack.enter_context(FlightMonitor(outputs, lockstep=fleet.lockstep, namespace=namespace))
                 flights.append(_Flight(member, run, monitor, partial(progress, member.name)))
             for flight in flights:

@@ -24,7 +24,9 @@ PACKET = struct.Struct(
 )
 KNOT = 1852.0 / 3600.0  # m/s, exact
 VISIBILITY = 20_000.0  # m
-ENGINES, RUNNING, WHEELS = 1, 2, 3
+ENGINES = 1
+RUNNING = 2
+WHEELS = 3
 
 
 def packet(pose: Mapping[str, float], origin: Origin, ground: float, seconds: int) -> bytes:

@@ -150,16 +150,20 @@ class _Span:
     """
 
     def __init__(self, scenario: Scenario, processes: FlightProcesses, monitor: "FlightMonitor", *, begins: bool) -> None:
-        self._duration, self._processes, self._monitor = scenario.flight.duration, processes, monitor
+        self._duration = scenario.flight.duration
+        self._processes = processes
+        self._monitor = monitor
         self._until = -math.inf  # s, flight time up to which the log holds y, y_m and u
         self._moved = 0.0 if begins else -math.inf  # s, flight time of the last change
-        self._flies, self._begins = not begins, begins
+        self._flies = not begins
+        self._begins = begins
         self.engaged = False  # the controller has published
 
     def outcome(self, t: float) -> str:
         """The outcome once the log holds the flight, or is not going to; empty before."""
         if (stamp := self._monitor.recorded()) is not None and stamp - self._processes.start_time > self._until:
-            self._until, self._moved = stamp - self._processes.start_time, t
+            self._until = stamp - self._processes.start_time
+            self._moved = t
         if t < self._duration:
             return ""
         if self._until >= self._duration - STAMP_ERROR:
@@ -188,8 +192,12 @@ def _follow_real_time(
     engaged_for: float,
     span: _Span,
 ) -> Steps:
-    units, outputs = display_units(scenario), scenario.controller.outputs
-    text, phase, why, announced = "starting", "", "", ""
+    units = display_units(scenario)
+    outputs = scenario.controller.outputs
+    text = "starting"
+    phase = ""
+    why = ""
+    announced = ""
     engaged_at = math.inf
     while True:
         _announce_learned(processes, monitor, processes.start_time, announce)
@@ -241,7 +249,9 @@ def _follow_lockstep(
 ) -> Steps:
     """The real-time factor counts from the first instant in the log. The flight ends with the last u, and a complete log."""
     end = scenario.flight.duration - 1.0 / scenario.aircraft.rate  # the last instant is the aircraft's last whole period
-    t, last_change, text = 0.0, time.monotonic(), "lockstep, starting"
+    t = 0.0
+    last_change = time.monotonic()
+    text = "lockstep, starting"
     timeout = SEARCH_TIMEOUT if scenario.learns() else STALL_TIMEOUT
     first: tuple[float, float] | None = None  # monotonic and flight time, s
     while t < end or not processes.is_completed():
@@ -249,7 +259,8 @@ def _follow_lockstep(
             return reason
         now = time.monotonic()
         if (recorded := monitor.recorded()) is not None:
-            t, last_change = recorded, now
+            t = recorded
+            last_change = now
             if first is None:
                 first = now, t
             else:

@@ -45,7 +45,9 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-POSE, WOULD_SEND, ENGAGEMENT = "pose", "bridge/would_send", "bridge/engagement"
+POSE = "pose"
+WOULD_SEND = "bridge/would_send"
+ENGAGEMENT = "bridge/engagement"
 
 GUIDANCE_VIEWS = ("odometry", "path", "markers", "guidance/imu", "guidance/fix", "guidance/wind")
 OF_LEARNING = ("proposal", "learned", "learning", "authority")  # of a learner, and of a controller that takes its models
@@ -105,7 +107,8 @@ def require_limits(autopilot: Autopilot, scenario: Scenario) -> None:
     if autopilot.dry_run:
         return
     channel_map = autopilot.channel_map
-    controller, key = scenario.controller, f"scenario {scenario.name}: controller"
+    controller = scenario.controller
+    key = f"scenario {scenario.name}: controller"
     found = controller.on_deactivate
     require(found == "trim", f"{key}.on_deactivate", repr(found), "'trim' with a bridge, which engages only from a u near trim")
     limits = controller.effector_limits()
@@ -167,7 +170,8 @@ def parameter_overrides(
     if spec is BRIDGE:
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
-    guidance, further = scenario.guidance, tuple[str, ...]()
+    guidance = scenario.guidance
+    further = tuple[str, ...]()
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
     if guidance is not None:

@@ -9,7 +9,8 @@ from flight_ros.startup import start_nodes
 
 def main() -> None:
     """Run them."""
-    guided, learns = "guidance" in sys.argv, "learner" in sys.argv
+    guided = "guidance" in sys.argv
+    learns = "learner" in sys.argv
     start_nodes(
         "aircraft_sim.node:AircraftNode",
         "reference_model.node:ReferenceModelNode",

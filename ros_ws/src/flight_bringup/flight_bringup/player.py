@@ -69,7 +69,8 @@ class Player(Client):
         begin_ns = begin_system_ns = first_ns = clock_ns = progress_ns = 0
         for due_ns, topic, message, stamped in messages:
             if begin_ns == 0:
-                begin_ns, begin_system_ns = time.monotonic_ns(), time.time_ns()
+                begin_ns = time.monotonic_ns()
+                begin_system_ns = time.time_ns()
                 first_ns = clock_ns = due_ns
             while clock_ns <= due_ns:
                 _sleep_until(begin_ns + round((clock_ns - first_ns) / rate))

@@ -102,12 +102,11 @@ class NodeProcess:
         if namespace:
             arguments += ["-r", f"__ns:={namespace}"]
         if node is ONE_PROCESS:  # `-p node:name` would mean a node without a namespace
-            sections, file = (
-                nest({name.replace(":", ".", 1): value for name, value in overrides.items()}),
-                log.with_suffix(".yaml"),
-            )
+            sections = nest({name.replace(":", ".", 1): value for name, value in overrides.items()})
+            file = log.with_suffix(".yaml")
             write_file(file, dump_yaml({f"/**/{name}": {"ros__parameters": values} for name, values in sections.items()}))
-            arguments, overrides = [*sections, *arguments, "--params-file", str(file)], {}
+            arguments = [*sections, *arguments, "--params-file", str(file)]
+            overrides = {}
         for name, value in overrides.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]  # JSON is YAML, and quotes what needs quotes
         self._log = log.open("x", encoding="utf-8")
@@ -160,14 +159,19 @@ class FlightProcesses:
         autopilot: Autopilot | None = None,
         namespace: str = "",
     ) -> None:
-        self._scenario, self._run, self._monitor, self._namespace = scenario, run, monitor, namespace
-        self._lockstep, self.autopilot = lockstep, autopilot
+        self._scenario = scenario
+        self._run = run
+        self._monitor = monitor
+        self._namespace = namespace
+        self._lockstep = lockstep
+        self.autopilot = autopilot
         self._first: tuple[NodeSpec, ...] = FIRST_STAGE
         self._second = second_stage(scenario, bridge=autopilot is not None)
         apart = (LEARNER,) if LEARNER in self._second and not lockstep else ()  # a search would delay ticks of its own process
         self._in_one_process = [spec.executable for spec in (*self._first, *self._second) if spec not in apart]
         if one_process:
-            self._first, self._second = (), (ONE_PROCESS, *apart)
+            self._first = ()
+            self._second = (ONE_PROCESS, *apart)
         self.processes: list[NodeProcess] = []
         self.outcome = INTERRUPTED  # what the log says of the flight
         self.start_time = math.inf  # system time of t = 0, s
@@ -321,7 +325,8 @@ class FlightProcesses:
 
 def _end(process: NodeProcess) -> str | None:
     """How a process has ended; None while it runs."""
-    name, status = process.node.executable, process.popen.poll()
+    name = process.node.executable
+    status = process.popen.poll()
     if status is None:
         return None
     process.finish()

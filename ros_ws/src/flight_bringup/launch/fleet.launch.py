@@ -35,7 +35,8 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _fly(context: LaunchContext) -> list[Action]:
-    file, duration = argument(context, "fleet"), argument(context, "duration")
+    file = argument(context, "fleet")
+    duration = argument(context, "duration")
     read_fleet(Path(file))  # a mistake in the file is one sentence, before anything starts
     end_with_launch(context)
 

@@ -85,7 +85,8 @@ def _fly(context: LaunchContext) -> list[Action]:
         return flight_node(spec, scenario, parameter_overrides(spec, scenario, run, start_time, lockstep=lockstep), run)
 
     def follow(lead: float, start_time: float) -> Sequence[Action]:
-        nodes, duration = second_stage(scenario), scenario.flight.duration
+        nodes = second_stage(scenario)
+        duration = scenario.flight.duration
         begins = not lockstep and scenario.controller.autostart and scenario.controller.start_active
         if lockstep:
             end: list[Action] = [on_state(context, AIRCRAFT, NodeState.COMPLETED, lambda: complete(run))]

@@ -84,7 +84,8 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _play(context: LaunchContext) -> list[Action]:
-    log, namespace = Path(argument(context, "run")), argument(context, "namespace")
+    log = Path(argument(context, "run"))
+    namespace = argument(context, "namespace")
     lockstep = argument(context, "lockstep") == "true"
     autopilot = find_autopilot(argument(context, "map"), dry_run=True) if argument(context, "map") else None
     nodes = [spec for spec in OPTIONAL if argument(context, spec.executable) == "true"] + [BRIDGE] * (autopilot is not None)

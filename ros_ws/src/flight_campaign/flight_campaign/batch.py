@@ -91,8 +91,10 @@ class Vehicle(NamedTuple):
 
 def vehicle(scenario: Scenario) -> Vehicle:
     """The shared properties of all aircraft of a scenario."""
-    plant, channels = scenario.aircraft.plant(), scenario.aircraft.channels()
-    aircraft, errors = plant.aircraft, scenario.aircraft.sensor_arrays()
+    plant = scenario.aircraft.plant()
+    channels = scenario.aircraft.channels()
+    aircraft = plant.aircraft
+    errors = scenario.aircraft.sensor_arrays()
     order = [list(channels.outputs).index(name) for name in scenario.controller.outputs]
     quantum = None if errors.quantum is None else errors.quantum[order]
     guard = scenario.controller.guard()
@@ -117,7 +119,8 @@ def shared(params: Any) -> Any:
 
 def with_equipment(vehicle: Vehicle, scenario: Scenario, values: Mapping[str, FloatArray]) -> Vehicle:
     """The vehicle with the lags and the noise of N aircraft, by name as from `equipment.drawn`."""
-    channels, aircraft = scenario.aircraft.channels(), scenario.aircraft
+    channels = scenario.aircraft.channels()
+    aircraft = scenario.aircraft
     if any(name.startswith("lag[") for name in values):
         lag = equipment.in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag)
         vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lag=_rows(lag)))
@@ -175,7 +178,8 @@ def assemble(
     def of_blocks(whole: FloatArray) -> tuple[Array, ...]:
         return tuple(_last(whole[:, block.rows][:, :, block.columns]) for block in blocks)
 
-    change, count = None, len(A)
+    change = None
+    count = len(A)
     if (drift := plant.drift) is not None:
         end = _matrices(A * drift.A, B * drift.B, directions * drift.wind, plant, course)
         moved, *others = (after - before for before, after in zip(begin, end, strict=True))
@@ -201,8 +205,10 @@ def _matrices(
     A: FloatArray, B: FloatArray, directions: FloatArray, plant: PlantParams, course: Course
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """tick, forced, rate and forced_rate of `Fleet`, the aircraft first."""
-    dt, aircraft = seconds(plant.step_ns), plant.aircraft
-    K, count = course.steps, len(A)
+    dt = seconds(plant.step_ns)
+    aircraft = plant.aircraft
+    K = course.steps
+    count = len(A)
     L = A + aircraft.gravity
     eye = np.broadcast_to(np.eye(A.shape[1]), A.shape)
     pairs = ((eye, 0.0 * eye), (0.0 * eye, eye))
@@ -234,7 +240,9 @@ def remainder_of(states: Array, aircraft: Aircraft) -> Array:
 
 def _reduced(aircraft: Aircraft) -> tuple[NDArray[np.int64], Aircraft]:
     """Indices of the states in the remainder, and the aircraft reduced to them and to `remainder_rows`."""
-    rows, coupling, kinematics = remainder_rows(aircraft), aircraft.coupling, aircraft.kinematics
+    rows = remainder_rows(aircraft)
+    coupling = aircraft.coupling
+    kinematics = aircraft.kinematics
     in_remainder = aircraft.gravity.any(axis=0)
     if coupling is not None:
         in_remainder[[*coupling.first, *coupling.second]] = True
@@ -276,7 +284,8 @@ def fly(
     `windows` has the ticks at which a window of the figures ends and the next begins.
     """
     timing = Timing(fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), windows)
-    arrays, segments = fleet._replace(blocks=()), jax.tree.map(jnp.asarray, course.segments)
+    arrays = fleet._replace(blocks=())
+    segments = jax.tree.map(jnp.asarray, course.segments)
     return _fly(arrays, vehicle, segments, params, course.period, mission, control_law=control_law, timing=timing)
 
 
@@ -334,7 +343,8 @@ def _fly(
         matrices = _at(segment.t, fleet)
         acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
         moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
-        u_trim, x_air = segment.u_ff[:, None] + 0.0 * y, x - fleet.wind * segment.air[:, None]
+        u_trim = segment.u_ff[:, None] + 0.0 * y
+        x_air = x - fleet.wind * segment.air[:, None]
         vane = vane_m = None
         if vehicle.vanes:
             vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
@@ -351,7 +361,9 @@ def _fly(
         return law, now.u, now.command
 
     def step(now: LoopState, segment: Segments, sample: Sample) -> tuple[Any, Array, Array]:
-        measured, limits, allocation = measure(now, segment, sample), vehicle.limits, vehicle.allocation
+        measured = measure(now, segment, sample)
+        limits = vehicle.limits
+        allocation = vehicle.allocation
         if allocation is None:
             law, _, u = control_law.limited(now.law, measured, segment.dt, params, limits)
             return law, u, u
@@ -394,7 +406,8 @@ def _sense(
     now: LoopState, segment: Segments, action: Array | None, window: Array, vehicle: Vehicle, mission: Mission | None
 ) -> tuple[LoopState, Sample]:
     """The sample of a tick for the law; guidance steps, and the figures take the true error."""
-    true, flown = now.x[vehicle.outputs], now.mission
+    true = now.x[vehicle.outputs]
+    flown = now.mission
     if mission is None:
         y_m, *reference = (values[:, None] for values in (segment.y_m, segment.sampled_y_m, segment.sampled_y_m_dot))
     else:
@@ -406,7 +419,8 @@ def _sense(
     if vehicle.quantum is not None:
         y = sensors.quantised(y, vehicle.quantum)
     arriving = jnp.concatenate([y[None], now.y_before])
-    y, y_before = arriving[-1], arriving[:-1]
+    y = arriving[-1]
+    y_before = arriving[:-1]
     if mission is not None:
         assert action is not None  # noqa: S101 - for the type checker: a mission has the actions of its guidance
         flown = missions.guide(flown, now.x, y, segment, action, mission)
@@ -424,7 +438,9 @@ def _advance(
     now: LoopState, command: Array, segment: Segments, fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing
 ) -> LoopState:
     """The state at the next tick, with the command of this one."""
-    blocks, u_late, flown = timing.blocks, timing.u_late, now.mission
+    blocks = timing.blocks
+    u_late = timing.u_late
+    flown = now.mission
     places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
     history = jnp.concatenate([command[None], now.command_before])
     acting = command if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
@@ -479,7 +495,10 @@ class Stepper:
     def __init__(
         self, fleet: Fleet, vehicle: Vehicle, course: Course, mission: Mission | None = None, windows: tuple[int, ...] = ()
     ) -> None:
-        self.ticks, self._course, self._mission, self._k = len(course.segments.t), course, mission, 0
+        self.ticks = len(course.segments.t)
+        self._course = course
+        self._mission = mission
+        self._k = 0
         self._timing = Timing(fleet.blocks, course.steps, course.late, int(np.max(np.asarray(fleet.late))), windows)
         self._fleet, self._vehicle, self._segments = jax.device_put((fleet._replace(blocks=()), vehicle, course.segments))
         self._windows = window_of(np.arange(self.ticks), windows)
@@ -552,8 +571,12 @@ def _at(t: Array, fleet: Fleet) -> Fleet:
 
 def _in_trim(fleet: Fleet, vehicle: Vehicle, mission: Mission | None, timing: Timing) -> LoopState:
     """The state of the closed loop before the first tick, without that of the law."""
-    n, count, m, p = len(fleet.forced), len(fleet.wind), len(vehicle.outputs), len(vehicle.inputs)
-    none, command = jnp.zeros((m, count)), jnp.zeros((p, count))
+    n = len(fleet.forced)
+    count = len(fleet.wind)
+    m = len(vehicle.outputs)
+    p = len(vehicle.inputs)
+    none = jnp.zeros((m, count))
+    command = jnp.zeros((p, count))
     return LoopState(
         jnp.zeros((n, count)),
         command,

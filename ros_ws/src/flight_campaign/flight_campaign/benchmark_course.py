@@ -66,7 +66,8 @@ def build_course(scenario: Scenario) -> Course:
     Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u by a part of a tick,
     dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
     """
-    aircraft, controller = scenario.aircraft, scenario.controller
+    aircraft = scenario.aircraft
+    controller = scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
     fixed = getattr(controller, "learn", None) is None
     require(fixed, "controller.learn", "a section", "none: only rise-di fly and rise-di campaign learn")
@@ -76,9 +77,12 @@ def build_course(scenario: Scenario) -> Course:
     )
     fixed = aircraft.over_airspeed is None
     require(fixed, "aircraft.over_airspeed", aircraft.over_airspeed, "none: the aircraft of a campaign keep their trim speed")
-    airframe, plant = aircraft.load()[0], aircraft.plant()
-    tick_ns, sample_ns = period_ns(controller.rate, "controller.rate"), period_ns(aircraft.rate, "aircraft.rate")
-    ticks, steps = nanoseconds(scenario.flight.duration) // tick_ns + 1, divide(tick_ns, plant.step_ns, "step", "a tick")
+    airframe = aircraft.load()[0]
+    plant = aircraft.plant()
+    tick_ns = period_ns(controller.rate, "controller.rate")
+    sample_ns = period_ns(aircraft.rate, "aircraft.rate")
+    ticks = nanoseconds(scenario.flight.duration) // tick_ns + 1
+    steps = divide(tick_ns, plant.step_ns, "step", "a tick")
     outputs = list(aircraft.channels().outputs)
     order = np.array([outputs.index(name) for name in controller.outputs])
 
@@ -90,7 +94,8 @@ def build_course(scenario: Scenario) -> Course:
     u_delay_ns = nanoseconds(aircraft.actuators.delay)
     u_late = divide(u_delay_ns, tick_ns, "actuators.delay", "a tick") if u_delay_ns else 0
     _require_plain_vanes(scenario, late)
-    error, drift = np.zeros((ticks, len(outputs))), sensors.initial_drift(errors)
+    error = np.zeros((ticks, len(outputs)))
+    drift = sensors.initial_drift(errors)
     noise, bias = np.zeros_like(error), 0.0 if errors.bias is None else errors.bias
     for k in range(ticks):
         error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
@@ -135,7 +140,8 @@ def build_course(scenario: Scenario) -> Course:
 
 
 def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[bool]) -> tuple[NDArray[np.int32], FloatArray]:
-    phase, dt = np.full(ticks, HOLD, dtype=np.int32), np.zeros(ticks)
+    phase = np.full(ticks, HOLD, dtype=np.int32)
+    dt = np.zeros(ticks)
     last: int | None = None
     for k in range(late, ticks):
         if not arrives[k - late]:
@@ -145,14 +151,17 @@ def _phases(ticks: int, late: int, period: float, max_age: float, arrives: list[
         else:
             gap = (k - last + late) * period
             require(gap <= max_age, "sensors.dropout", f"{gap:g} s without y", "less than max_age")
-            phase[k], dt[k] = STEP, min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
+            phase[k] = STEP
+            dt[k] = min(max((k - last) * period, DT_RANGE[0] * period), DT_RANGE[1] * period)
         last = k
     return phase, dt
 
 
 def _require_plain_vanes(scenario: Scenario, late: int) -> None:
     """Raise ParameterError for vanes beyond a campaign: late, frozen, with losses or steps."""
-    vanes, sensors_of, key = scenario.aircraft.vanes, scenario.aircraft.sensors, "aircraft.vanes"
+    vanes = scenario.aircraft.vanes
+    sensors_of = scenario.aircraft.sensors
+    key = "aircraft.vanes"
     if scenario.controller.vanes:
         require(not late, "sensors.delay", f"{sensors_of.delay:g} s beside vanes", "0: a campaign has no late vanes")
         plain = vanes.dropout == 0.0 and not np.isfinite(vanes.frozen_at).any() and not any(sensors_of.quantisation)
@@ -196,7 +205,8 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
         for part in forced
     )
     if (air := plant.turbulence) is not None:
-        turbulent, z = np.zeros_like(wind.over_step), turbulence.initial_state(air)
+        turbulent = np.zeros_like(wind.over_step)
+        z = turbulence.initial_state(air)
         normals = turbulence.normals(0, ticks * steps, air.seed)
         for k in range(ticks * steps):
             turbulent[k] = turbulence.wind(z, air)

@@ -25,7 +25,10 @@ from flight_design.gains import tuned_gains
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
 
-TUNED_IN, TUNED_FOR, TUNED_ON = "osprey_servo", "osprey", "gust_turbulence"  # the gains of a law of the comparison
+# the gains of a law of the comparison
+TUNED_IN = "osprey_servo"
+TUNED_FOR = "osprey"
+TUNED_ON = "gust_turbulence"
 FIXED = ("rate", "outputs", "inputs", "lower", "upper")  # keys of the frame that no law changes
 NOT_STATED = "not stated"
 
@@ -80,7 +83,8 @@ def entered(entry: BenchmarkEntry, task: Task) -> ControllerConfig | Step | None
     controller = AnyLaw.validate_mapping({**task.controller, **law}, f"{entry.name}: controller")
     given = AnyLaw.validate_mapping({**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name)
     for key in FIXED:
-        value, expected = getattr(controller, key), getattr(given, key)
+        value = getattr(controller, key)
+        expected = getattr(given, key)
         require(value == expected, f"{entry.name}: controller.{key}", value, f"{expected}, as every law of {task.set} has it")
     return controller
 
@@ -90,7 +94,8 @@ def stepped(step: Step, t: float, y: FloatArray, y_m: FloatArray, task: Task) ->
 
     Raises ParameterError for a function that raises, for a wrong shape, and for numbers that are not finite.
     """
-    where, expected = f"u in {task.set} at t = {t:g} s", f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
+    where = f"u in {task.set} at t = {t:g} s"
+    expected = f"{len(task.inputs)} finite numbers: {', '.join(task.inputs)}"
     try:
         u = step(t, y.copy(), y_m.copy())
     except Exception as error:
@@ -119,7 +124,8 @@ def find_entry(
         return BenchmarkEntry(name or first.replace(":", "."), sees or "y", knows or NOT_STATED, source, enter)
     if first in REGISTERED:
         require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
-        law, own = LAWS[first], _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
+        law = LAWS[first]
+        own = _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
         return BenchmarkEntry(name or first, sees or law.measurements, knows or law.model_data, *own)
     scenarios = [find(word) for word in words]
     by_airframe = {scenario.aircraft.airframe: scenario.controller for scenario in scenarios}

@@ -37,7 +37,9 @@ from rise_di_controller.params import ControllerConfig
 if TYPE_CHECKING:
     import polars as pl
 
-DEFINITION, CHUNKS, SCORES = "benchmark.json", "chunks", "scores.json"
+DEFINITION = "benchmark.json"
+CHUNKS = "chunks"
+SCORES = "scores.json"
 CHUNK = 50  # aircraft of a set that fly at once
 
 
@@ -73,7 +75,8 @@ class Definition(Config):
 
 def define(flights: "Flights", aircraft: int, stack: str) -> Definition:
     """The definition of a run. Raises ParameterError for an entry that flies no set."""
-    entry, not_flown = flights.entry, flights.not_flown()
+    entry = flights.entry
+    not_flown = flights.not_flown()
     flies = len(not_flown) < len(SETS)
     require(flies, entry.name, next(iter(not_flown.values()), ""), "an entry that flies one set at least")
     sets = flights.sets
@@ -93,7 +96,8 @@ class Benchmark:
     """A run of the benchmark and its folder. A folder with chunks of the same definition is continued."""
 
     def __init__(self, folder: Path, definition: Definition) -> None:
-        self.folder, self.definition = folder, definition
+        self.folder = folder
+        self.definition = definition
         path = folder / DEFINITION
         if is_file(path):
             same = path.read_text(encoding="utf-8") == definition.model_dump_json(indent=1)
@@ -152,7 +156,8 @@ class Flights:
     """The flights of an entry."""
 
     def __init__(self, entry: BenchmarkEntry, sets: Sets) -> None:
-        self.entry, self.sets = entry, sets
+        self.entry = entry
+        self.sets = sets
         self._prepared: dict[str, _Prepared] = {}
 
     def not_flown(self) -> dict[str, str]:
@@ -182,17 +187,21 @@ class Flights:
 
     def fly(self, job: Job, aircraft: int) -> bytes:
         """Fly a chunk of a benchmark of `aircraft`: its rows as Parquet."""
-        name, chunk = [*SETS][job[0]], job[1]
-        prepared, seed = self._prepared[name], seed_of(name, self.sets.release, "aircraft")
+        name = [*SETS][job[0]]
+        chunk = job[1]
+        prepared = self._prepared[name]
+        seed = seed_of(name, self.sets.release, "aircraft")
         if prepared.course is None:
             return encode(_fly_alone(self.entry, prepared), seed, 1.0)
-        first, size = chunk * CHUNK, min(CHUNK, SETS[name].aircraft(aircraft) - chunk * CHUNK)
+        first = chunk * CHUNK
+        size = min(CHUNK, SETS[name].aircraft(aircraft) - chunk * CHUNK)
         return encode(_fly_fleet(self.entry, prepared, seed, first, size), seed, 1.0)
 
 
 def _fly_fleet(entry: BenchmarkEntry, of: _Prepared, seed: int, first: int, size: int) -> Chunk:
     """Fly uncertain aircraft first, first + 1, ..., as in a campaign."""
-    scenario, course = of.scenario, of.course
+    scenario = of.scenario
+    course = of.course
     assert course is not None  # noqa: S101 - for the type checker
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
@@ -215,7 +224,8 @@ def _stepped(flights: Stepper, entry: BenchmarkEntry, of: _Prepared, size: int) 
     u = np.zeros((len(of.task.inputs), size))
     for _ in range(flights.ticks):
         y, y_m = flights.sense()
-        bounded, t = flights.bounded, flights.t
+        bounded = flights.bounded
+        t = flights.t
         for k, step in enumerate(steps):
             if bounded[k] and callable(step):
                 u[:, k] = stepped(step, t, y[:, k], y_m[:, k], of.task)
@@ -225,7 +235,8 @@ def _stepped(flights: Stepper, entry: BenchmarkEntry, of: _Prepared, size: int) 
 
 def _figures(result: FleetResult, of: _Prepared) -> dict[str, FloatArray]:
     """Figures by name, (N,) each, SI; the score of a window has the name "score.30-60"."""
-    outputs, inputs = of.task.outputs, of.task.inputs
+    outputs = of.task.outputs
+    inputs = of.task.inputs
     unit = score_units(outputs, of.scenario.aircraft.channels().outputs)
     if result.mission is None:
         figures = {"score": score(np.asarray(result.rms), unit)}
@@ -245,11 +256,15 @@ class _FunctionController(Controller):
 
     def __init__(self, parameters: ControllerConfig, step: Step, task: Task) -> None:
         super().__init__(parameters)
-        self._step, self._task, self.names = step, task, ()
+        self._step = step
+        self._task = task
+        self.names = ()
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
         """The u of the function."""
-        y, y_m, t = self._y[-1], self._y_m[-1], seconds(now_ns)
+        y = self._y[-1]
+        y_m = self._y_m[-1]
+        t = seconds(now_ns)
         u = stepped(self._step, t, y.value, y_m.value, self._task)
         inputs = TickInputs(y.stamp_ns, y.value, y_m.value, seconds(y_m.stamp_ns - y.stamp_ns), seconds(self.period_ns))
         return ControlOutput(y.stamp_ns, u, inputs, lambda: np.zeros(0))

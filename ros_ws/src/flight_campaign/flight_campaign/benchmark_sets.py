@@ -18,8 +18,12 @@ from flight_analysis.closed_loop.scenario import Scenario
 
 VERSION = 1
 UNCERTAINTY = 0.3  # of each entry of A and B
-RATE, STEP = 100.0, 0.005  # Hz of y, y_m and u; s of the integration, as in a comparison of laws
-DAMAGE, REPEAT = 60.0, 60.0  # s: when the inputs lose half of their effect; after which the commands begin again
+# Hz of y, y_m and u; s of the integration, as in a comparison of laws
+RATE = 100.0
+STEP = 0.005
+# s: when the inputs lose half of their effect; after which the commands begin again
+DAMAGE = 60.0
+REPEAT = 60.0
 DAMAGED = ("elevator", "aileron")
 RELEASE_LENGTH = 40  # hex digits of a commit
 
@@ -62,7 +66,9 @@ SETS: dict[str, FlightSet] = {
     "jsbsim_f16": FlightSet("f16 of JSBSim, a gust", "jsbsim_f16", fleet=False),
 }
 SCENARIOS = tuple(sorted({of.scenario for of in SETS.values()}))
-BEFORE, AFTER = "30-60", "90-120"  # windows of the damage with the same commands
+# windows of the damage with the same commands
+BEFORE = "30-60"
+AFTER = "90-120"
 
 
 def seed_of(name: str, release: str, what: str) -> int:
@@ -75,7 +81,8 @@ class Sets:
     """The sets of a run: the scenarios of the stack by name, and the hash that fresh seeds come from, "" for the fixed ones."""
 
     def __init__(self, scenarios: Mapping[str, Scenario], release: str = "") -> None:
-        self.release, self._scenarios = release, scenarios
+        self.release = release
+        self._scenarios = scenarios
 
     def scenario(self, name: str) -> Scenario:
         """The scenario of a set, with the gains of the stack."""

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from flight_campaign.batch import Vehicle
     from flight_campaign.missions import Mission
 
-DEFINITION, CHUNKS = "campaign.json", "chunks"
+DEFINITION = "campaign.json"
+CHUNKS = "chunks"
 OUT_OF_MEMORY = "RESOURCE_EXHAUSTED"  # in an error of JAX
 CHUNK = 1000  # aircraft computed at once; those that learn fly one by one, each a chunk
 MARGIN_AIRCRAFT = 200  # aircraft of a case, the first ones, whose margins are computed
@@ -119,7 +120,8 @@ class Definition(Config):
             "seed": self.seed,
             "number": number,
         }
-        entries, scenario = self.spread.entries, self.scenario(case)
+        entries = self.spread.entries
+        scenario = self.scenario(case)
         uncertainty |= {"entries": [*entries], "parts": [*entries.values()], "distribution": self.distribution}
         of_equipment = self.drawn_equipment(scenario, number, 1)
         equipped = equipment.with_equipment(scenario, {name: float(value[0]) for name, value in of_equipment.items()})
@@ -186,7 +188,8 @@ def define(
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
-    outputs, own = scenario.controller.outputs, dict(units or {})
+    outputs = scenario.controller.outputs
+    own = dict(units or {})
     for name, unit in own.items():
         require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
         require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
@@ -241,7 +244,9 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
-    first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
+    first = chunk * definition.chunk
+    count = definition.size(job)
+    part = definition.uncertainty
     scenario, course, vehicle, law, mission = _prepare(text, case)
     # The last chunk has the size of the others, so that nothing is compiled again; surplus aircraft are dropped.
     airframe = load_airframe(scenario.aircraft.airframe)
@@ -253,7 +258,8 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     vehicle = batch.with_equipment(vehicle, scenario, equipped)
     result = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))
-    outputs, inputs = scenario.controller.outputs, scenario.controller.effectors
+    outputs = scenario.controller.outputs
+    inputs = scenario.controller.effectors
     if result.mission is None:
         figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
     else:
@@ -267,7 +273,9 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
 def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chunk:
     """Fly a chunk of a campaign with learners, one aircraft after another."""
     case, chunk = job
-    first, count, part = chunk * definition.chunk, definition.size(job), definition.uncertainty
+    first = chunk * definition.chunk
+    count = definition.size(job)
+    part = definition.uncertainty
     scenario = definition.scenario(case)
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, part, part, definition.seed, first, count, definition.spread)
@@ -300,7 +308,8 @@ def _prepare(text: str, case: int) -> _Shared:
     from flight_campaign import batch, missions  # noqa: PLC0415 - as above
 
     scenario = Definition.model_validate_json(text).scenario(case)
-    law, course = scenario.controller.tuned_law(), build_course(scenario)
+    law = scenario.controller.tuned_law()
+    course = build_course(scenario)
     mission = None if scenario.guidance is None else missions.build(scenario, course)
     return _Shared(scenario, course, batch.vehicle(scenario), law._replace(params=batch.shared(law.params)), mission)
 
@@ -309,7 +318,8 @@ class Campaign:
     """A campaign and its folder."""
 
     def __init__(self, folder: Path, definition: Definition) -> None:
-        self.folder, self.definition = folder, definition
+        self.folder = folder
+        self.definition = definition
 
     @classmethod
     def begin(cls, folder: Path, definition: Definition) -> "Campaign":
@@ -364,7 +374,8 @@ class Campaign:
 
     def margins(self, case: int) -> LoopMargins | None:
         """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
-        of, scenario = self.definition, self.definition.scenario(case)
+        of = self.definition
+        scenario = self.definition.scenario(case)
         try:
             return margins(scenario, min(of.aircraft, MARGIN_AIRCRAFT), of.uncertainty, of.seed, of.spread)
         except ParameterError:
@@ -377,7 +388,8 @@ class Campaign:
         """Rank correlations of the drawn entries with the score of a case; `worst` is the number of its worst aircraft."""
         import polars as pl  # noqa: PLC0415 - as above
 
-        rows, airframe = self.rows(case), load_airframe(self.definition.scenario().aircraft.airframe)
+        rows = self.rows(case)
+        airframe = load_airframe(self.definition.scenario().aircraft.airframe)
         matrices = drawn_entries(airframe, airframe.matrix_a()[None], airframe.matrix_b()[None])
         published = {name: float(value[0]) for name, value in matrices.items()}
         published |= equipment.references(self.definition.scenario(), self.definition.entries)
@@ -388,7 +400,8 @@ class Campaign:
     def _read(self, job: Job) -> "pl.DataFrame":
         import polars as pl  # noqa: PLC0415 - as above
 
-        path, size = self._path(job), self.definition.size(job)
+        path = self._path(job)
+        size = self.definition.size(job)
         try:
             table = pl.read_parquet(path, glob=False)
         except pl.exceptions.PolarsError:

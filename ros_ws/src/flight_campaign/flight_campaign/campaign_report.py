@@ -86,7 +86,8 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
 
 def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, Any]]:
     """Write the scenarios of the worst aircraft; returns them with the command that flies each."""
-    definition, again = campaign.definition, []
+    definition = campaign.definition
+    again = []
     for aircraft in tally.worst[:RERUN]:
         path = _path(campaign, case, str(aircraft.number))
         write_file(path, scenario_yaml(definition.aircraft_scenario(aircraft.number, case)))
@@ -96,11 +97,13 @@ def _write_worst(campaign: Campaign, case: int, tally: Tally) -> list[dict[str, 
 
 def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
     """Rank correlations of a case; writes the airframe and the scenario of the worst corner where there is one."""
-    definition, ranked = campaign.definition, campaign.influence(case, tally.worst[0].number)
+    definition = campaign.definition
+    ranked = campaign.influence(case, tally.worst[0].number)
     corner = {of["entry"]: of["worst_corner"] for of in ranked["entries"] if of["worst_corner"]}
     if not corner:
         return ranked | {"command": None}
-    scenario, path = definition.scenario(case), _path(campaign, case, "corner")
+    scenario = definition.scenario(case)
+    path = _path(campaign, case, "corner")
     airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
     known = equipment.references(scenario, definition.entries)
     of_equipment = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
@@ -168,7 +171,8 @@ def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence
     """Scores, lost aircraft and margins, a column for each case."""
     columns = []
     for tally, of_loop in zip(tallies, margins, strict=True):
-        score, lost = tally.figures.get("score", Figure()), tally.lost + tally.diverged
+        score = tally.figures.get("score", Figure())
+        lost = tally.lost + tally.diverged
         worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
         columns.append([f"{score.mean:.3g}", worst, f"{100.0 * lost / max(tally.flights, 1):.3g}", *least_margins(of_loop)])
     names = ("score, mean", "score, worst", "lost or diverged, %", *LEAST_MARGINS)
@@ -303,7 +307,8 @@ def _density(figure: Figure) -> tuple[FloatArray, FloatArray]:
     if not figure.count:
         return np.zeros(0), np.zeros(0)
     places = np.array(list(figure.bins)) // COARSE
-    first, last = int(places.min()) - 1, int(places.max()) + 1
+    first = int(places.min()) - 1
+    last = int(places.max()) + 1
     counts = np.zeros(last - first + 1)
     np.add.at(counts, places - first, list(figure.bins.values()))
     exponents = (np.arange(first, last + 1) + 0.5) * COARSE

@@ -12,7 +12,8 @@ from typing import Any
 
 from flight_core.parameters import ParameterError
 
-CONNECT, RECONNECT = 10.0, 60.0
+CONNECT = 10.0
+RECONNECT = 60.0
 """s to wait for a scheduler at the start, and after its loss."""
 
 LOST_WORKER_TIMEOUT = {"distributed.deploy.lost-worker-timeout": "10 minutes"}
@@ -60,7 +61,9 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
         from distributed import CancelledError, Client, KilledWorker, as_completed  # noqa: PLC0415 - half a second
         from distributed.comm import CommClosedError  # noqa: PLC0415 - as above
 
-        waiting, count, patience = iter(jobs), workers or os.cpu_count() or 1, CONNECT
+        waiting = iter(jobs)
+        count = workers or os.cpu_count() or 1
+        patience = CONNECT
         for part in ("", ".client", ".nanny", ".scheduler", ".worker"):  # they log the loss of a peer as tracebacks
             logging.getLogger(f"distributed{part}").setLevel(logging.CRITICAL)
         lost: list[Job] = []
@@ -90,7 +93,8 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                             done.add(more)
                         yield job, result
                 except (CancelledError, CommClosedError):
-                    lost, patience = list(underway.values()), RECONNECT
+                    lost = list(underway.values())
+                    patience = RECONNECT
                 except KilledWorker as error:
                     found = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
                     raise ParameterError(f"--engine dask: found {found}, expected a smaller --chunk") from None

@@ -34,7 +34,8 @@ def of_matrices(entries: Mapping[str, float]) -> dict[str, float]:
 
 def published(scenario: Scenario) -> dict[str, float]:
     """The lags above 0 and the noise above 0 of a scenario by name, SI."""
-    aircraft, channels = scenario.aircraft, scenario.aircraft.channels()
+    aircraft = scenario.aircraft
+    channels = scenario.aircraft.channels()
     named = (("lag", channels.inputs, aircraft.actuators.lag), ("noise", channels.outputs, aircraft.sensors.noise))
     return {
         f"{kind}[{name}]": value
@@ -49,7 +50,8 @@ def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, floa
 
     Raises ParameterError for an unknown entry.
     """
-    known, every = published(scenario), dict[str, float]()
+    known = published(scenario)
+    every = dict[str, float]()
     for name, part in entries.items():
         if name == DELAY:
             rate = scenario.controller.rate
@@ -73,7 +75,8 @@ def drawn(scenario: Scenario, spread: Spread, seed: int, first: int, count: int)
     A lag and a noise are multiplied by 1 + d, as an entry of A. A delay is (1 + d) / 2 of the largest one, in whole periods. A
     value depends on seed and number alone. The entries of `spread` are those of `expanded`.
     """
-    known, rate = published(scenario), scenario.controller.rate
+    known = published(scenario)
+    rate = scenario.controller.rate
     uniform = random_streams.uniform(first, count, len(known) + 1, random_streams.EQUIPMENT, seed)
     d = deviations(uniform, spread.distribution)
     values = {
@@ -99,7 +102,9 @@ def in_order(values: Mapping[str, Any], kind: str, names: tuple[str, ...], other
 
 def with_equipment(scenario: Scenario, values: Mapping[str, float]) -> Scenario:
     """The scenario with lags, noise and a further delay of u by name."""
-    aircraft, channels, changes = scenario.aircraft, scenario.aircraft.channels(), {}
+    aircraft = scenario.aircraft
+    channels = scenario.aircraft.channels()
+    changes = {}
     delay = aircraft.actuators.delay + values.get(DELAY, 0.0)
     if any(name.startswith("lag[") or name == DELAY for name in values):
         lag = in_order(values, "lag", tuple(channels.inputs), aircraft.actuators.lag) if aircraft.actuators.lag else []

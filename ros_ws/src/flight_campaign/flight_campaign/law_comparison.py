@@ -70,7 +70,8 @@ def compare(
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
     A, B = (np.concatenate([sampled[0][k], *(level[k][1:] for level in sampled[1:])]) for k in range(2))
     in_time = np.arange(len(A))
-    parts, first = np.split(in_time[1:], len(levels)), in_time[1 : 1 + aircraft]
+    parts = np.split(in_time[1:], len(levels))
+    first = in_time[1 : 1 + aircraft]
     of = np.concatenate([in_time, np.tile(first, len(delays))])
     late = np.concatenate([0 * in_time, np.repeat(np.array(delays, dtype=int), aircraft)])
     flights = {

@@ -55,7 +55,8 @@ def fly(scenario: Scenario, learner: MakeLearner) -> Flight:
     """Fly a scenario that learns. Raises ParameterError."""
     events: list[Event] = []
     tape = simulate(scenario, learn=learner(scenario), announce=events.append)
-    true, outputs = true_error(tape), scenario.controller.outputs
+    true = true_error(tape)
+    outputs = scenario.controller.outputs
     assert true is not None  # noqa: S101 - simulated flights have the truth
     at_ticks = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0
     errors = {name: error_metrics(true[name][at_ticks]) for name in outputs}
@@ -66,6 +67,7 @@ def fly(scenario: Scenario, learner: MakeLearner) -> Flight:
 
 def require_flyable(scenario: Scenario) -> None:
     """Raise ParameterError for a scenario with a learner that a campaign cannot fly."""
-    aircraft, route = scenario.aircraft, scenario.guidance
+    aircraft = scenario.aircraft
+    route = scenario.guidance
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: a campaign draws their entries")
     require(route is None, "guidance", "a section beside controller.learn", "none: the aircraft of a mission do not learn")

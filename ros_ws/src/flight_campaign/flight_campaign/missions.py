@@ -118,7 +118,9 @@ class MissionState(NamedTuple):
 
 def require_mission(scenario: Scenario) -> GuidanceConfig:
     """The section `guidance` of a scenario. Raises ParameterError for a guidance beyond a campaign of missions."""
-    guidance, aircraft, reference = scenario.guidance, scenario.aircraft, scenario.reference_model
+    guidance = scenario.guidance
+    aircraft = scenario.aircraft
+    reference = scenario.reference_model
     if guidance is None or guidance.route is None:
         expected = "a route, whose cross-track error is the score of a campaign of missions"
         raise ParameterError(f"guidance.route: found none, expected {expected}")
@@ -139,8 +141,11 @@ def build(scenario: Scenario, course: Course) -> Mission:
 
     Raises ParameterError as `require_mission`, and for a rate of guidance that does not meet the ticks.
     """
-    guidance, aircraft, reference = require_mission(scenario), scenario.aircraft, scenario.reference_model
-    params, names = guidance.params(), scenario.controller.outputs
+    guidance = require_mission(scenario)
+    aircraft = scenario.aircraft
+    reference = scenario.reference_model
+    params = guidance.params()
+    names = scenario.controller.outputs
     tick_ns = period_ns(scenario.controller.rate, "controller.rate")
     every = divide(params.period_ns, tick_ns, "controller.rate", "a period of guidance")
 
@@ -154,9 +159,12 @@ def build(scenario: Scenario, course: Course) -> Mission:
     matrices = reference.model()
     stepper = model.stepper(seconds(reference_ns), matrices)
     n, m = matrices.B_m.shape
-    Phi, Gamma, held = np.eye(n), np.zeros((n, m)), stepper.Gamma @ np.tile(np.eye(m), (3, 1))
+    Phi = np.eye(n)
+    Gamma = np.zeros((n, m))
+    held = stepper.Gamma @ np.tile(np.eye(m), (3, 1))
     for _ in range(divide(tick_ns, reference_ns, "reference_model.rate", "a tick")):
-        Phi, Gamma = stepper.Phi @ Phi, stepper.Phi @ Gamma + held
+        Phi = stepper.Phi @ Phi
+        Gamma = stepper.Phi @ Gamma + held
     order = [reference.outputs.index(name) for name in names]
     route = guidance.plan(guidance.waypoints())
     loiters = any(path.is_orbit(leg) for leg in route.legs[:-1])
@@ -214,7 +222,8 @@ def legs_of(route: Route) -> Legs:
 def initial_state(count: int, late: int, mission: Mission) -> MissionState:
     """N aircraft in trim, heading north, y `late` ticks old."""
     n, m = mission.Gamma.shape
-    none, zeros = jnp.zeros(count), jnp.zeros((m, count))
+    none = jnp.zeros(count)
+    zeros = jnp.zeros((m, count))
     velocity = jnp.zeros((3, count)).at[0].set(mission.speed)
     return MissionState(
         jnp.zeros((n, count)),
@@ -359,7 +368,8 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
 
 def _profile(leg: Legs, pose: dict[str, Array]) -> tuple[Array, Array]:
     """Altitude, m, and climb rate, m/s, of a leg at the nearest point, as `Route.profile`."""
-    north, east = jnp.cos(leg.end_course), jnp.sin(leg.end_course)
+    north = jnp.cos(leg.end_course)
+    east = jnp.sin(leg.end_course)
     to_go = north * (leg.end[0] - pose["north"]) + east * (leg.end[1] - pose["east"])
     length = jnp.hypot(leg.end[0] - leg.start[0], leg.end[1] - leg.start[1])
     climb = leg.slope * (pose["v_north"] * north + pose["v_east"] * east)
@@ -369,7 +379,8 @@ def _profile(leg: Legs, pose: dict[str, Array]) -> tuple[Array, Array]:
 def advance(state: MissionState, x: Array, mission: Mission) -> MissionState:
     """The state a tick later, from x then: reference model, and pose by the trapezoidal rule."""
     V, alpha, beta, phi, theta, q, r = _states(x, mission)
-    half, psi_dot = mission.period / 2.0, heading_rate(phi, theta, q, r)
+    half = mission.period / 2.0
+    psi_dot = heading_rate(phi, theta, q, r)
     psi = state.psi + half * (state.psi_dot + psi_dot)
     velocity = jnp.stack(pose_model.velocity(mission.speed + V, alpha, beta, phi, theta, psi))
     return state._replace(

@@ -29,7 +29,8 @@ def encode(chunk: Chunk, seed: int, factor: float) -> bytes:
     """The table of a chunk as Parquet (zstd), SI; figures of a diverged aircraft, and NaN, are null."""
     import polars as pl  # noqa: PLC0415
 
-    count, stream = len(chunk.diverged), io.BytesIO()
+    count = len(chunk.diverged)
+    stream = io.BytesIO()
     diverged = pl.Series("diverged", chunk.diverged.astype(bool))
     table = pl.DataFrame(
         {

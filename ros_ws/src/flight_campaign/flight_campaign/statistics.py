@@ -15,7 +15,8 @@ from flight_core.parameters import Config, require
 from flight_core.units import ANGULAR_RATE, SPEED, quantity
 from flight_core.vectors import FloatArray
 
-PER_DECADE, DECADES = 100, (-8, 6)
+PER_DECADE = 100
+DECADES = (-8, 6)
 """Bins of the histograms: 2.3 % wide, from 1e-8 to 1e6 in SI, the range of all errors of a flight."""
 
 EDGES = 10.0 ** (np.arange(DECADES[0] * PER_DECADE, DECADES[1] * PER_DECADE + 1) / PER_DECADE)
@@ -49,8 +50,10 @@ class Figure(Config):
         if not len(values):
             return cls()
         places, counts = np.unique(np.searchsorted(EDGES, values, side="right") - 1, return_counts=True)
-        mean, bins = float(np.mean(values)), dict(zip(places.tolist(), counts.tolist(), strict=True))
-        squares, largest = float(np.sum((values - mean) ** 2)), float(np.max(values))
+        mean = float(np.mean(values))
+        bins = dict(zip(places.tolist(), counts.tolist(), strict=True))
+        squares = float(np.sum((values - mean) ** 2))
+        largest = float(np.max(values))
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
     def __add__(self, other: Self) -> Self:
@@ -74,12 +77,14 @@ class Figure(Config):
 
     def quantile(self, share: float) -> float:
         """The upper bound of a share of the flights, to the width of a bin (2.3 %)."""
-        wanted, below = share * self.count, 0
+        wanted = share * self.count
+        below = 0
         for place, number in self.bins.items():
             if below + number >= wanted:
                 if place < 0:
                     return 0.0
-                low, high = EDGES[place], EDGES[min(place + 1, len(EDGES) - 1)]
+                low = EDGES[place]
+                high = EDGES[min(place + 1, len(EDGES) - 1)]
                 return min(float(low * (high / low) ** ((wanted - below) / number)), self.largest)
             below += number
         return self.largest
@@ -104,7 +109,8 @@ class Tally(Config):
     @classmethod
     def of(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
         """Of the aircraft first, first + 1, ...; every figure of shape (N,), the "score" included."""
-        bounded, score = ~np.asarray(diverged, dtype=bool), np.asarray(figures["score"])
+        bounded = ~np.asarray(diverged, dtype=bool)
+        score = np.asarray(figures["score"])
         rank = np.where(bounded, score, np.inf)
         order = np.argsort(-rank, kind="stable")[:WORST_KEPT]
         return cls(

@@ -55,7 +55,8 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
     Topics have no delay, as in the benchmark. Raises ParameterError for a law that no scenario flies.
     """
     require_registered(name)
-    model, base = benchmark.model, benchmark.scenario.controller
+    model = benchmark.model
+    base = benchmark.scenario.controller
     kept = set(ControllerConfig.model_fields) - {"law", "feedforward", "observer"}
     values = {key: value for key, value in base.model_dump(exclude_none=True).items() if key in kept}
     values |= {"law": REGISTERED[name], "input_scale": model.input_scale.tolist(), "D": [int(sign) for sign in model.D]}
@@ -104,7 +105,8 @@ def _feedforward(name: str, benchmark: Benchmark) -> FeedforwardConfig | None:
 
 def _observer(name: str, tuned: TuningResult, benchmark: Benchmark) -> ObserverConfig:
     """The observer of a law, with its bound of u_o; the margin is that of the search, so none is required of it."""
-    controller, airframe = benchmark.scenario.controller, benchmark.scenario.aircraft.load()[0]
+    controller = benchmark.scenario.controller
+    airframe = benchmark.scenario.aircraft.load()[0]
     integrators = LAWS[name].feedforward == INTEGRATORS
     states, axes = (controller.outputs, ()) if integrators else (tuple(airframe.states), tuple(airframe.gusts))
     design = DESIGNS[name](as_gains(tuned), benchmark.model, Names(states, controller.inputs, controller.outputs, axes))

@@ -34,7 +34,8 @@ from rise_di_controller.linear_loop import Loop
 ACTIVITY_UNIT = {"deg": np.deg2rad(60.0), "rad": np.deg2rad(60.0), "%": 6.0, "1": 6.0}
 """rad/s and 1/s by the unit of an input: mean abs(u_dot) that costs as much as one unit of error. 60 deg/s and 600 %/s."""
 
-GUST, TURBULENCE = "gust", "turbulence"
+GUST = "gust"
+TURBULENCE = "turbulence"
 """The winds of a benchmark: that of its scenario, and turbulence in its place."""
 
 TUNING_TURBULENCE_SEED = 40  # of the turbulence in a cost; a comparison flies another one
@@ -60,13 +61,18 @@ OBJECTIVES = {
     ),
 }
 
-UNCERTAIN_AIRCRAFT, UNCERTAINTY, UNCERTAINTY_SEED = 12, 0.4, 40
+UNCERTAIN_AIRCRAFT = 12
+UNCERTAINTY = 0.4
+UNCERTAINTY_SEED = 40
 """Number, +-fraction and seed of the uncertain aircraft. Campaigns and comparisons use other seeds by default."""
 
 DELAY_TICKS = 2
 """Delay of u in the late flights of a cost: 20 ms at 100 Hz. Without actuators it is one tick: the loop's lag is 15 ms."""
 
-POPULATION, GENERATIONS, GENERATIONS_PER_GAIN, INITIAL_SIGMA = 16, 88, 6, 0.4
+POPULATION = 16
+GENERATIONS = 88
+GENERATIONS_PER_GAIN = 6
+INITIAL_SIGMA = 0.4
 """A search has GENERATIONS, or GENERATIONS_PER_GAIN times its gains if that is more: from 15 gains on. INITIAL_SIGMA is the
 first standard deviation of log(gain)."""
 
@@ -107,7 +113,8 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
     air = turbulence_of(scenario) | {"seed": turbulence_seed}
     turbulent = with_model.vary(aircraft={"gusts": {}, "turbulence": air})
     rows, columns = law_order(airframe, controller)
-    actuators, m = scenario.aircraft.actuators, len(controller.inputs)
+    actuators = scenario.aircraft.actuators
+    m = len(controller.inputs)
 
     def in_law_order(limits: Iterable[float], default: float) -> FloatArray:
         values = list(limits) or [default] * m
@@ -190,7 +197,8 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
     delayed = aircraft if objective.all_late else aircraft[:1]
-    of, counts = np.concatenate([aircraft, delayed]), [len(A), len(delayed)]
+    of = np.concatenate([aircraft, delayed])
+    counts = [len(A), len(delayed)]
     late = np.repeat([0, objective.delay * benchmark.delay], counts)
     share = np.repeat([1.0 / count for count in counts], counts)
     return [
@@ -240,7 +248,8 @@ def tune(
     import cma  # noqa: PLC0415 - it imports matplotlib, which nothing here uses
 
     begin = initial_gains(law, benchmark.model)
-    origin, ends = np.log(np.concatenate(list(begin.values()))[:, 0]), np.cumsum([len(gain) for gain in begin.values()])[:-1]
+    origin = np.log(np.concatenate(list(begin.values()))[:, 0])
+    ends = np.cumsum([len(gain) for gain in begin.values()])[:-1]
 
     def gains_of(vectors: FloatArray) -> Gains:
         """Gains by name, shape (size, N), of logarithms (N, d)."""
@@ -251,7 +260,9 @@ def tune(
         evaluation._replace(fleet=repeat_flights(evaluation.fleet, together))
         for evaluation in evaluations(objective, benchmark)
     ]
-    each, control_law, of_one = len(flights[0].weight), law.control_law(benchmark.model), law.params(begin, benchmark.model)
+    each = len(flights[0].weight)
+    control_law = law.control_law(benchmark.model)
+    of_one = law.params(begin, benchmark.model)
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:
         """Costs of a part of the candidates in one wind, (together,)."""

@@ -71,7 +71,8 @@ def benchmark(
 
 
 def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: bool) -> None:
-    total, missing = run.definition.flights, run.missing()
+    total = run.definition.flights
+    missing = run.missing()
     done = total - sum(map(run.definition.size, missing))
     try:
         with progress_bar(*COUNT_COLUMNS, quiet=quiet) as bar:
@@ -85,7 +86,8 @@ def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: boo
 
 
 def _show(console: Console, scores: Mapping[str, Any]) -> None:
-    entry, seeds = scores["entry"], scores["benchmark"]["release"] or "fixed"
+    entry = scores["entry"]
+    seeds = scores["benchmark"]["release"] or "fixed"
     title = f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows {entry['knows']}"
     table = new_table(title, ("set", "flights", "score", "worst", "lost"), left=("set",), wrapped=("set",))
     for of in scores["sets"].values():

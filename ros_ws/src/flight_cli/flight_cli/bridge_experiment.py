@@ -108,7 +108,8 @@ def _excite(
     console: Console, channel_map: ChannelMap, map_name: str, speed: float | None, folder: Path, amplitude: float
 ) -> Path:
     """Fly the experiment; the folder of its run."""
-    airframe, scenario = folder / "experiment_airframe.yaml", folder / "experiment.yaml"
+    airframe = folder / "experiment_airframe.yaml"
+    scenario = folder / "experiment.yaml"
     planned = experiment(channel_map, speed, amplitude, str(airframe.resolve()))
     _write(folder, {airframe.stem: planned.airframe, scenario.stem: planned.scenario})
     chosen = load_scenario(scenario)
@@ -145,7 +146,8 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
         left=("input",),
     )
     for i, name in enumerate(controller.inputs):
-        width, band = controller.width[i], f"{controller.lowest[i]:g} to {controller.highest[i]:g}"
+        width = controller.width[i]
+        band = f"{controller.lowest[i]:g} to {controller.highest[i]:g}"
         table.add_row(
             name, f"{controller.amplitude[i]:.3g}", f"{2 * width:g}, {4 * width:g}", f"{controller.period[i]:g}", band
         )
@@ -167,7 +169,8 @@ def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, 
     """
     recorded = read_run(run)
     warn_of_lacks(recorded)
-    tape, flown = recorded.tape, recorded.engagements
+    tape = recorded.tape
+    flown = recorded.engagements
     if COMMANDS in tape:
         require_map_of_import(channel_map, recorded)
         recorded.require("y", "u")
@@ -233,7 +236,8 @@ def _show_models(console: Console, response: Response, models: list[ChannelModel
 
 
 def _show_gains(console: Console, found: Channels, response: Response, flyable: Flyable) -> None:
-    controller, params = flyable.controller, flyable.controller.law_params()
+    controller = flyable.controller
+    params = flyable.controller.law_params()
     table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"), left=("channel",))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         place = response.outputs.index(output)

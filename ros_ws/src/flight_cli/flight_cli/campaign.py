@@ -172,11 +172,14 @@ def _parse_sweep(text: str) -> Sweep:
 def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) -> float | None:
     """Fly the chunks that are missing; aircraft-seconds per second, None if none is."""
     definition = monte_carlo.definition
-    total, missing = definition.aircraft * definition.cases, monte_carlo.missing()
+    total = definition.aircraft * definition.cases
+    missing = monte_carlo.missing()
     there = total - sum(definition.size(job) for job in missing)
     if not missing:
         return None
-    seconds, begin, done = definition.scenario().flight.duration, time.monotonic(), 0
+    seconds = definition.scenario().flight.duration
+    begin = time.monotonic()
+    done = 0
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
             task = bar.add_task("aircraft", total=total, completed=there, shown="starting")

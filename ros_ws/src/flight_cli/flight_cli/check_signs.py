@@ -45,7 +45,8 @@ def check_signs(
         warn_of_lacks_in(bag, namespace)
     checked = check_scenario(channel_map, chosen, frame, bag, namespace)
     if as_json:
-        channels, sentences = [channel._asdict() for channel in checked.channels], list(checked.contradictions)
+        channels = [channel._asdict() for channel in checked.channels]
+        sentences = list(checked.contradictions)
         result = {"map": channel_map.name, "channels": channels, "seconds": checked.seconds, "contradictions": sentences}
         print_json(result)
     else:
@@ -78,7 +79,8 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
     headings = ("channel", "raw value", "topic")
     fields = new_table("", headings, left=headings)
     for channel in checked.channels:
-        given, taken = channel_map.inputs[channel.input], channel_map.outputs[channel.output]
+        given = channel_map.inputs[channel.input]
+        taken = channel_map.outputs[channel.output]
         fields.add_row(f"u.{channel.input}", _format_field(given), channel_map.messages[given.message].topic)
         fields.add_row(f"y.{channel.output}", _format_field(taken), taken.topic)
     console.print(fields)

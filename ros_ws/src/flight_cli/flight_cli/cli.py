@@ -19,7 +19,9 @@ from typing import Annotated
 
 import typer
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+FAILED = 1
+BAD_INPUT = 2
+INTERRUPTED = 130
 NICE = 10  # of a command that may run beside a flight
 GARBAGE_THRESHOLD = 100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores

@@ -192,7 +192,8 @@ def _tune(
 
 
 def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario) -> Table:
-    units, of = display_units(scenario), " / ".join
+    units = display_units(scenario)
+    of = " / ".join
     levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels))
     delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *found[0].lost_late))
     heads = (
@@ -227,7 +228,8 @@ def _format_margins(margins: Margins) -> str:
 
 def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], aims: Iterable[str]) -> str:
     """What the words of the table mean."""
-    units, controller = display_units(scenario), scenario.controller
+    units = display_units(scenario)
+    controller = scenario.controller
     errors = zip(controller.outputs, benchmark.unit.tolist(), strict=True)
     slews = zip(controller.inputs, benchmark.activity_unit.tolist(), strict=True)
     delay = 1e3 * benchmark.model.period * benchmark.delay

@@ -101,7 +101,8 @@ def _report(flown: Flown) -> _Result:
 def _show(name: str, flown: Sequence[Flown], results: Mapping[str, _Result]) -> None:
     """Print a line an aircraft, the folders of the runs, and what a busy host withheld."""
     headings = ("aircraft", "flown (s)", "ticks", "engaged", "outcome")
-    table, lines = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",)), []
+    table = new_table(f"Fleet {name}", headings, ("aircraft", "outcome"), ("outcome",))
+    lines = []
     for each in flown:
         summary, engaged = results[each.member.name]
         ticks = summary["ticks"]
@@ -124,7 +125,8 @@ def foreign_samples(summaries: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
     Empty without an account of processes.
     """
-    sentences, total = [], 0
+    sentences = []
+    total = 0
     for name, summary in summaries.items():
         processes = (summary["account"] or {}).get("processes", {})
         total += sum(process["samples"] for process in processes.values())

@@ -117,7 +117,8 @@ def gains(
             own_loop = all(value is None for value in loop.values())
             require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
             answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
-            answers, origin = {"scenario": answer}, ""
+            answers = {"scenario": answer}
+            origin = ""
         else:
             selection = select_gains(
                 airframe,
@@ -141,7 +142,8 @@ def gains(
                 mixing=mixing,
                 progress=status.update,
             )
-            engineering, origin = selection.engineering, selection.origin
+            engineering = selection.engineering
+            origin = selection.origin
             answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
@@ -181,8 +183,10 @@ def _require_margins(found: Assessment, accept: bool) -> None:
 
 def _show_trade(console: Console, selection: Selection) -> None:
     """The error of the linear loop along the manoeuvre against the phase margin."""
-    controller, frame = selection.chosen, selection.study.airframe
-    outputs, of_outputs = controller.outputs, frame.units_of_outputs()
+    controller = selection.chosen
+    frame = selection.study.airframe
+    outputs = controller.outputs
+    of_outputs = frame.units_of_outputs()
     shown = [display_unit(of_outputs[name]) for name in outputs]
     counted = all(quantity(unit).dimension in SCORE_UNIT for unit in of_outputs.values())  # no score of a height
     units = score_units(outputs, of_outputs) if counted else np.full(len(outputs), np.nan)
@@ -250,7 +254,8 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
     for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
         row = [f"{output} by {name}", f"{first.D[i]:+d}"]
         for answer in answers.values():
-            params, response = answer.controller.law_params(), gain_selection.response(answer.study, answer.controller)[i]
+            params = answer.controller.law_params()
+            response = gain_selection.response(answer.study, answer.controller)[i]
             row += [f"{params.K[i] * response:.4g}", f"{params.Lambda[i]:.3g}", f"{params.beta[i] * response:.4g}"]
         table.add_row(*row)
     return table

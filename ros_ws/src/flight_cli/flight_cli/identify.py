@@ -55,7 +55,8 @@ from flight_log.tape_reader import read_run
 from rise_di_controller.params import ControllerConfig
 
 CANNOT_FLY = 3
-REFLY_MARGIN, STEP_MARGIN = 0.03, 0.015  # s. Without A the model of the loop has no damping, and less margin than the aircraft.
+REFLY_MARGIN = 0.03  # s. Without A the model of the loop has no damping
+STEP_MARGIN = 0.015  # and less margin than the aircraft.
 LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is reported as not linear
 
 
@@ -248,7 +249,8 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
         raise ParameterError(f"{source.log}: found a log without its scenario, expected --scenario with the controller's lags")
     controller = recorded_parameters(recorded.scenario)
     actuation = _actuation(controller, nominal, controller.delay if source.delay is None else source.delay)
-    samples, console = recording(recorded.tape, nominal), Console(quiet=as_json)
+    samples = recording(recorded.tape, nominal)
+    console = Console(quiet=as_json)
     with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("search")
         show = partial(bar.update, task)
@@ -356,7 +358,8 @@ def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
 
 
 def _show(console: Console, found: IdentifiedAircraft) -> None:
-    trim, steps = found.trim, found.responses
+    trim = found.trim
+    steps = found.responses
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     console.print(
@@ -384,7 +387,8 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
         console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
 
     answer = found.selection.engineering
-    controller, params = answer.controller, answer.controller.law_params()
+    controller = answer.controller
+    params = answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
     table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings, left=("channel",))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
@@ -426,7 +430,8 @@ def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
 
 
 def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    trim, steps = found.trim, found.responses
+    trim = found.trim
+    steps = found.responses
     by_input = {
         name: {
             "trim": float(trim.commands[j]),

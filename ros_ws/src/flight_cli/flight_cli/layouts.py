@@ -28,9 +28,11 @@ def layouts(
     require(fleet is None or scenario is None, "--fleet", "a scenario beside it", "one of the two")
     if fleet is None:
         chosen = find_scenario(scenario or "osprey_servo")
-        name, scenarios = chosen.name, {"": chosen}
+        name = chosen.name
+        scenarios = {"": chosen}
     else:
-        name, scenarios = fleet.stem, {member.name: member.scenario for member in read_fleet(fleet).members}
+        name = fleet.stem
+        scenarios = {member.name: member.scenario for member in read_fleet(fleet).members}
     aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
     files = {f"{name}.foxglove.json": foxglove(aircraft), f"{name}.plotjuggler.xml": plotjuggler(aircraft)}
     if guided := [namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None]:

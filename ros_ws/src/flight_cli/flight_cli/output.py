@@ -38,14 +38,17 @@ from flight_analysis.report.summary import (
 from flight_core.files import write_file, writing
 from flight_core.parameters import ParameterError
 
-ENDED_EARLY, INTERRUPTED = 3, 130  # exit statuses; bad input is 2 (`flight_cli.cli`)
+# exit statuses; bad input is 2 (`flight_cli.cli`)
+ENDED_EARLY = 3
+INTERRUPTED = 130
 LICENCE = "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"  # of a written file
 LATEST = Path("runs/latest")  # the run of a command that is given none
 
 
 def show_flight(console: Console, flight: RecordedFlight) -> None:
     """Print the tables of a flight."""
-    summary, units = flight.summary, flight.units
+    summary = flight.summary
+    units = flight.units
     if flight.scenario is None:
         _show_imported(console, flight)
         return

@@ -81,7 +81,8 @@ def replay(
 
 
 def _show_guidance(guided: GuidanceReplay) -> None:
-    first, of = guided.first, f"guidance: {guided.checked} of {guided.steps} steps checked"
+    first = guided.first
+    of = f"guidance: {guided.checked} of {guided.steps} steps checked"
     if first is None:
         print(f"{of}, every bit equal")
     else:
@@ -121,7 +122,8 @@ def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:
 
 def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], ticks: int, *, open_loop: bool) -> None:
     console = Console(soft_wrap=True, highlight=False)
-    first, checked = result.first(), int(result.whole.sum())
+    first = result.first()
+    checked = int(result.whole.sum())
     of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
     if first is None:
         console.print(
@@ -146,7 +148,8 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
 
 def _count_by_group(result: ReplayResult) -> dict[str, int]:
     """Number of ticks in which each group of channels differs."""
-    different, groups = result.different(), [name.split(".")[0] for name in result.names]
+    different = result.different()
+    groups = [name.split(".")[0] for name in result.names]
     ticks = {group: different[:, np.array(groups) == group].any(axis=1) for group in groups}
     counts = Counter({group: int(differs.sum()) for group, differs in ticks.items()})
     return {name: count for name, count in counts.most_common() if count}
@@ -155,7 +158,8 @@ def _count_by_group(result: ReplayResult) -> dict[str, int]:
 def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[str, float]]:
     """Difference of u by input, in its unit: rms, largest, its time, and the rms of the recorded u; NaN without a u."""
     known = np.isfinite(result.computed).all(axis=1)
-    recorded, computed = result.group(result.recorded[known], "u"), result.group(result.computed[known], "u")
+    recorded = result.group(result.recorded[known], "u")
+    computed = result.group(result.computed[known], "u")
     figures = {}
     for name in inputs:
         difference = computed[name] - recorded[name]

@@ -10,13 +10,20 @@ import os
 import struct
 from pathlib import Path
 
-CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000
-CREATE_RULESET, ADD_RULE, RESTRICT_SELF = 444, 445, 446  # system calls, the same numbers on every architecture
-PATH_BENEATH, VERSION_FLAG = 1, 1
+CLONE_NEWUSER = 0x10000000
+CLONE_NEWNET = 0x40000000
+# system calls, the same numbers on every architecture
+CREATE_RULESET = 444
+ADD_RULE = 445
+RESTRICT_SELF = 446
+PATH_BENEATH = 1
+VERSION_FLAG = 1
 NO_NEW_PRIVS = 38  # of prctl(2)
-WRITE_FILE, TRUNCATE = 1 << 1, 1 << 14
+WRITE_FILE = 1 << 1
+TRUNCATE = 1 << 14
 CHANGES = WRITE_FILE | sum(1 << bit for bit in range(4, 13))  # write a file; remove and make files, folders, links, sockets
-REFER_VERSION, TRUNCATE_VERSION = 2, 3  # of landlock, with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
+REFER_VERSION = 2  # of landlock
+TRUNCATE_VERSION = 3  # with LANDLOCK_ACCESS_FS_REFER and _TRUNCATE
 REFER = 1 << 13
 
 _LIBC = ctypes.CDLL(None, use_errno=True)

@@ -218,7 +218,8 @@ SIMPLE: Mapping[Any, Callable[..., Kind]] = MappingProxyType(
 
 def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> Kind:
     """Values permitted by an annotation under rules, e.g. gt. Raises TypeError for an unknown annotation or rule."""
-    origin, parts = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    parts = get_args(annotation)
     if origin is Annotated:
         return kind_of(parts[0], {rule: limit for field in parts[1:] for rule, limit in field.rules.items()} | dict(rules))
     if origin in (Union, UnionType):
@@ -238,7 +239,9 @@ class FieldInfo:
     annotation: Any = None
 
     def __init__(self, default: Any, description: str, rules: Mapping[str, Any]) -> None:
-        self.default, self.description, self.rules = default, description, rules
+        self.default = default
+        self.description = description
+        self.rules = rules
 
     @cached_property
     def kind(self) -> Kind:

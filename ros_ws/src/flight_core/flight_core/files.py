@@ -25,7 +25,8 @@ from flight_core.text import printable
 # or for too deep nesting.
 NOT_YAML = (yaml.YAMLError, ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
-INT_TAG, FLOAT_TAG = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+INT_TAG = "tag:yaml.org,2002:int"
+FLOAT_TAG = "tag:yaml.org,2002:float"
 
 MAX_FILE_BYTES = 1 << 19
 """Bytes. A scenario has 4 kB, metadata.yaml of 500 topics less than this. PyYAML needs up to 0.2 kB and 5 us a byte."""

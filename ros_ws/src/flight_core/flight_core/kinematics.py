@@ -30,7 +30,8 @@ def heading_rate(phi: Scalar, theta: Scalar, q: Scalar, r: Scalar) -> Scalar:
 
 def turn_rate(phi: Scalar, theta: Scalar, theta_dot: Scalar, speed: Scalar) -> Scalar:
     """R of a coordinated turn: psi_dot cos(phi) cos(theta) - theta_dot sin(phi), psi_dot = g tan(phi) / V; speed V in m/s."""
-    xp, phi = array_namespace(phi), tilt(phi)
+    xp = array_namespace(phi)
+    phi = tilt(phi)
     return GRAVITY * xp.tan(phi) / speed * xp.cos(phi) * xp.cos(theta) - theta_dot * xp.sin(phi)
 
 
@@ -39,7 +40,8 @@ def body_rates(phi: Scalar, theta: Scalar, phi_dot: Scalar, theta_dot: Scalar, r
 
     q = (theta_dot + r sin(phi)) / cos(phi),  p = phi_dot - tan(theta) (q sin(phi) + r cos(phi))
     """  # noqa: D400, D415 - what follows is an equation
-    xp, phi = array_namespace(phi), tilt(phi)
+    xp = array_namespace(phi)
+    phi = tilt(phi)
     q = (theta_dot + r * xp.sin(phi)) / xp.cos(phi)
     return phi_dot - xp.tan(tilt(theta)) * (q * xp.sin(phi) + r * xp.cos(phi)), q
 

@@ -82,7 +82,8 @@ class Config:
     @classmethod
     def read(cls, values: Mapping[Any, Any], key: str, problems: Problems, *, check: bool = True) -> Self | None:
         """Build the set from a nested mapping; None, and a sentence in `problems`, for a value not permitted."""
-        before, content = len(problems.sentences()), {}
+        before = len(problems.sentences())
+        content = {}
         for name, field in cls.model_fields.items():
             if name in values:
                 content[name] = field.kind.read(values[name], f"{key}.{name}", problems)
@@ -174,7 +175,8 @@ class NodeConfig(Config):
         return frozenset()
 
 
-SMALLEST, LARGEST = 1e-9, 1e9
+SMALLEST = 1e-9
+LARGEST = 1e9
 """Bounds of a quantity in SI units. A value beyond is an error of units, and overflows in products and quotients of the law."""
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(gt=0, ge=SMALLEST, le=LARGEST)]

@@ -55,6 +55,8 @@ class PublisherLock:
 
     def refresh(self, sender: str, now_ns: int) -> bool:
         """Lock to the publisher of a valid sample. Returns whether the publisher has changed."""
-        changed, self.publisher, self._received_ns = sender != self.publisher, sender, now_ns
+        changed = sender != self.publisher
+        self.publisher = sender
+        self._received_ns = now_ns
         self._overrun_ns = 0
         return changed

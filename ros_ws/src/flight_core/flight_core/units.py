@@ -32,7 +32,10 @@ class Quantity(NamedTuple):
         return self[1:]
 
 
-ANGLE, LENGTH, SPEED, ANGULAR_RATE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 1, -1, 0), (1, 0, -1, 0)
+ANGLE = (1, 0, 0, 0)
+LENGTH = (0, 1, 0, 0)
+SPEED = (0, 1, -1, 0)
+ANGULAR_RATE = (1, 0, -1, 0)
 
 BASE_UNITS: Mapping[str, Quantity] = MappingProxyType(
     {

@@ -37,9 +37,18 @@ _NUMPY: Any = np if hasattr(np, "concat") else _NumPy1()
 class _Floats:
     """Elementary functions of the array API standard for Python floats."""
 
-    acos, asin, atan, atan2 = math.acos, math.asin, math.atan, math.atan2
-    sin, cos, tan, sqrt, hypot, copysign = math.sin, math.cos, math.tan, math.sqrt, math.hypot, math.copysign
-    minimum, maximum = min, max
+    acos = math.acos
+    asin = math.asin
+    atan = math.atan
+    atan2 = math.atan2
+    sin = math.sin
+    cos = math.cos
+    tan = math.tan
+    sqrt = math.sqrt
+    hypot = math.hypot
+    copysign = math.copysign
+    minimum = min
+    maximum = max
 
     @staticmethod
     def where(condition: bool, x1: float, x2: float) -> float:

@@ -71,5 +71,6 @@ def yaw_for_bank(phi_c: Scalar, phi: Scalar, speed: Scalar) -> Scalar:
 
     A yaw rolls an aircraft to the same side: the outer wing is faster, and the dihedral rolls away from the sideslip.
     """
-    xp, turn = array_namespace(phi), GRAVITY / speed
+    xp = array_namespace(phi)
+    turn = GRAVITY / speed
     return clip(turn * xp.tan(phi_c) + YAW_TO_BANK * (phi_c - phi), turn * math.tan(LARGEST_YAW))

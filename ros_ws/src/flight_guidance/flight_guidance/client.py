@@ -37,7 +37,8 @@ class GuidanceClient(Client):
 
     def __init__(self, name: str = "operator", namespace: str = "", parent: Client | None = None) -> None:
         super().__init__(name, namespace, parent)
-        self._guidance, self._decoder = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True), NamedDecoder()
+        self._guidance = PolledSubscription(self._node, GUIDANCE, NEWEST_SAMPLES, raw=True)
+        self._decoder = NamedDecoder()
         self._log = PolledSubscription(self._node, ROSOUT, RECORD_FOREIGN)
 
     def call(self, service: str) -> str:

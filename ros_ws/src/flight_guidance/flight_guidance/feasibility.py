@@ -64,7 +64,8 @@ def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Pe
     """
     _require_bounds(waypoints, can)
     flown = speeds(waypoints, can.speed)
-    least, slowest = 0.0, 0.0
+    least = 0.0
+    slowest = 0.0
     for speed in flown:
         bank = protection.bank_limit(can.bank, can.stall_speed, speed)
         least = max(least, least_radius(speed, can.wind, bank))
@@ -88,7 +89,8 @@ def _without_short_legs(
 
     Raises ShortLegError where none can go.
     """
-    kept, refusal = list(enumerate(waypoints)), None
+    kept = list(enumerate(waypoints))
+    refusal = None
     while True:
         try:
             legs = _legs([waypoint for _, waypoint in kept], radius, least)
@@ -124,7 +126,9 @@ def _with_circles(
     kept: Mapping[int, Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
 ) -> FlyableRoute:
     """The route with a circle for each change of altitude beyond the climb or sink along the leg; waypoints by number."""
-    numbers, waypoints, told = list(kept), list(kept.values()), list(notes)
+    numbers = list(kept)
+    waypoints = list(kept.values())
+    told = list(notes)
     while True:
         legs = _legs(waypoints, radius, least)
         lines: dict[int, float] = {}
@@ -132,7 +136,8 @@ def _with_circles(
             if isinstance(leg, Line):
                 lines[number] = path.length(leg)
         for k, length in lines.items():
-            before, at = waypoints[k - 1], waypoints[k]
+            before = waypoints[k - 1]
+            at = waypoints[k]
             change = at.altitude - before.departure
             rate = can.climb if change > 0.0 else can.sink
             reach = rate * length / ((at.speed or can.speed) + can.wind)

@@ -74,7 +74,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     axes = (1,) * np.ndim(motion.phi)
     turns = [(side, share) for side in (1.0, -1.0) for share in SHARES]
     side, share = (column.reshape(-1, 1, *axes) for column in np.array(turns).T)
-    aim, turn = side * motion.bank, share * GRAVITY / motion.speed
+    aim = side * motion.bank
+    turn = share * GRAVITY / motion.speed
     rolled = motion.lag + abs(aim - motion.phi) / motion.roll_rate
     longest = motion.lag + 2.0 * motion.bank / motion.roll_rate + 1.95 * math.pi / (turn * xp.tan(motion.bank))
     t = np.linspace(0.0, 1.0, POINTS).reshape(-1, *axes) * longest
@@ -83,7 +84,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     chi = motion.heading + _integral(turn * xp.tan(phi), longest)
     v_north = motion.speed * xp.cos(chi) + motion.wind[0]
     v_east = motion.speed * xp.sin(chi) + motion.wind[1]
-    north, east = motion.north + _integral(v_north, longest), motion.east + _integral(v_east, longest)
+    north = motion.north + _integral(v_north, longest)
+    east = motion.east + _integral(v_east, longest)
     remaining = _remaining(side, _bearing(ways(fence), fence, north, east), xp.atan2(v_east, v_north))
     homeward = (remaining < HOMEWARD) & (t > rolled)
     after = xp.cumsum(homeward, axis=1) - homeward > 0
@@ -109,7 +111,11 @@ class Escape(NamedTuple):
     course: Any  # rad, over ground: of the way home
 
 
-RIGHT, LEFT, HOME, BACK, AROUND = 1.0, -1.0, 2.0, 3.0, 4.0
+RIGHT = 1.0
+LEFT = -1.0
+HOME = 2.0
+BACK = 3.0
+AROUND = 4.0
 """Actions of the fence; 0 is none.
 
 A turn to the right, to the left; the way home in a straight line; the way back from outside, the shortest way; the way home
@@ -127,10 +133,12 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     if isinstance(motion.phi, float):
         north, east, phi = map(np.float64, (motion.north, motion.east, motion.phi))
         motion = motion._replace(north=north, east=east, phi=phi)
-    xp, place = array_namespace(motion.phi), (motion.north, motion.east)
+    xp = array_namespace(motion.phi)
+    place = (motion.north, motion.east)
     v_north = motion.speed * xp.cos(motion.heading) + motion.wind[0]
     v_east = motion.speed * xp.sin(motion.heading) + motion.wind[1]
-    course, margin = xp.atan2(v_east, v_north), MARGIN * xp.hypot(v_north, v_east)
+    course = xp.atan2(v_east, v_north)
+    margin = MARGIN * xp.hypot(v_north, v_east)
     *aim, straight = ways(fence).aim(fence, *place)
     bearing = xp.atan2(aim[1] - place[1], aim[0] - place[0])
     now = clearance(fence.zones, *place)

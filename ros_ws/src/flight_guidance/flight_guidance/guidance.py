@@ -107,9 +107,11 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
     def group(prefix: str, keys: Sequence[str]) -> tuple[float, ...]:
         return tuple(logged[f"{prefix}.{key}"] for key in keys)
 
-    target, mask = Target(*group("target", TARGETS)), int(logged["given"])
+    target = Target(*group("target", TARGETS))
+    mask = int(logged["given"])
     given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
-    begin, age_ns = Begin(int(logged["begin"])), nanoseconds(logged["age.pose"])
+    begin = Begin(int(logged["begin"]))
+    age_ns = nanoseconds(logged["age.pose"])
     inputs = Inputs(
         t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given, Authority(*(logged[name] for name in LEARNED))
     )
@@ -148,7 +150,8 @@ class Guidance:
 
     def __init__(self, parameters: GuidanceConfig) -> None:
         self._params: GuidanceParams = parameters.params()
-        self.period_ns, self.names = self._params.period_ns, names(parameters.outputs)
+        self.period_ns = self._params.period_ns
+        self.names = names(parameters.outputs)
         waypoints = parameters.waypoints()
         self.route = parameters.plan(waypoints) if waypoints else None
         self._digest = digest(self.route)
@@ -158,7 +161,9 @@ class Guidance:
         self._given: dict[str, float] = {} if self.route is None else {"leg": 0.0}
         self._route_waits = self.route is not None  # no step has flown it yet
         self._state: GuidanceState | None = None
-        self._engaged, self._paused, self._begin = True, False, Begin.HOLD
+        self._engaged = True
+        self._paused = False
+        self._begin = Begin.HOLD
         self._notices = parameters.notices()
         self._waits_from_ns: int | None = None  # for a pose that is young enough
         self._operated_ns: int | None = None  # the instant of the operator's last message, or of the first step
@@ -181,7 +186,8 @@ class Guidance:
         Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond `modes.LARGEST`, and for
         a pose equal to the last in every value.
         """
-        last, newest = self._pose, self._newest(self._pose, sample, now_ns)
+        last = self._pose
+        newest = self._newest(self._pose, sample, now_ns)
         if last is not None and np.array_equal(last.value, newest.value):
             raise ChannelError("frozen", "pose: found every value as before, expected an aircraft that moves")
         self._pose = newest
@@ -217,14 +223,18 @@ class Guidance:
         While guidance is off, the route waits for the engagement. Commands before the route and not taken by a step yet are
         void, and so are the legs of the program.
         """
-        self.route, self._digest, self._given, self._route_waits = route, digest(route), {}, True
+        self.route = route
+        self._digest = digest(route)
+        self._given = {}
+        self._route_waits = True
         without = ((start, {name: value for name, value in step.items() if name != "leg"}) for start, step in self._program)
         self._program = deque((start, step) for start, step in without if step)
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
         """Know that an operator is there: the age of the link counts from the next step on."""
-        self._operated_ns, self._link_lost = None, False
+        self._operated_ns = None
+        self._link_lost = False
 
     def hold(self) -> bool:
         """Hold the heading, the altitude and the airspeed of now; False while guidance does not fly."""
@@ -243,7 +253,8 @@ class Guidance:
 
     def skip(self) -> bool:
         """Leave the waypoint ahead out and fly to the next waypoint; False while no route is flown, and on the last leg."""
-        state, route = self._state, self.route
+        state = self._state
+        route = self.route
         if self.mode is not Mode.ENGAGED or state is None or state.lateral is not Lateral.ROUTE or route is None:
             return False
         later = range(state.leg + 1, len(route.legs))
@@ -255,7 +266,8 @@ class Guidance:
 
     def resume(self) -> bool:
         """Fly the last leg again from the nearest point; False while the route is flown, and without a route."""
-        state, route = self._state, self.route
+        state = self._state
+        route = self.route
         if self.mode is not Mode.ENGAGED or state is None or state.lateral is Lateral.ROUTE or route is None:
             return False
         pose = self.pose()
@@ -298,10 +310,12 @@ class Guidance:
 
     def waits(self, now_ns: int) -> str:
         """Why there is no u_m, once guidance has waited for STALE_TIME for a pose that is young enough; else ""."""
-        since, pose = self._waits_from_ns, self._pose
+        since = self._waits_from_ns
+        pose = self._pose
         if since is None or pose is None or now_ns - since < nanoseconds(STALE_TIME):
             return ""
-        age, limit = seconds(now_ns - pose.stamp_ns), seconds(self._params.max_age_ns)
+        age = seconds(now_ns - pose.stamp_ns)
+        limit = seconds(self._params.max_age_ns)
         return f"no u_m: pose is {age:.2f} s old, guidance.max_age {limit:g} s"
 
     def _watch_link(self, now_ns: int) -> int:
@@ -322,7 +336,8 @@ class Guidance:
         """
         while self._program and self._program[0][0] <= t_ns:
             self.take_target(self._program.popleft()[1])
-        y, pose = self._y, self._pose
+        y = self._y
+        pose = self._pose
         flies = self._engaged and not self._paused
         if pose is None or y is None or now_ns - y.stamp_ns > self._params.max_age_ns or not flies:
             self._begin = max(self._begin, Begin.AGAIN)
@@ -333,10 +348,13 @@ class Guidance:
             return None
         self._waits_from_ns = None
         link_age_ns = self._watch_link(now_ns)
-        y_values, pose_values = tuple(y.value.tolist()), tuple(pose.value.tolist())
+        y_values = tuple(y.value.tolist())
+        pose_values = tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority)
         told = self.route.notes if self.route is not None and self._route_waits else ()
-        self._begin, self._given, self._route_waits = Begin.NO, {}, False
+        self._begin = Begin.NO
+        self._given = {}
+        self._route_waits = False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
         log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
         notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))

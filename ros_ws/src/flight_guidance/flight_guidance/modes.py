@@ -173,12 +173,15 @@ def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams
     if authority == Authority():
         return params
     dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
-    limits, attitude, vertical = params.limits, params.attitude, params.vertical
+    limits = params.limits
+    attitude = params.attitude
+    vertical = params.vertical
     climb, sink = reach.climb_rates(authority.down, authority.up, params.speed)
     vertical = vertical._replace(climb=min(vertical.climb, climb))
     if authority.down >= reach.LEAST:
         vertical = vertical._replace(sink=min(vertical.sink, sink))
-    rate, bank = attitude.roll_rate, min(limits.bank, reach.YAWED_BANK)
+    rate = attitude.roll_rate
+    bank = min(limits.bank, reach.YAWED_BANK)
     if "p" not in dead:
         rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
         bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
@@ -307,7 +310,8 @@ def read_target(
     for name, value in values.items():
         if abs(value) > LARGEST:
             raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
-    limits, vertical = params.limits, params.vertical
+    limits = params.limits
+    vertical = params.vertical
     for name, least, largest in (
         ("phi", -limits.bank, limits.bank),
         ("r", -(turn := GRAVITY * math.tan(limits.bank) / params.speed), turn),
@@ -320,7 +324,8 @@ def read_target(
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
             unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
             unit += "/s" * (name == "r")
-            found, expected = f"{values[name] * factor:.6g}", f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
+            found = f"{values[name] * factor:.6g}"
+            expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
             raise ChannelError("bounds", f"{what}.{name}: found {found}, expected {expected}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
@@ -433,7 +438,8 @@ def step(
     state = begin(state, inputs, params)
     dt = seconds(inputs.t_ns - state.t_ns)
     state = _with_attitude(state, inputs, dt, params)
-    pose, y = dict(zip(POSE, inputs.pose, strict=True)), dict(zip(params.outputs, inputs.y, strict=True))
+    pose = dict(zip(POSE, inputs.pose, strict=True))
+    y = dict(zip(params.outputs, inputs.y, strict=True))
     state, missed = _with_commands(state, inputs.given, pose, dt, route)
     state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
@@ -467,7 +473,9 @@ def command(
 
     The values may be arrays with an element per aircraft of a fleet; the modes hold for the whole fleet.
     """
-    speed, limits, flies = true_airspeed(y["V"], params), params.limits, state.mode is Mode.ENGAGED
+    speed = true_airspeed(y["V"], params)
+    limits = params.limits
+    flies = state.mode is Mode.ENGAGED
     if flies:
         alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
         turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
@@ -538,10 +546,12 @@ def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: Guid
         since = min(seconds(inputs.pose_age_ns), LONGEST_LEAD)
     else:
         lost = inputs.pose_age_ns > params.max_age_ns + params.hold_ns
-        state, since = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING), dt
+        state = state._replace(mode=Mode.POSE_LOST if lost else Mode.DEAD_RECKONING)
+        since = dt
     p, q, r = (inputs.y[params.outputs.index(name)] for name in ("p", "q", "r"))
     phi_dot, theta_dot = euler_rates(state.phi, state.theta, p, q, r)
-    phi, theta = state.phi + since * phi_dot, state.theta + since * theta_dot
+    phi = state.phi + since * phi_dot
+    theta = state.theta + since * theta_dot
     psi_dot = heading_rate(state.phi, state.theta, q, r)
     measured = pose["psi"] + since * psi_dot if state.mode is Mode.ENGAGED else None
     psi = heading_estimate(state.psi, measured, psi_dot, dt)
@@ -599,7 +609,8 @@ def _with_commands(
     A lateral command ends the leg: the command may come with a new route, and so with new legs. Returns further the distance
     from the end of a leg that ends here and is missed, m.
     """
-    missed, on_route = 0.0, state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & given.keys()
+    missed = 0.0
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & given.keys()
     if on_route and route is not None:
         state, missed = _along_route(state, pose, dt, route)
     if not given:
@@ -623,7 +634,9 @@ def _with_commands(
 
 def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route) -> tuple[GuidanceState, float]:
     """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and the distance missed by, m."""
-    position, leg, near = (pose["north"], pose["east"]), route.legs[state.leg], route.near(state.leg)
+    position = (pose["north"], pose["east"])
+    leg = route.legs[state.leg]
+    near = route.near(state.leg)
     if state.joining:
         at, course = route.start(state.leg, state.target.along)
         if path.joined(at, course, near, position, _over_ground(pose)[0]):
@@ -671,7 +684,8 @@ def _on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | 
     flies = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and state.vertical is Vertical.PROFILE
     if not flies or route is None:
         return state
-    leg, climb = route.legs[state.leg], 0.0
+    leg = route.legs[state.leg]
+    climb = 0.0
     if state.joining or (path.is_orbit(leg) and leg.end is not None and not state.loitered):
         altitude = route.joining_altitude(state.leg, state.target.along)
     else:
@@ -684,7 +698,8 @@ def _on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | 
 
 def _joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route) -> GuidanceState:
     """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg where the point is near."""
-    state, flown = _on_leg(state, leg, route), route.legs[leg]
+    state = _on_leg(state, leg, route)
+    flown = route.legs[leg]
     if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
         return state
     at, course = route.start(leg, along)
@@ -704,7 +719,9 @@ def _bank(
     nowhere = PathError(0.0, 0.0, 0.0)
     if state.mode is not Mode.ENGAGED:
         return 0.0, nowhere, 0.0
-    target, gamma, over_ground = state.target, path_angle(pose["climb"], speed), _over_ground(pose)
+    target = state.target
+    gamma = path_angle(pose["climb"], speed)
+    over_ground = _over_ground(pose)
     if state.lateral is Lateral.PHI:
         return target.phi, nowhere, 0.0
     if state.lateral is Lateral.HEADING:
@@ -712,7 +729,8 @@ def _bank(
     if state.lateral is Lateral.COURSE:
         return bank_for(course_acceleration(target.course, *over_ground, params.k_chi), gamma, STEEPEST), nowhere, 0.0
     leg: Leg = Arc((target.north, target.east), target.radius)
-    following, position = None, (pose["north"], pose["east"])
+    following = None
+    position = (pose["north"], pose["east"])
     if state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         if state.joining:
@@ -741,7 +759,8 @@ def _joins(at: Point, course: Scalar, near: Scalar, flown: Scalar, position: Poi
 
 def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
     """Course, rad, and speed over ground, m/s, at least 1."""
-    v_north, v_east = pose["v_north"], pose["v_east"]
+    v_north = pose["v_north"]
+    v_east = pose["v_east"]
     xp = array_namespace(v_north)
     return xp.atan2(v_east, v_north), xp.maximum(xp.hypot(v_north, v_east), 1.0)
 
@@ -776,14 +795,16 @@ def _climb(
     """Commanded climb rate, m/s, and whether protection limits the rate."""
     if state.vertical is Vertical.THETA:
         return pose["climb"], False  # the start value for the modes CLIMB and ALTITUDE
-    vertical, target = params.vertical, state.target
+    vertical = params.vertical
+    target = state.target
     wanted = target.climb if state.vertical is Vertical.CLIMB else climb_for(target.altitude - pose["altitude"], vertical)
     if state.vertical is Vertical.PROFILE:
         wanted = wanted + target.climb
     least, largest = protection.climb_range(vertical.climb, vertical.sink, state.V_c - speed, params.speed)
     xp = array_namespace(speed)
     lower, upper = _climb_within(pose["altitude"], params)
-    least, largest = xp.maximum(least, lower), xp.minimum(largest, upper)
+    least = xp.maximum(least, lower)
+    largest = xp.minimum(largest, upper)
     fast = protection.sink_limit(vertical.climb, vertical.sink, speed, params.limits.largest_speed)
     least = xp.maximum(least, fast)
     largest = xp.minimum(largest, protection.climb_limit(vertical.climb, vertical.sink, speed, params.limits.floor))
@@ -797,7 +818,8 @@ def _is_bounded(limits: Limits) -> bool:
 
 def _climb_within(altitude: Scalar, params: GuidanceParams) -> tuple[Scalar, Scalar]:
     """Least and largest climb rate by the least and the largest altitude, m/s: those of `climb_for` to the bounds."""
-    vertical, limits = params.vertical, params.limits
+    vertical = params.vertical
+    limits = params.limits
     if not _is_bounded(limits):
         return -vertical.sink, vertical.climb
     return climb_for(limits.lowest - altitude, vertical), climb_for(limits.highest - altitude, vertical)

@@ -67,7 +67,8 @@ TFMessage: Any = resolve_name("tf2_msgs.msg:TFMessage") if find_spec("tf2_msgs")
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)  # as tf2_ros has it
 MAX_TARGETS = 16  # messages of target a tick; later messages wait, so that a storm delays no u_m
 MAX_ROUTE_SIZE = 65_536  # bytes, 900 waypoints: decoding takes 0.14 ms a waypoint
-ODOMETRY_PERIOD_NS, PATH_PERIOD_NS = NANOSECONDS // 10, NANOSECONDS
+ODOMETRY_PERIOD_NS = NANOSECONDS // 10
+PATH_PERIOD_NS = NANOSECONDS
 PATH_LENGTH = 120  # poses of the flown path, one a second
 
 SENTENCES: Mapping[Mode, str] = {
@@ -101,7 +102,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)
         self._u_m_encoder = self.encoder((*outputs, *channels.ATTITUDE))
         self._log_encoder = self.encoder(self._guidance.names)
-        self._allowed, self._mode, self._waits = True, Mode.OFF, ""
+        self._allowed = True
+        self._mode = Mode.OFF
+        self._waits = ""
         self._authority = self.receive(
             AUTHORITY,
             Decoder(AUTHORITY_CHANNELS).decode,
@@ -110,7 +113,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
             lock=None if self.parameters.lockstep else PublisherLock(self._timeouts_ns),
             qos=LOCKSTEP if self.parameters.lockstep else NEWEST_SAMPLES,
         )
-        self._authorities, self._authority_ns, self._has_authority = deque[StampedVector](), -1, True
+        self._authorities = deque[StampedVector]()
+        self._authority_ns = -1
+        self._has_authority = True
         if self.parameters.lockstep:
             y_period_ns = period_ns(self.parameters.y_rate, "y_rate")
             inputs = y_period_ns, self.period_ns(), self._y.receive, self._pose.receive
@@ -286,9 +291,12 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
     # For maps and 3-D views
 
     def _odometry_of(self, now_ns: int) -> Odometry:
-        pose, y = self._guidance.pose(), self._guidance.y()
+        pose = self._guidance.pose()
+        y = self._guidance.y()
         message = Odometry()
-        message.header.stamp, message.header.frame_id, message.child_frame_id = _stamp(now_ns), MAP, self._body
+        message.header.stamp = _stamp(now_ns)
+        message.header.frame_id = MAP
+        message.child_frame_id = self._body
         placed = message.pose.pose
         placed.position = Point(x=pose["east"], y=pose["north"], z=pose["altitude"])
         for key, value in zip("xyzw", quaternion(pose["phi"], pose["theta"], pose["psi"]), strict=True):
@@ -305,9 +313,11 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
 
     def _publish_sensors(self, odometry: Odometry) -> None:
         """Attitude and rates, the place on the Earth where an origin is given, the estimated wind by where the air moves to."""
-        place, twist = odometry.pose.pose, odometry.twist.twist
+        place = odometry.pose.pose
+        twist = odometry.twist.twist
         imu = Imu(orientation=place.orientation, angular_velocity=twist.angular)
-        imu.header.stamp, imu.header.frame_id = odometry.header.stamp, self._body
+        imu.header.stamp = odometry.header.stamp
+        imu.header.frame_id = self._body
         imu.linear_acceleration_covariance[0] = -1.0  # no estimate, as the definition of the message says
         self._imu.publish(imu)
         wind = Vector3Stamped(header=odometry.header)
@@ -319,7 +329,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         latitude, longitude, height = self.parameters.origin
         there = geographic(place.position.y, place.position.x, Origin(latitude, longitude))
         fix = NavSatFix(latitude=there.latitude, longitude=there.longitude, altitude=height + place.position.z)
-        fix.header.stamp, fix.header.frame_id = odometry.header.stamp, self._body
+        fix.header.stamp = odometry.header.stamp
+        fix.header.frame_id = self._body
         fix.status.status = NavSatStatus.STATUS_FIX
         self._fix.publish(fix)
 
@@ -330,7 +341,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if (route := self._guidance.route) is None:
             return
         marker = Marker(ns="route", type=Marker.LINE_STRIP, action=Marker.ADD)
-        marker.header, marker.pose.orientation.w, marker.scale.x = flown.header, 1.0, 3.0
+        marker.header = flown.header
+        marker.pose.orientation.w = 1.0
+        marker.scale.x = 3.0
         marker.color.r = marker.color.g = marker.color.a = 1.0
         start = (0.0, 0.0)
         for leg, altitude in zip(route.legs, route.altitude, strict=True):
@@ -353,7 +366,8 @@ def _service(answer: Callable[[Any], bool | str], called: Callable[[], None]) ->
     def callback(request: Any, response: Any) -> Any:
         called()
         result = answer(request)
-        response.success, response.message = result is True, "" if result is True else str(result)
+        response.success = result is True
+        response.message = "" if result is True else str(result)
         return response
 
     return callback
@@ -362,8 +376,11 @@ def _service(answer: Callable[[Any], bool | str], called: Callable[[], None]) ->
 def _transform(odometry: Odometry) -> TransformStamped:
     """The transform from the map to the body frame."""
     transform = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
-    place, moved = odometry.pose.pose, transform.transform
-    moved.translation.x, moved.translation.y, moved.translation.z = place.position.x, place.position.y, place.position.z
+    place = odometry.pose.pose
+    moved = transform.transform
+    moved.translation.x = place.position.x
+    moved.translation.y = place.position.y
+    moved.translation.z = place.position.z
     moved.rotation = place.orientation
     return transform
 

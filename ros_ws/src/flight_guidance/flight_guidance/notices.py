@@ -40,7 +40,8 @@ def is_blown_back(log: Mapping[str, Scalar]) -> Scalar:
 
     `log`: channels of `guidance`, values or arrays.
     """
-    track, lateral = log["track"], log["mode.lateral"]
+    track = log["track"]
+    lateral = log["mode.lateral"]
     xp = array_namespace(track)
     along, wind = (
         log[north] * xp.cos(track) + log[east] * xp.sin(track)
@@ -54,15 +55,20 @@ class _Lasting:
     """Whether a condition has lasted for `dwell`; due once, and again after the condition has been away for `dwell`."""
 
     def __init__(self, dwell: float = DWELL) -> None:
-        self._dwell, self._holds, self._since, self._said = dwell, False, -math.inf, False
+        self._dwell = dwell
+        self._holds = False
+        self._since = -math.inf
+        self._said = False
 
     def due(self, t: float, *, holds: bool) -> bool:
         """Whether a notice is due at the flight time t, s."""
         if holds != self._holds:
-            self._holds, self._since = holds, t
+            self._holds = holds
+            self._since = t
         if t - self._since < self._dwell:
             return False
-        before, self._said = self._said, holds
+        before = self._said
+        self._said = holds
         return holds and not before
 
 
@@ -86,24 +92,38 @@ class Notices:
         link_timeout: float = math.inf,
         reach: Callable[[Authority], str] = lambda authority: "",
     ) -> None:
-        self._reach, self._authority, self._reached = reach, Authority(), ""
-        self._wind, self._max_age, self._largest_wind, self._link_timeout = wind, max_age, largest_wind, link_timeout
+        self._reach = reach
+        self._authority = Authority()
+        self._reached = ""
+        self._wind = wind
+        self._max_age = max_age
+        self._largest_wind = largest_wind
+        self._link_timeout = link_timeout
         self._link = _Lasting(0.0)
         self._stale = _Lasting(STALE_TIME)
-        self._blown, self._strong, self._leg, self._action = _Lasting(), _Lasting(), 0, 0.0
-        self._outside_from, self._farthest = math.nan, 0.0  # NaN: inside
+        self._blown = _Lasting()
+        self._strong = _Lasting()
+        self._leg = 0
+        self._action = 0.0
+        # NaN: inside
+        self._outside_from = math.nan
+        self._farthest = 0.0
 
     def take(self, t: float, log: Mapping[str, float]) -> list[Notice]:
         """The notices of a sample at the flight time t, s, from the CHANNELS of the log."""
-        before, self._leg, texts = self._leg, int(log["leg"]), []
+        before = self._leg
+        self._leg = int(log["leg"])
+        texts = []
         if log["missed"] > 0.0:
             texts.append(f"leg {before} missed by {log['missed']:.0f} m")
-        action, self._action = self._action, log["fence.action"]
+        action = self._action
+        self._action = log["fence.action"]
         if abs(self._action) == RIGHT and self._action != action:
             side = "right" if self._action == RIGHT else "left"
             texts.append(f"fence {log['fence.clearance']:.0f} m away: turns to the {side}, then home")
         texts += self._outside(t, log["fence.clearance"])
-        wind, largest = math.hypot(log["wind.north"], log["wind.east"]), self._largest_wind(log["V_c"])
+        wind = math.hypot(log["wind.north"], log["wind.east"])
+        largest = self._largest_wind(log["V_c"])
         if (authority := Authority(*(log.get(name, UNKNOWN) for name in LEARNED))) != self._authority:
             self._authority, reached, self._reached = authority, self._reached, self._reach(authority)
             if reached != self._reached:
@@ -123,13 +143,16 @@ class Notices:
         """The sentence where the aircraft leaves the fence, or is back inside. While pose is lost, neither is known."""
         if clearance >= LARGEST:
             return []
-        is_outside, was_outside = clearance < 0.0, not math.isnan(self._outside_from)
+        is_outside = clearance < 0.0
+        was_outside = not math.isnan(self._outside_from)
         self._farthest = max(self._farthest, -clearance)
         if is_outside and not was_outside:
-            self._outside_from, self._farthest = t, -clearance
+            self._outside_from = t
+            self._farthest = -clearance
             return ["outside of the fence: the shortest way inside, then home"]
         if was_outside and not is_outside:
-            lasted, self._outside_from = t - self._outside_from, math.nan
+            lasted = t - self._outside_from
+            self._outside_from = math.nan
             return [f"inside of the fence after {lasted:.1f} s outside, {self._farthest:.0f} m at most"]
         return []
 

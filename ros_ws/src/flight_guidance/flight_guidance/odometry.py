@@ -5,7 +5,9 @@
 import math
 from collections.abc import Mapping
 
-MAP, BODY = "map", "base_link"  # frames of REP 105: east, north, up; forward, left, up
+# frames of REP 105: east, north, up; forward, left, up
+MAP = "map"
+BODY = "base_link"
 ROUTE_FRAMES = (MAP, "")  # of a route that guidance takes
 
 
@@ -24,7 +26,9 @@ def quaternion(phi: float, theta: float, psi: float) -> tuple[float, float, floa
 
 def body_velocity(pose: Mapping[str, float]) -> tuple[float, float, float]:
     """Velocity over ground forward, left and up in the body frame, m/s, from a pose."""
-    phi, theta, psi = pose["phi"], pose["theta"], pose["psi"]
+    phi = pose["phi"]
+    theta = pose["theta"]
+    psi = pose["psi"]
     ahead = pose["v_north"] * math.cos(psi) + pose["v_east"] * math.sin(psi)
     right = pose["v_east"] * math.cos(psi) - pose["v_north"] * math.sin(psi)
     forward = ahead * math.cos(theta) + pose["climb"] * math.sin(theta)

@@ -44,7 +44,8 @@ FLOOR_FRACTION = 0.8
 FASTEST_ROLL = 0.35
 """rad/s, 20 deg/s."""
 
-ALTITUDE_GAIN, ALPHA_TIME = 0.2, 2.0
+ALTITUDE_GAIN = 0.2
+ALPHA_TIME = 2.0
 """1/s and s, for a flight path that follows the pitch within two seconds."""
 
 STEEPEST = 0.1
@@ -231,7 +232,8 @@ class GuidanceConfig(NodeConfig):
         lowest, highest = self._altitudes()
         require(lowest < highest, "ceiling", f"{highest:g} m", f"more than altitude_floor, {lowest:g} m")
         self._check_home()
-        params, route = self.params(), None if self.route is None else self.plan(self.waypoints())
+        params = self.params()
+        route = None if self.route is None else self.plan(self.waypoints())
         for start, target in self.program_steps():
             read_target(target, params, route, f"program at {start:g} s")
 
@@ -296,7 +298,8 @@ class GuidanceConfig(NodeConfig):
     def notices(self) -> Notices:
         """What the notices of a flight depend on."""
         link_timeout = self.home.link_timeout or math.inf
-        reach_of, wind_of = partial(reach_sentence, self.params()), partial(largest_wind, wind=self.wind, bank=self.bank)
+        reach_of = partial(reach_sentence, self.params())
+        wind_of = partial(largest_wind, wind=self.wind, bank=self.bank)
         return Notices(self.wind, self.max_age, wind_of, link_timeout, reach_of)
 
     def climb_limits(self) -> tuple[float, float]:
@@ -313,8 +316,10 @@ class GuidanceConfig(NodeConfig):
         """The numbers of the equations."""
         frequency = dict(zip(self.outputs, self.natural_frequency, strict=True))
         floor, (climb, sink) = self._floor(), self.climb_limits()
-        roll, pitch = frequency["p"] / 4.0, frequency["q"] / 4.0
-        turn, roll_rate = GRAVITY * math.tan(self.bank) / self.speed, self.largest_roll_rate()
+        roll = frequency["p"] / 4.0
+        pitch = frequency["q"] / 4.0
+        turn = GRAVITY * math.tan(self.bank) / self.speed
+        roll_rate = self.largest_roll_rate()
         slew = {
             "p": frequency["p"] * roll_rate,
             "q": frequency["q"] * (self.load * GRAVITY / self.speed + turn * math.sin(self.bank)),
@@ -365,18 +370,22 @@ class GuidanceConfig(NodeConfig):
     def plan(self, waypoints: Sequence[Waypoint]) -> Route:
         """Legs through waypoints. Raises ParameterError for a route that is not feasible."""
         floor, (climb, sink) = self._floor(), self.climb_limits()
-        stall, flown = floor / protection.FLOOR, speeds(waypoints, self.speed)
-        roll_rate, fastest = self.largest_roll_rate(), self._largest_speed()
+        stall = floor / protection.FLOOR
+        flown = speeds(waypoints, self.speed)
+        roll_rate = self.largest_roll_rate()
+        fastest = self._largest_speed()
         can = Performance(self.speed, stall, self.bank, roll_rate, climb, sink, self.wind, fastest, *self._altitudes())
         banks = [protection.bank_limit(self.bank, stall, max(speed, floor)) for speed in flown]
         # an empty route is refused below
         radius = max((least_radius(speed, self.wind, bank) for speed, bank in zip(flown, banks, strict=True)), default=0.0)
         legs, waypoints, notes = flyable(waypoints, self.radius or math.ceil(radius), self.period or self.least_period(), can)
-        flown, numbers = speeds(waypoints, self.speed), leads(legs)
+        flown = speeds(waypoints, self.speed)
+        numbers = leads(legs)
         # A fillet leads to the next waypoint; a leg leaves the waypoint before. An orbit changes the altitude at its waypoint.
         before = [max(k - 1, 0) for k in numbers]
         slopes = self.profile == "slope"
-        altitude, left = [], []
+        altitude = []
+        left = []
         for leg, to, at in zip(legs, numbers, before, strict=True):
             fillet = isinstance(leg, Arc) and not is_orbit(leg)
             left.append(waypoints[to].altitude if is_orbit(leg) else waypoints[at].departure)

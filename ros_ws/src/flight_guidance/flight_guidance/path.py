@@ -90,7 +90,8 @@ class Route(NamedTuple):
 
     def profile(self, leg: int, along: float) -> tuple[float, float]:
         """The altitude at a distance along a leg, m, and its slope, 1: a straight line from waypoint to waypoint, or a step."""
-        altitude, distance = self.altitude[leg], length(self.legs[leg])
+        altitude = self.altitude[leg]
+        distance = length(self.legs[leg])
         if not self.slopes or not distance:
             return altitude, 0.0
         slope = (altitude - self.from_altitude[leg]) / distance
@@ -137,13 +138,17 @@ def error(leg: Leg, position: Point) -> PathError:
 
 def line_error(start: Point, track: Scalar, position: Point) -> PathError:
     """`error` beside a line from a point on a course, rad."""
-    xp, north, east = array_namespace(track), position[0] - start[0], position[1] - start[1]
+    xp = array_namespace(track)
+    north = position[0] - start[0]
+    east = position[1] - start[1]
     return PathError(east * xp.cos(track) - north * xp.sin(track), track, 0.0)
 
 
 def circle_error(centre: Point, radius: Scalar, position: Point) -> PathError:
     """`error` beside a circle, radius in m, positive to the right."""
-    xp, north, east = array_namespace(radius), position[0] - centre[0], position[1] - centre[1]
+    xp = array_namespace(radius)
+    north = position[0] - centre[0]
+    east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
     bearing = xp.atan2(east, north)  # from the centre
     return PathError(side * (abs(radius) - xp.hypot(north, east)), bearing + side * math.pi / 2.0, 1.0 / radius)
@@ -165,7 +170,9 @@ def passed(leg: Leg, position: Point) -> bool:
 
 def beyond(end: Point, course: Scalar, position: Point) -> Any:
     """Whether a position lies beyond the half plane through a point across a course, rad."""
-    xp, north, east = array_namespace(course), position[0] - end[0], position[1] - end[1]
+    xp = array_namespace(course)
+    north = position[0] - end[0]
+    east = position[1] - end[1]
     return north * xp.cos(course) + east * xp.sin(course) >= 0.0
 
 
@@ -202,8 +209,11 @@ def joining_length(at: Point, course: Scalar, radius: Scalar, position: Point, f
     """
     xp = array_namespace(radius)
     centre = joining_centre(at, course, radius)
-    north, east = position[0] - centre[0], position[1] - centre[1]
-    side, R, d = xp.copysign(1.0, radius), abs(radius), xp.hypot(north, east)
+    north = position[0] - centre[0]
+    east = position[1] - centre[1]
+    side = xp.copysign(1.0, radius)
+    R = abs(radius)
+    d = xp.hypot(north, east)
     touch = xp.atan2(east, north) + side * xp.acos(R / xp.maximum(d, R))  # bearing from the centre
     turn = touch + side * math.pi / 2.0 - flown
     sweep = (side * (course - touch) - math.pi / 2.0 + SLACK) % (2.0 * math.pi) - SLACK
@@ -233,7 +243,8 @@ def outline(leg: Leg, start: Point) -> list[Point]:
     """Points along a leg from the start, for drawing: at most 10 deg apart on an arc; an orbit is at least a full turn."""
     if isinstance(leg, Line):
         return [leg.start, leg.end]
-    side, first = math.copysign(1.0, leg.radius), course_of(leg.centre, start)
+    side = math.copysign(1.0, leg.radius)
+    first = course_of(leg.centre, start)
     turn = 2.0 * math.pi if is_orbit(leg) else 0.0
     if leg.end is not None:
         turn += side * (course_of(leg.centre, leg.end) - first) % (2.0 * math.pi)
@@ -252,7 +263,8 @@ def route_outline(route: Route) -> list[tuple[float, float, float]]:
 
 def lengths_after(route: Route) -> list[float]:
     """Length of the legs after each leg, m, without the last orbit, which has no end."""
-    lengths, point = [], route.start(0)[0]
+    lengths = []
+    point = route.start(0)[0]
     for leg in route.legs[:-1]:
         points = outline(leg, leg.start if isinstance(leg, Line) else point)
         lengths.append(sum(map(math.dist, points, points[1:])))
@@ -293,7 +305,8 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 
 def leads(legs: Sequence[Leg]) -> list[int]:
     """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to the next waypoint."""
-    numbers, at = [], 0
+    numbers = []
+    at = 0
     for leg in legs:
         at += isinstance(leg, Line)
         numbers.append(at + 1 if isinstance(leg, Arc) and not is_orbit(leg) else at)
@@ -323,7 +336,8 @@ def route(
     require(len(waypoints) >= 2, "route", f"{len(waypoints)} waypoints", "two or more")
     require(radius >= least, "guidance.radius", f"{radius:g} m", f"at least {math.ceil(least)} m at this speed, wind and bank")
     legs: list[Leg] = []
-    first, last = 0, len(waypoints) - 1
+    first = 0
+    last = len(waypoints) - 1
     for k in [*sorted(number for number in loiters if number < last), last]:
         if k > 0:
             lines = _between_circles(waypoints[first : k + 1], radius, first, leaves=bool(legs))
@@ -370,12 +384,14 @@ def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg
     legs: list[Leg] = []
     start = waypoints[0]
     for k, (here, there) in enumerate(pairwise(waypoints)):
-        length, needed = math.dist(here, there), cut[k] + cut[k + 1]
+        length = math.dist(here, there)
+        needed = cut[k] + cut[k + 1]
         if length <= needed:
             expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
             number = first + k + 1
             raise ShortLegError(f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number)
-        course, turn = course_of(here, there), turns[k + 1]
+        course = course_of(here, there)
+        turn = turns[k + 1]
         end = _along(there, course, -cut[k + 1])
         legs.append(Line(start, end))
         if cut[k + 1] > SHORTEST:

@@ -57,6 +57,7 @@ def climb_range(climb: float, sink: float, shortfall: Scalar, speed: float) -> t
     `speed`: V0, m/s. With V_dot = -g climb / V the second term of d bounds the bandwidth of V by climb to 0.4 rad/s.
     """  # noqa: D400, D415 - what follows is an equation
     margins = (max(SHORTFALL * speed, GRAVITY * rate / (0.4 * speed)) for rate in (sink, climb))
-    xp, ratios = array_namespace(shortfall), (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
+    xp = array_namespace(shortfall)
+    ratios = (sign * shortfall / d for sign, d in zip((-1.0, 1.0), margins, strict=True))
     least, largest = (xp.minimum(xp.maximum(2.0 - ratio, 0.0), 1.0) for ratio in ratios)
     return -sink * least, climb * largest

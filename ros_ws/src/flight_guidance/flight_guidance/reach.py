@@ -9,7 +9,8 @@ from typing import NamedTuple
 from flight_core.channels import SIDES, UNKNOWN
 from flight_core.units import GRAVITY
 
-CLIMB, SINK = 0.7, 0.5
+CLIMB = 0.7
+SINK = 0.5
 """Parts of the throttle's authority for a climb and a sink; the rest holds the airspeed."""
 
 REVERSALS = 11.0

@@ -21,7 +21,8 @@ from flight_guidance import route_formats
 from flight_guidance.path import Point
 from flight_guidance.route_formats import FORMATS, Above, Home, Place
 
-SEMI_MAJOR, FLATTENING = 6378137.0, 1.0 / 298.257223563
+SEMI_MAJOR = 6378137.0
+FLATTENING = 1.0 / 298.257223563
 """a in m and f of the ellipsoid WGS84. Source: NGA.STND.0036 (2014)."""
 
 MAX_DISTANCE = 100e3
@@ -81,7 +82,8 @@ def local(latitude: float, longitude: float, origin: Origin) -> Point:
     and the difference of two vectors [x, y, z] turned to north and east at the origin. Altitude takes no part: the altitude of
     an aircraft follows the curved Earth. Source: IOGP publication 373-7-2, methods EPSG:9602 and 9836.
     """
-    lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)
+    lat = math.radians(origin.latitude)
+    turn = math.radians(longitude - origin.longitude)
     (out_0, up_0), (out, up) = _meridian(lat), _meridian(math.radians(latitude))
     outward = out * math.cos(turn) - out_0
     return (up - up_0) * math.cos(lat) - outward * math.sin(lat), out * math.sin(turn)
@@ -103,7 +105,8 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
 
 def _is_above(latitude: float, longitude: float, origin: Origin) -> bool:
     """Whether a position is on the half of the Earth around the origin; the antipodal half has the same north and east."""
-    lat, turn = math.radians(origin.latitude), math.radians(longitude - origin.longitude)
+    lat = math.radians(origin.latitude)
+    turn = math.radians(longitude - origin.longitude)
     out, up = _meridian(math.radians(latitude))
     return out * math.cos(turn) * math.cos(lat) + up * math.sin(lat) > 0.0
 
@@ -148,10 +151,12 @@ def read_route_file(
     content = read_file(path, str(path), "a route file")
     if suffix in YAML:
         require(line is None, "--line", f"the route {path}", "a file with several lines")
-        waypoints, notes = list(_read_yaml(content, str(path), origin)), list[str]()
+        waypoints = list(_read_yaml(content, str(path), origin))
+        notes = list[str]()
     else:
         route = route_formats.read(content, str(path), suffix, line)
-        home, notes = route.home, list(route.notes)
+        home = route.home
+        notes = list(route.notes)
         if origin is None and home is not None and above_sea is not None:
             origin = Origin(home.latitude, home.longitude)
         _require_order(route.places, origin)
@@ -179,7 +184,8 @@ def _merged(waypoints: Sequence[Waypoint]) -> list[Waypoint]:
     speed: float | None = None
     for waypoint in waypoints:
         if merged and waypoint.point == (last := merged[-1]).point:
-            turns, wait = last.turns + waypoint.turns, last.wait + waypoint.wait
+            turns = last.turns + waypoint.turns
+            wait = last.wait + waypoint.wait
             leave = None if waypoint.departure == last.altitude else waypoint.departure
             merged[-1] = last._replace(turns=turns, wait=wait, leave=leave)
             speed = waypoint.speed or speed
@@ -264,7 +270,8 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
         first, last = spans.pop()
         if last - first < 2:
             continue
-        start, along = points[first], points[last] - points[first]
+        start = points[first]
+        along = points[last] - points[first]
         inside = points[first + 1 : last] - start
         share = np.clip(inside @ along / max(float(along @ along), np.finfo(float).tiny), 0.0, 1.0)
         distance = np.linalg.norm(inside - share[:, None] * along, axis=1)
@@ -279,7 +286,8 @@ class _Heights:
     """Turns the altitude of a place to the altitude of `pose`."""
 
     def __init__(self, given: float | None = None, home: Home | None = None, *, above_sea: bool | None = None) -> None:
-        self._given, self._sea = given, None if home is None else home.altitude
+        self._given = given
+        self._sea = None if home is None else home.altitude
         self._zero = given  # altitude of the home, as `pose` counts
         if given is None and above_sea is not None:
             self._zero = self._sea if above_sea else 0.0
@@ -287,7 +295,8 @@ class _Heights:
 
     def of(self, place: Place) -> Any:
         """The altitude in m, not validated yet. Raises ParameterError where the file does not tell."""
-        altitude, above = place.altitude, place.above
+        altitude = place.altitude
+        above = place.above
         if above is Above.AS_POSE or altitude is None:
             return self._given if altitude is None else altitude
         altitude = _number(place.key, altitude, "altitude")
@@ -349,7 +358,8 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
 
 
 def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
-    key, altitude = place.key, heights.of(place)
+    key = place.key
+    altitude = heights.of(place)
     if altitude is None and place.found:
         raise ParameterError(f"{key}: found {place.found}, expected longitude, latitude, altitude, or --altitude to fly at")
     if origin is None:

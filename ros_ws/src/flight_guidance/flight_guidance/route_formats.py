@@ -185,8 +185,10 @@ def _read_json(content: bytes, key: str, line: str | None = None) -> Places:
     geometries: list[_Geometry] = []
     others: list[str] = []
     for node, properties in _nodes(tree):
-        speed, name = _member(properties, "V"), _member(properties, "name")
-        kind, coordinates = _member(node, "type"), _member(node, "coordinates")
+        speed = _member(properties, "V")
+        name = _member(properties, "name")
+        kind = _member(node, "type")
+        coordinates = _member(node, "coordinates")
         if isinstance(kind, str) and kind in GEOJSON:
             parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
             part_kind = kind if len(parts) == 1 else PARTS.get(kind, kind)
@@ -203,7 +205,8 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
     _require_wgs84(tree, key)
     lines: list[list[Place]] = []
     for node, _ in _nodes(tree):
-        kind, coordinates = _member(node, "type"), _member(node, "coordinates")
+        kind = _member(node, "type")
+        coordinates = _member(node, "coordinates")
         if node is None:
             continue
         known = isinstance(kind, str) and kind in GEOJSON
@@ -444,7 +447,13 @@ def _gpx_places(parent: Element, kind: str) -> list[Place]:
 
 FRAMES = {0: Above.SEA, 5: Above.SEA, 3: Above.HOME, 6: Above.HOME}  # MAV_FRAME
 TERRAIN = (10, 11)
-WAYPOINT, LAND, SPLINE, JUMP, CHANGE_SPEED, AIRSPEED = 16, 21, 82, 177, 178, 0  # MAV_CMD, and SPEED_TYPE
+# MAV_CMD, and SPEED_TYPE
+WAYPOINT = 16
+LAND = 21
+SPLINE = 82
+JUMP = 177
+CHANGE_SPEED = 178
+AIRSPEED = 0
 UNLIMITED, TURNS, TIME, TO_ALTITUDE = LOITERS = 17, 18, 19, 31  # NAV_LOITER_...
 COMMANDS = {17: "NAV_LOITER_UNLIM", 18: "NAV_LOITER_TURNS", 19: "NAV_LOITER_TIME", 31: "NAV_LOITER_TO_ALT"}
 COMMANDS |= {20: "NAV_RETURN_TO_LAUNCH", 21: "NAV_LAND", 22: "NAV_TAKEOFF", 84: "NAV_VTOL_TAKEOFF", 85: "NAV_VTOL_LAND"}
@@ -489,12 +498,14 @@ def _in_order(key: str, items: Sequence[_Item]) -> list[int]:
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
         (name, _, command, params, *_), here = items[k], k
-        k, steps = k + 1, steps + 1
+        k = k + 1
+        steps = steps + 1
         require(steps <= MOST_ITEMS, key, f"more than {MOST_ITEMS} items by the repetitions of {name}", "fewer")
         if command != JUMP:
             order.append(here)
             continue
-        target, count = params[0], -0.5 if params[1] is None else float(params[1])
+        target = params[0]
+        count = -0.5 if params[1] is None else float(params[1])
         if not count:
             continue
         require(target in at and count.is_integer(), key, f"{name} to {target}", "a jump to an item, a whole number of times")
@@ -541,7 +552,8 @@ def _mission_place(key: str, item: _Item, speed: Any, before: Place | None) -> P
     """The place of an item; of a loiter without a latitude and a longitude the place before."""
     latitude, longitude, altitude = item.params[4:7]
     if not (latitude or longitude) and before is not None:
-        latitude, longitude = before.latitude, before.longitude
+        latitude = before.latitude
+        longitude = before.longitude
         if not altitude:
             return before._replace(turns=0.0, wait=0.0, climbs=False, speed=speed)
     found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
@@ -570,7 +582,8 @@ def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
         expected = f"waypoints, {' or '.join(TRANSECTS)} with their items, {' or '.join(LANDINGS)}"
         require(kind == "SimpleItem", f"{key}: item {number}", f"a {short_repr(kind)}", expected)
         params = _member(entry, "params")
-        frame, command = _member(entry, "frame"), _member(entry, "command")
+        frame = _member(entry, "frame")
+        command = _member(entry, "command")
         numbers = isinstance(params, list) and all(value is None or isinstance(value, int | float) for value in params)
         fits = numbers and len(params) == 7 and isinstance(frame, int) and isinstance(command, int)
         require(fits, f"{key}: item {number}", short_repr(entry), "frame, command and seven params")
@@ -632,7 +645,8 @@ def _plan_fence(tree: Any, key: str) -> FencePlaces:
         corners = [_lat_lon(corner) for corner in _listed(_member(zone, "polygon"), key)]
         zones.append(_grouped(Area(corners, None, not _flag(zone, "inclusion", None, key))))
     for zone in _entries(fence, "circles", key):
-        circle, inclusion = _member(zone, "circle"), _flag(zone, "inclusion", None, key)
+        circle = _member(zone, "circle")
+        inclusion = _flag(zone, "inclusion", None, key)
         zones.append(_grouped(Area([_lat_lon(_member(circle, "center"))], _member(circle, "radius"), not inclusion)))
     rally = [_lat_lon(point, Above.HOME) for point in _entries(_member(tree, "rallyPoints"), "points", key)]
     back = _member(fence, "breachReturn")
@@ -662,7 +676,8 @@ def _json_fence(tree: Any, key: str) -> FencePlaces:
         kind = _member(node, "type")
         require(kind in ("Polygon", "MultiPolygon", "Point"), key, f"a {short_repr(kind)}", "Polygons, or Points with a radius")
         coordinates = _listed(_member(node, "coordinates"), key)
-        exclude, radius = _flag(properties, "exclude", False, key), _member(properties, "radius")
+        exclude = _flag(properties, "exclude", False, key)
+        radius = _member(properties, "radius")
         group = _member(properties, "group")
         if kind == "Point":
             require(radius is not None, key, "a Point without the property radius", "the radius of a circle, m")
@@ -680,10 +695,12 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
     items, home = _wpl_items(content, key)
     zones: list[Area] = []
     rally: list[Place] = []
-    missing, back = 0, None
+    missing = 0
+    back = None
     for item in items:
         latitude, longitude, altitude = item.params[4:7]
-        place, exclude = Place("fence", latitude, longitude, altitude), item.command in {FENCE_OUT, CIRCLE_OUT}
+        place = Place("fence", latitude, longitude, altitude)
+        exclude = item.command in {FENCE_OUT, CIRCLE_OUT}
         if missing or item.command in {FENCE_IN, FENCE_OUT}:
             count = item.params[0]
             fits = item.command in {FENCE_IN, FENCE_OUT} and count in range(3, MOST_CORNERS + 1)
@@ -720,7 +737,13 @@ def _group(item: _Item, key: str) -> int:
 
 
 MOST_CORNERS = 10_000
-RETURN, FENCE_IN, FENCE_OUT, CIRCLE_IN, CIRCLE_OUT, RALLY = 5000, 5001, 5002, 5003, 5004, 5100  # MAV_CMD
+# MAV_CMD
+RETURN = 5000
+FENCE_IN = 5001
+FENCE_OUT = 5002
+CIRCLE_IN = 5003
+CIRCLE_OUT = 5004
+RALLY = 5100
 
 
 def _entries(tree: Any, name: str, key: str) -> list[Any]:
@@ -774,7 +797,8 @@ def _wpl_items(content: bytes, key: str) -> tuple[list[_Item], Home | None]:
     lines = content.decode(encoding, errors="replace").splitlines()
     head = lines[0].strip() if lines else ""
     require(head.startswith(WPL), key, short_repr(head), "QGC WPL 110 in the first line")
-    items, home = list[_Item](), None
+    items = list[_Item]()
+    home = None
     for number, line in enumerate(lines[1:], start=2):
         words = line.split()
         if not words or words[0].startswith("#"):

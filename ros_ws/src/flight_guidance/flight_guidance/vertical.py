@@ -34,7 +34,8 @@ def climb_for(error: Scalar, params: VerticalParams) -> Scalar:
 
     The two branches and the slopes agree at e_l. Far away the climb rate falls by a/2 a second: slow enough for the aircraft.
     """  # noqa: D400, D415 - what follows is an equation
-    k_h, a = params.k_h, params.acceleration
+    k_h = params.k_h
+    a = params.acceleration
     near = a / (2.0 * k_h * k_h)
     xp = array_namespace(error)
     far = xp.copysign(xp.sqrt(a * xp.maximum(abs(error) - near / 2.0, 0.0)), error)

@@ -42,13 +42,15 @@ class Ways(NamedTuple):
         """The aim of places, north and east, m, and whether the straight way home is free; beside the map the nearest cell."""
         xp = array_namespace(north)
         rows, columns = self.straight.shape
-        row_at, column_at = (north - self.corner[0]) / self.cell, (east - self.corner[1]) / self.cell
+        row_at = (north - self.corner[0]) / self.cell
+        column_at = (east - self.corner[1]) / self.cell
         row = xp.clip(xp.round(row_at), 0, rows - 1).astype(np.int32)
         column = xp.clip(xp.round(column_at), 0, columns - 1).astype(np.int32)
         on_map = (abs(row_at - row) < 1.0) & (abs(column_at - column) < 1.0)
         straight = xp.asarray(self.straight)[row, column] & on_map
         orbit_north, orbit_east = onto_orbit(fence, north, east)
-        cell_north, cell_east = self.corner[0] + self.cell * row, self.corner[1] + self.cell * column
+        cell_north = self.corner[0] + self.cell * row
+        cell_east = self.corner[1] + self.cell * column
         aim_north = xp.where(on_map, xp.asarray(self.north)[row, column], cell_north)
         aim_east = xp.where(on_map, xp.asarray(self.east)[row, column], cell_east)
         return xp.where(straight, orbit_north, aim_north), xp.where(straight, orbit_east, aim_east), straight
@@ -57,19 +59,22 @@ class Ways(NamedTuple):
 def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
     """Where the tangent from a place touches the clockwise orbit round home; within the orbit a place 1 m on along it."""
     xp = array_namespace(north)
-    x, y = fence.home[0] - north, fence.home[1] - east
+    x = fence.home[0] - north
+    y = fence.home[1] - east
     distance = xp.maximum(xp.hypot(x, y), 1e-6)
     # Home is to the right of the tangent. Within the orbit the course is across the bearing of home.
     left = xp.asin(xp.minimum(fence.radius / distance, 1.0))
     length = xp.maximum(xp.sqrt(xp.maximum(distance**2 - fence.radius**2, 0.0)), 1.0)
-    along, across = xp.cos(left) * length / distance, xp.sin(left) * length / distance
+    along = xp.cos(left) * length / distance
+    across = xp.sin(left) * length / distance
     return north + along * x + across * y, east + along * y - across * x
 
 
 def line_clearance(fence: Fence, north: Array, east: Array, to_north: Array, to_east: Array) -> Array:
     """Least clearance of straight lines, m."""
     share = np.linspace(0.0, 1.0, POINTS).reshape(-1, *(1,) * np.ndim(north))
-    on_north, on_east = north + share * (to_north - north), east + share * (to_east - east)
+    on_north = north + share * (to_north - north)
+    on_east = east + share * (to_east - east)
     return array_namespace(north).min(clearance(fence.zones, on_north, on_east), axis=0)
 
 
@@ -101,7 +106,8 @@ def ways(fence: Fence) -> Ways:
     ahead = following
     for _ in range(CELLS_PER_RADIUS - 1):
         ahead = following.ravel()[ahead]
-    aim_north, aim_east = north.ravel()[ahead], east.ravel()[ahead]
+    aim_north = north.ravel()[ahead]
+    aim_east = east.ravel()[ahead]
     if (outside := room < 0.0).any() and leads_home.any():
         nearest = _nearest(north[outside], east[outside], north[leads_home], east[leads_home])
         aim_north[outside] = north[leads_home][nearest]
@@ -151,7 +157,8 @@ def _shortest(seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell
     Bellman and Ford: the lengths of all cells at once, until none becomes shorter.
     """
     lengths = [cell * math.hypot(*step) for step in STEPS]
-    costs, rooms = _neighbours(cost, math.inf), _neighbours(room, -math.inf)
+    costs = _neighbours(cost, math.inf)
+    rooms = _neighbours(room, -math.inf)
     edges = np.array(
         [
             np.where(room + room_beside > length, length * (cost + cost_beside) / 2.0, math.inf)
@@ -165,7 +172,8 @@ def _shortest(seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell
         if np.array_equal(shorter, to_go):
             break
         to_go = shorter
-    own, best = np.arange(room.size).reshape(room.shape), through.argmin(axis=0)
+    own = np.arange(room.size).reshape(room.shape)
+    best = through.argmin(axis=0)
     moves = np.array([row * room.shape[1] + column for row, column in STEPS])
     return to_go, np.where(np.isfinite(to_go) & ~seeds, own + moves[best], own)
 

@@ -44,11 +44,13 @@ def inside(zone: Zone, north: Array, east: Array) -> Array:
     xp = array_namespace(north)
     if zone.radius:
         return zone.radius - xp.hypot(north - zone.north[0], east - zone.east[0])
-    start_north, start_east = np.array(zone.north), np.array(zone.east)
+    start_north = np.array(zone.north)
+    start_east = np.array(zone.east)
     edge_north = np.roll(start_north, -1) - start_north
     edge_east = np.roll(start_east, -1) - start_east
     distance = _distance(start_north, start_east, edge_north, edge_east, north, east)
-    x, y = north[..., None] - start_north, east[..., None] - start_east
+    x = north[..., None] - start_north
+    y = east[..., None] - start_east
     level = np.where(edge_north == 0.0, 1.0, edge_north)  # an edge to the east crosses no line to the east
     crossed = ((x < 0.0) != (x < edge_north)) & (y < x * edge_east / level)  # by a ray to the east: even-odd rule
     return xp.where(xp.sum(crossed, axis=-1) % 2 == 1, distance, -distance)
@@ -59,14 +61,16 @@ def _distance(
 ) -> Array:
     """Distance of places from the nearest of edges, m."""
     xp = array_namespace(north)
-    x, y = north[..., None] - start_north, east[..., None] - start_east
+    x = north[..., None] - start_north
+    y = east[..., None] - start_east
     share = xp.clip((x * edge_north + y * edge_east) / (edge_north**2 + edge_east**2), 0.0, 1.0)
     return xp.min(xp.hypot(x - share * edge_north, y - share * edge_east), axis=-1)
 
 
 def clearance(zones: tuple[Zone, ...], north: Array, east: Array) -> Array:
     """Distance from the fence, m, negative outside of the fence."""
-    xp, groups = array_namespace(north), _groups(zones)
+    xp = array_namespace(north)
+    groups = _groups(zones)
     out = [-inside(zone, north, east) for zone in zones if zone.exclude]
     if not groups:
         return reduce(xp.minimum, out)
@@ -101,10 +105,12 @@ def _border(groups: tuple[tuple[Zone, ...], ...]) -> tuple[FloatArray, FloatArra
     """
     groups = tuple(tuple(map(_polygon, group)) for group in groups)
     corners = [np.column_stack([zone.north, zone.east]) for zone in chain.from_iterable(groups)]
-    starts, ends = np.concatenate(corners), np.concatenate([np.roll(ring, -1, axis=0) for ring in corners])
+    starts = np.concatenate(corners)
+    ends = np.concatenate([np.roll(ring, -1, axis=0) for ring in corners])
     pieces = [_cut(start, end, starts, ends) for start, end in zip(starts, ends, strict=True)]
     start, end = (np.concatenate(column) for column in zip(*pieces, strict=True))
-    edge, middle = end - start, (start + end) / 2.0
+    edge = end - start
+    middle = (start + end) / 2.0
     beside = SEAM * np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
     sides = [_deepest(groups, *(middle + side * beside).T) >= 0.0 for side in (1.0, -1.0)]
     on_border = sides[0] != sides[1]
@@ -123,7 +129,9 @@ def _polygon(zone: Zone) -> Zone:
 
 def _cut(start: FloatArray, end: FloatArray, starts: FloatArray, ends: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Starts and ends of the pieces of an edge, shapes (P, 2), cut where further edges cross or begin."""
-    edge, edges, to_start = end - start, ends - starts, starts - start
+    edge = end - start
+    edges = ends - starts
+    to_start = starts - start
     length = math.hypot(*edge)
     across = edge[0] * edges[:, 1] - edge[1] * edges[:, 0]
     parallel = across == 0.0

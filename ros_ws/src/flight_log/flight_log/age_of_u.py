@@ -14,7 +14,8 @@ from flight_log.learning_messages import DIAGNOSTIC_ARRAY
 from flight_log.named_vectors import typestore
 
 DIAGNOSTICS = "/diagnostics"
-MEAN, MAX = "age of u mean (s)", "age of u max (s)"
+MEAN = "age of u mean (s)"
+MAX = "age of u max (s)"
 IN_MESSAGE = MEAN.encode()  # of a message with an age of u
 CHANNELS = ("mean", "max")
 

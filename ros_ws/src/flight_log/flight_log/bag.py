@@ -22,7 +22,8 @@ from flight_log.message_definitions import Definition, definition
 from flight_log.rosbag2_metadata import METADATA, FileContents, TopicCount, bag_metadata_yaml
 from flight_log.scan import RECORD
 
-SCENARIO_MEDIA_TYPE, FILE_MEDIA_TYPE = "application/yaml", "text/yaml"  # of attachments: the scenario, and other files
+SCENARIO_MEDIA_TYPE = "application/yaml"  # of attachments: the scenario
+FILE_MEDIA_TYPE = "text/yaml"  # and other files
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
@@ -35,10 +36,12 @@ CHUNK_BYTES = 256 * 1024
 # Bytes reserved for the end of a file: the chunk in progress and its index, and the summary without the chunk indexes. The
 # chunk indexes grow with the file: 77 bytes for each chunk and 10 for each topic in it (MCAP specification, Chunk Index).
 END_BYTES = 2 * CHUNK_BYTES
-INDEX_BYTES, INDEX_BYTES_BY_TOPIC = 77, 10
+INDEX_BYTES = 77
+INDEX_BYTES_BY_TOPIC = 10
 
 # Private attributes of mcap's Writer, as in mcap 1.6. Another version would use its own.
-CHUNK_BUILDER, CHUNK_INDEXES = "_Writer__chunk_builder", "_Writer__chunk_indices"
+CHUNK_BUILDER = "_Writer__chunk_builder"
+CHUNK_INDEXES = "_Writer__chunk_indices"
 MESSAGE = int(Opcode.MESSAGE)
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")  # RECORD, then channel, sequence, log time and publish time (MCAP specification)
 INDEX_HEAD = struct.Struct("<BQHI")  # RECORD, then channel and size
@@ -98,7 +101,9 @@ class _ChunkIndexes:
     """
 
     def __init__(self, file: ReservedFile, channels: Sequence[BagChannel]) -> None:
-        self._file, self._channels, self._count = file, channels, 0
+        self._file = file
+        self._channels = channels
+        self._count = 0
 
     def append(self, index: ChunkIndex) -> None:
         record = RecordBuilder()

@@ -40,7 +40,9 @@ class StampClock:
         if self._step_ns:
             return self._taken(stamp_ns, np.zeros(len(stamp_ns), dtype=bool), len(stamp_ns))
         known = np.flatnonzero(~unset)
-        stamps, offsets, timed = stamp_ns[known], stamp_ns[known] - log_ns[known], log_ns[known] != 0
+        stamps = stamp_ns[known]
+        offsets = stamp_ns[known] - log_ns[known]
+        timed = log_ns[known] != 0
         before = stamps[:1] if self._last_ns is None else self._last_ns
         offset_before = offsets[:1] if self._last_ns is None else self._last_offset_ns
         jumps = np.diff(stamps, prepend=before)
@@ -58,13 +60,16 @@ class StampClock:
                     keep[known[first:after]] = False
                 continue
             if jump_ns < -STEP_NS or is_ahead:
-                self._step_ns, self._step_at_ns = jump_ns, self._last_ns or 0
+                self._step_ns = jump_ns
+                self._step_at_ns = self._last_ns or 0
                 keep[known[first] :] = False
                 break
             if self._last_ns is None:  # the messages before are too few to be the begin of the clock
-                away_ns, lead_ns = stamps[first] - stamps[:first], offsets[first] - offsets[:first]
+                away_ns = stamps[first] - stamps[:first]
+                lead_ns = offsets[first] - offsets[:first]
                 keep[known[:first]] &= (away_ns >= -STEP_NS) & ((away_ns <= STRAY_NS) | (lead_ns <= STEP_NS))
-            self._last_ns, self._last_offset_ns = int(stamps[after - 1]), int(offsets[after - 1])
+            self._last_ns = int(stamps[after - 1])
+            self._last_offset_ns = int(offsets[after - 1])
             self._offset_ns = max(self._offset_ns, int(offsets[first:after].max()))
         return self._taken(stamp_ns, keep, len(stamp_ns))
 
@@ -96,7 +101,8 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str:
     if recording.unset:
         parts.append(f"{recording.unset} of {recording.found} samples have no usable stamp and are left out")
     if recording.step_ns:
-        way, t = "back" if recording.step_ns < 0 else "forth", seconds(recording.step_at_ns - start_ns)
+        way = "back" if recording.step_ns < 0 else "forth"
+        t = seconds(recording.step_at_ns - start_ns)
         step = f"the clock of its stamps steps {way} by {abs(seconds(recording.step_ns)):.3f} s at t = {t:.3f} s"
         parts.append(f"{step}: the {recording.left_out} samples after the step are left out")
     return f"{name}: {'; '.join(parts)}" if parts else ""

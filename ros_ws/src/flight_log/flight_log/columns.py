@@ -28,7 +28,8 @@ class Columns:
     """
 
     def __init__(self, width: int, expected: int) -> None:
-        self.count, self._width = 0, width
+        self.count = 0
+        self._width = width
         self._stamp_ns, self._store = self._new(expected)
 
     def _new(self, capacity: int) -> tuple[NDArray[np.int64], "_Memory | _File"]:
@@ -39,7 +40,8 @@ class Columns:
         """Append samples: stamps (N,) and rows (N, k)."""
         end = self.count + len(rows)
         if end > len(self._stamp_ns):
-            stamps, store = self._stamp_ns, self._store
+            stamps = self._stamp_ns
+            store = self._store
             self._stamp_ns, self._store = self._new(end + end // 2)
             self._stamp_ns[: self.count] = stamps[: self.count]
             for index in range(self._width):
@@ -72,7 +74,8 @@ class _File:
     """Columns in a temporary file without a name, written past memory and mapped as long as an array of them is used."""
 
     def __init__(self, width: int, capacity: int) -> None:
-        self._capacity, self._shape = capacity, (width, capacity)
+        self._capacity = capacity
+        self._shape = (width, capacity)
         with _on_disk():
             self._file = TemporaryFile()  # noqa: SIM115 - open as long as a signal has it
             finalize(self, self._file.close)

@@ -55,7 +55,9 @@ class ReservedFile:
             raise
         try_lock(self._descriptor)
         self._reserved_bytes = 0
-        self._kept_bytes, self._kept = 0, bytearray()  # in the reserve; in memory once that is free
+        # in the reserve; in memory once that is free
+        self._kept_bytes = 0
+        self._kept = bytearray()
         self._position = 0
         self._closed = False
         self.full = False  # the reserve was needed

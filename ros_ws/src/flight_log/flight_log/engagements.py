@@ -9,7 +9,8 @@ from rosbags.serde.errors import SerdeError
 
 from flight_log.named_vectors import typestore
 
-ENGAGEMENT, KEY_VALUE = "/bridge/engagement", "diagnostic_msgs/msg/KeyValue"
+ENGAGEMENT = "/bridge/engagement"
+KEY_VALUE = "diagnostic_msgs/msg/KeyValue"
 ENGAGED = "ENGAGED"  # the key of a report
 
 

@@ -11,11 +11,16 @@ from mcap.writer import MCAP0_MAGIC
 
 from flight_core.files import open_nonblocking
 
-MCAP, SQLITE, ZSTD, LZ4 = "an MCAP file", "a database of SQLite", "a zstd file", "an lz4 file"
-EMPTY, BEGUN = "an empty file", "the first bytes of an MCAP file"
+MCAP = "an MCAP file"
+SQLITE = "a database of SQLite"
+ZSTD = "a zstd file"
+LZ4 = "an lz4 file"
+EMPTY = "an empty file"
+BEGUN = "the first bytes of an MCAP file"
 UNREADABLE = "a file that cannot be read"
 
-LOGS, PACKED = (MCAP, SQLITE), (ZSTD, LZ4)
+LOGS = (MCAP, SQLITE)
+PACKED = (ZSTD, LZ4)
 """Kinds that may be a log, and kinds that may hold a log."""
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # RFC 8878, section 3.1.1
@@ -52,7 +57,9 @@ MAGICS = MappingProxyType(
 )
 """Kinds of files by the first bytes."""
 
-TAR_PLACE, TAR = 257, b"ustar"  # POSIX.1-2017, pax, ustar Interchange Format
+# POSIX.1-2017, pax, ustar Interchange Format
+TAR_PLACE = 257
+TAR = b"ustar"
 MAVLINK = (b"\xfd", b"\xfe")  # first byte of a packet of MAVLink 2 and 1 (MAVLink guide, Packet Serialization)
 TLOG_TIME = struct.Struct(">Q")  # us since 1970, before each packet of a tlog (MAVLink guide, mavlogdump)
 TLOG_YEARS = (2000, 2100)

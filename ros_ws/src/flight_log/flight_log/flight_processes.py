@@ -12,7 +12,8 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Process
 from flight_log.named_vectors import typestore
 
-ROSOUT, LOG = "/rosout", "rcl_interfaces/msg/Log"
+ROSOUT = "/rosout"
+LOG = "rcl_interfaces/msg/Log"
 READY = b"\x06\x00\x00\x00ready\x00"  # the text of the line in CDR: its length with the final zero, and its bytes
 UNNAMED = "a publisher without a name"
 INSTANCE = re.compile(r"(/.+)#\d+")  # node and process id

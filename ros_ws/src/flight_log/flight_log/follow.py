@@ -32,8 +32,11 @@ from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE_INDEX, RECOR
 
 HEAD = struct.Struct("<BQ6xQQ")  # of RECORD and MESSAGE: opcode, length, log time, publish time
 # As plain numbers: of a log of one hour 400,000 records are compared.
-CHUNK, MESSAGE, INDEX = int(Opcode.CHUNK), int(Opcode.MESSAGE), int(Opcode.MESSAGE_INDEX)
-SCHEMA, CHANNEL = int(Opcode.SCHEMA), int(Opcode.CHANNEL)
+CHUNK = int(Opcode.CHUNK)
+MESSAGE = int(Opcode.MESSAGE)
+INDEX = int(Opcode.MESSAGE_INDEX)
+SCHEMA = int(Opcode.SCHEMA)
+CHANNEL = int(Opcode.CHANNEL)
 ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
 READ_BYTES = 1 << 20  # read from the file at once
 
@@ -122,7 +125,8 @@ class Follower:
                 continue
             with path.open("rb", buffering=READ_BYTES) as stream:
                 status = os.fstat(stream.fileno())
-                size, identity = status.st_size, (status.st_dev, status.st_ino)
+                size = status.st_size
+                identity = (status.st_dev, status.st_ino)
                 if self._position > 0 and (identity != self._identity or size < self._position):
                     self.fault = f"{path} was replaced by another file, as rise-di repair does"
                     return
@@ -164,7 +168,8 @@ class Follower:
     def _records(self, stream: IO[bytes], size: int) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of every whole record behind the position. The position moves on before a record is given."""
         if self._position == 0 and size >= len(MCAP0_MAGIC):
-            self.complete, self._position = False, len(MCAP0_MAGIC)
+            self.complete = False
+            self._position = len(MCAP0_MAGIC)
         stream.seek(self._position)
         while 0 < self._position <= size - RECORD.size:
             opcode, length = RECORD.unpack(stream.read(RECORD.size))
@@ -192,7 +197,8 @@ class Follower:
                 self._take_whole(record)
         except DECODE_ERRORS:
             self.damaged += 1
-            self._chunk, self._indexed = b"", True
+            self._chunk = b""
+            self._indexed = True
 
     def _take_indexed(self, content: bytes) -> None:
         """The messages of a channel in the last chunk. Raises DECODE_ERRORS."""
@@ -215,14 +221,16 @@ class Follower:
             if channel.step == 0:
                 channel.step = _step(channel.rate, len(places), self._messages_at((places[0], places[-1]))[1])
             step = max(channel.step, 1)
-            skipped, channel.skip = channel.skip, (channel.skip - len(places)) % step
+            skipped = channel.skip
+            channel.skip = (channel.skip - len(places)) % step
             places = places[skipped::step]
         if places:
             self._pending.append(Messages(channel.topic, channel.type_name, *self._messages_at(places)))
 
     def _learn_from_chunks(self) -> None:
         """Schemas and channels of the chunks so far: that of a topic may be in a chunk without a message of it."""
-        places, self._unread = self._unread, []
+        places = self._unread
+        self._unread = []
         if self.path is None:
             return
         with self.path.open("rb") as stream:
@@ -234,7 +242,9 @@ class Follower:
 
     def _messages_at(self, places: Sequence[int]) -> tuple[list[int], list[bytes]]:
         """Times of sending, else of receipt, in ns and data of messages of the last chunk. Raises DECODE_ERRORS."""
-        chunk, sent_ns, data = self._chunk, [], []
+        chunk = self._chunk
+        sent_ns = []
+        data = []
         for place in places:
             opcode, length, received, sent = HEAD.unpack_from(chunk, place)
             end = place + RECORD.size + length
@@ -256,7 +266,8 @@ class Follower:
         if isinstance(record, Message):
             channel = self._channels.get(record.channel_id)
             if channel is not None and channel.rate > 0.0:
-                sent_ns, data = record.publish_time or record.log_time, plain_message(record.data)
+                sent_ns = record.publish_time or record.log_time
+                data = plain_message(record.data)
                 self._pending.append(Messages(channel.topic, channel.type_name, [sent_ns], [data]))
         elif isinstance(record, Attachment | Metadata):
             self._pending.append(record)

@@ -7,8 +7,11 @@ from typing import Any
 from flight_core.rates import NANOSECONDS
 from flight_log.named_vectors import typestore
 
-LEARNING, DIAGNOSTIC_ARRAY = "learning", "diagnostic_msgs/msg/DiagnosticArray"
-OK, WARN = 0, 1  # levels of diagnostic_msgs/msg/DiagnosticStatus
+LEARNING = "learning"
+DIAGNOSTIC_ARRAY = "diagnostic_msgs/msg/DiagnosticArray"
+# levels of diagnostic_msgs/msg/DiagnosticStatus
+OK = 0
+WARN = 1
 
 
 def learning_message(stamp_ns: int, sentence: str, *, warns: bool) -> bytes:

@@ -116,8 +116,10 @@ def encoded(samples: Samples) -> NDArray[np.uint8]:
     """
     store = joint_state_types()
     types: dict[str, Any] = store.types
-    header, time = types["std_msgs/msg/Header"], types["builtin_interfaces/msg/Time"]
-    empty, marks = np.zeros(0), _marks(len(samples.names))
+    header = types["std_msgs/msg/Header"]
+    time = types["builtin_interfaces/msg/Time"]
+    empty = np.zeros(0)
+    marks = _marks(len(samples.names))
     message = types[JOINT_STATE](header(time(sec=0, nanosec=0), samples.sender), list(samples.names), marks, empty, empty)
     template = bytes(store.serialize_cdr(message, JOINT_STATE))
     rows = np.tile(np.frombuffer(template, dtype=np.uint8), (len(samples.stamp_ns), 1))
@@ -140,7 +142,8 @@ def _position(marked: bytes, marks: FloatArray) -> slice:
 
 def decode_routes(table: Table) -> Decoded:
     """Routes of nav_msgs/Path in the frame map (east, north, up): a sample with the channels WAYPOINT a waypoint."""
-    samples, unreadable = [], 0
+    samples = []
+    unreadable = 0
     for message in map(bytes, table):
         try:
             route: Any = typestore().deserialize_cdr(message, PATH)
@@ -174,7 +177,8 @@ class _JointStateDecoder:
             alike = table if same.all() else table[same]
             values = np.ascontiguousarray(alike[:, self._values]).view("<f8")
             samples.append(Samples(self._names, stamps_of(alike), values, self._sender))
-        unreadable, rest = 0, [bytes(message) for message in table[~same]]
+        unreadable = 0
+        rest = [bytes(message) for message in table[~same]]
         for message in rest:
             try:
                 vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)

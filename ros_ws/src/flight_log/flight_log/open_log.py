@@ -148,7 +148,8 @@ def log_topics(run: Path) -> dict[str, str]:
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
-                    name, encoding = schemas.get(record.schema_id, ""), record.message_encoding
+                    name = schemas.get(record.schema_id, "")
+                    encoding = record.message_encoding
                     topics.setdefault(record.topic, name if encoding == "cdr" else f"{name} in {encoding}")
                 elif topics and scan.message_counts:  # the index names all channels
                     break
@@ -241,7 +242,8 @@ class SqliteScan:
             raise ParameterError(f"{self._shown}: cannot be read ({reason}), expected a bag of rosbag2") from None
         try:
             for connection in connections:
-                definition, ext = connection.msgdef, connection.ext
+                definition = connection.msgdef
+                ext = connection.ext
                 encoding = encodings.get(definition.format, "ros2msg")
                 yield Schema(id=connection.id, data=definition.data.encode(), encoding=encoding, name=connection.msgtype)
                 serialised = str(getattr(ext, "serialization_format", "cdr"))
@@ -249,7 +251,8 @@ class SqliteScan:
             for connection, log_ns, data in reader.messages(connections):
                 yield connection.id, log_ns, bytes(data)
         except Exception:  # as above: what was read so far stays
-            self.damaged, self.complete = self.damaged + 1, False
+            self.damaged = self.damaged + 1
+            self.complete = False
         finally:
             reader.close()
 

@@ -69,7 +69,8 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
     begins_stamped = {topic: begins_with_stamp(_definition(message)) for topic, message in known.items()}
     votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE and stamp_of(message.data)]
     lockstep = 2 * sum(votes) > len(votes)
-    messages, now_ns = [], 0
+    messages = []
+    now_ns = 0
     for message in stored:
         # A stamp on the second time scale, or an unset stamp, gives no due time. The message is sent unchanged.
         stamped = begins_stamped[message.topic] and _is_flight_time(message) is lockstep
@@ -129,7 +130,8 @@ def _start_ns(stored: Iterable[StoredMessage], otherwise: int) -> int:
     first: dict[str, StoredMessage] = {}
     for message in stored:
         first.setdefault(message.topic.rpartition("/")[2], message)
-    truth, y_m = first.get("truth"), first.get("y_m")
+    truth = first.get("truth")
+    y_m = first.get("y_m")
     otherwise = otherwise if y_m is None else stamp_of(y_m.data)
     decode = None if truth is None else decoder(truth.type_name)
     if truth is None or decode is None:

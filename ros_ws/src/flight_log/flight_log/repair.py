@@ -63,7 +63,8 @@ def repair(run: Path) -> Repair:
     for file in files:
         require_mcap(file)
     previous: Mapping[str, Any] = {}
-    end_ns, missing = 0, list[str]()
+    end_ns = 0
+    missing = list[str]()
     if not is_file(run):
         previous, end_ns = _previous_metadata(run / METADATA)
         missing = missing_parts(files, previous)

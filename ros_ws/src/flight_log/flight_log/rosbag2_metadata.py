@@ -93,7 +93,8 @@ def read_bag_metadata(run: Path) -> tuple[dict[str, Any], int]:
     tree = read_yaml(run / METADATA, METADATA, "that of rosbag2")
     try:
         information: dict[str, Any] = dict(tree[INFORMATION])
-        start, duration = information["starting_time"]["nanoseconds_since_epoch"], information["duration"]["nanoseconds"]
+        start = information["starting_time"]["nanoseconds_since_epoch"]
+        duration = information["duration"]["nanoseconds"]
         end_ns = int(start) + int(duration)
     except (KeyError, OverflowError, TypeError, ValueError):
         raise ParameterError(f"{METADATA}: found something else, expected that of rosbag2") from None

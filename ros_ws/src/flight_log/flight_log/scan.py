@@ -167,7 +167,8 @@ class Scan:
         if position < len(MCAP0_MAGIC):
             return []
         stream.seek(position)
-        footer, magic = stream.read(FOOTER.size), stream.read()
+        footer = stream.read(FOOTER.size)
+        magic = stream.read()
         opcode, _, start, _, crc = FOOTER.unpack(footer)
         self.complete = magic == MCAP0_MAGIC and opcode == Opcode.FOOTER and start <= position
         if not self.complete or start == 0:
@@ -249,7 +250,8 @@ def _joined(parts: Iterator[Part], most: int) -> Iterator[Sequence[Part]]:
         more = CHUNK.unpack_from(part.content)[2] if is_chunk else 0
         if chunks and (not is_chunk or size + more > most):
             yield chunks
-            chunks, size = [], 0
+            chunks = []
+            size = 0
         if is_chunk:
             chunks.append(part)
             size += more
@@ -376,11 +378,13 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
     lengths = heads["length"][places]
     if np.any(heads["opcode"][places] != Opcode.MESSAGE) or np.any((lengths < MESSAGE.size) | (lengths > len(data))):
         raise McapError("a message index without its message")
-    starts, ends = np.append(places, len(data)), np.append(0, places + RECORD.size + lengths)
+    starts = np.append(places, len(data))
+    ends = np.append(0, places + RECORD.size + lengths)
     others: list[McapRecord] = []
     found: list[int] = []
     for gap in np.flatnonzero(starts != ends):
-        position, stop = int(ends[gap]), int(starts[gap])
+        position = int(ends[gap])
+        stop = int(starts[gap])
         while position != stop:
             opcode, length = RECORD.unpack_from(data, position)
             begin = position + RECORD.size
@@ -420,7 +424,8 @@ def decompress(chunk: bytes) -> bytes:
     """The bytes of the records in the content of a chunk, limited to the stated size. Raises DECODE_ERRORS."""
     _, _, size, crc, name_length = CHUNK.unpack_from(chunk)
     (length,), start = LENGTH.unpack_from(chunk, CHUNK.size + name_length), CHUNK.size + name_length + LENGTH.size
-    compression, compressed = chunk[CHUNK.size : CHUNK.size + name_length], memoryview(chunk)[start : start + length]
+    compression = chunk[CHUNK.size : CHUNK.size + name_length]
+    compressed = memoryview(chunk)[start : start + length]
     if len(compressed) != length:
         raise McapError("a chunk longer than its record")
     if size > max(MAX_CHUNK_BYTES, len(compressed)):

@@ -96,7 +96,8 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
     """A message of PARAMETER_EVENTS with changes by dotted name, the inverse of `parameter_changes`; None deletes one."""
     store = typestore()
     types = {name: store.types[f"rcl_interfaces/msg/{name}"] for name in ("ParameterEvent", "Parameter", "ParameterValue")}
-    texts, empty = (bool, int, float, str), np.zeros(0)
+    texts = (bool, int, float, str)
+    empty = np.zeros(0)
 
     def parameter(name: str, value: Any) -> Any:
         array = isinstance(value, (list, tuple))
@@ -116,6 +117,7 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
 def parameter_value(message: Any) -> Any:
     """The value in a rcl_interfaces/msg/ParameterValue; None for an unset value."""
     # After the field "type" of rcl_interfaces/msg/ParameterValue there is one field for each type, in their order from 1 on.
-    kind, names = message.type, [field.name for field in fields(message)]
+    kind = message.type
+    names = [field.name for field in fields(message)]
     value: Any = getattr(message, names[kind]) if 0 < kind < len(names) else None
     return value.tolist() if hasattr(value, "tolist") else value

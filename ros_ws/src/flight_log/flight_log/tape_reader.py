@@ -92,7 +92,8 @@ class RecordedRun(NamedTuple):
         """Raise ParameterError with the topics of the log where a topic of a flight has no sample, or every topic."""
         missing = [name for name in names if name not in self.tape]
         if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):
-            where, has = "the log" if self.path is None else str(self.path), listed(self.topics)
+            where = "the log" if self.path is None else str(self.path)
+            has = listed(self.topics)
             found = f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
             raise ParameterError(f"{where}: found {found}, expected {A_FLIGHT}")
 
@@ -156,7 +157,8 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    stored, ages = given or log.scenario, age_of_u(log.diagnostics, aircraft)
+    stored = given or log.scenario
+    ages = age_of_u(log.diagnostics, aircraft)
     return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
 
 
@@ -208,12 +210,15 @@ class _TopicSamples:
     """Samples of a topic, decoded in batches. The samples with equal names are the signal."""
 
     def __init__(self, decode: Decoder, expected: int) -> None:
-        self._decode, self._expected = decode, expected
+        self._decode = decode
+        self._expected = expected
         self._batch: list[tuple[Table, NDArray[np.int64]]] = []  # of one length, and their log times
         self._batched = 0  # messages
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
-        self._numbered, self._restarted, self._lost = False, False, 0
+        self._numbered = False
+        self._restarted = False
+        self._lost = 0
         self._unset = 0  # samples with a zero stamp that `signal` left out
         self._samples: dict[tuple[str, ...], Columns] = {}  # by names
         self.spans: dict[str, Span] = {}  # by publisher
@@ -222,7 +227,8 @@ class _TopicSamples:
     def add(self, table: Table, log_ns: NDArray[np.int64], sequence: NDArray[np.int64]) -> None:
         steps = np.diff(sequence, prepend=sequence[:1] if self._number is None else self._number)
         self._lost += int((steps[steps > 1] - 1).sum())
-        self._numbered, self._number = self._numbered or bool(sequence.any()), int(sequence[-1])
+        self._numbered = self._numbered or bool(sequence.any())
+        self._number = int(sequence[-1])
         self._restarted = self._restarted or bool(np.any(steps < 0))  # another publisher, or a restarted one
         alike = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not alike:
@@ -234,11 +240,13 @@ class _TopicSamples:
         if not self._batch:
             return
         table, log_ns = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
-        self._batch, self._batched = [], 0
+        self._batch = []
+        self._batched = 0
         if table.shape[1] >= STAMP.stop:
             keep, count = self._clock.usable(stamps_of(table), log_ns, more=more, end=end)
             if count < len(table):
-                self._batch, self._batched = [(table[count:], log_ns[count:])], len(table) - count
+                self._batch = [(table[count:], log_ns[count:])]
+                self._batched = len(table) - count
             table = table[:count] if keep.all() else table[:count][keep]
         if not len(table):
             return
@@ -280,7 +288,8 @@ class _TopicSamples:
         signal = self._samples[names].signal(tuple(map(printable, names)))
         stamps = signal.stamp_ns
         zero = stamps == 0
-        zeros, usual = int(np.count_nonzero(zero)), len(stamps) - 1 if name in RESTING else 1
+        zeros = int(np.count_nonzero(zero))
+        usual = len(stamps) - 1 if name in RESTING else 1
         if zeros > usual:  # a recorder may take each message twice
             usual = int(np.unique(stamps[~zero], return_counts=True)[1].max(initial=usual))
         if name not in UNSTAMPED and zeros and (zeros > max(usual, 1) or stamps.max() > SINCE_EPOCH_NS):
@@ -443,7 +452,8 @@ def _read_file(file: Path, log: _Log) -> None:
                 elif isinstance(record, Schema):
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
-                    expected, type_name = scan.message_counts.get(record.id, 0), schemas.get(record.schema_id, "")
+                    expected = scan.message_counts.get(record.id, 0)
+                    type_name = schemas.get(record.schema_id, "")
                     is_cdr = record.message_encoding == "cdr"
                     log.kinds.setdefault(record.topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}")
                     if is_cdr and (take := log.reader_of(record.topic, full_name(type_name), expected)) is not None:

@@ -93,7 +93,8 @@ class TapeWriter:
         channels = [self._channels[topic] for topic in signals]
         counts = [len(signal.stamp_ns) for signal in signals.values()]
         stamps = np.concatenate([signal.stamp_ns for signal in signals.values()])
-        columns, indexes = np.repeat(np.arange(len(counts)), counts), np.concatenate([np.arange(count) for count in counts])
+        columns = np.repeat(np.arange(len(counts)), counts)
+        indexes = np.concatenate([np.arange(count) for count in counts])
         order = np.argsort(stamps, kind="stable")
         for stamp_ns, column, index in zip(*(values[order].tolist() for values in (stamps, columns, indexes)), strict=True):
             channel = channels[column]

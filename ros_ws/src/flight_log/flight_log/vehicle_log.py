@@ -28,7 +28,9 @@ from flight_log.file_kinds import file_kind
 
 DEGREE = math.pi / 180.0
 AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1, common.xml
-STICKS, SERVOS = 16, 16  # channels that are read
+# channels that are read
+STICKS = 16
+SERVOS = 16
 LARGEST = 2**62  # ns, of a damaged stamp
 ULOG_HEAD = 16  # bytes: magic, version and time
 
@@ -161,7 +163,8 @@ ULOG_TORQUES: Mapping[tuple[str, str], Source] = MappingProxyType(
 )
 """Where PX4 before 1.14 has the setpoints of torque and thrust (actuator_controls.msg: roll, pitch, yaw, thrust)."""
 
-PLANE, COPTER = "plane", "multicopter"
+PLANE = "plane"
+COPTER = "multicopter"
 FIRMWARE = re.compile(r"(?:Ardu|APM:)(Plane|Copter|Rover|Sub)")  # in a MSG of ArduPilot
 FIRMWARES = MappingProxyType({"Plane": PLANE, "Copter": COPTER, "Rover": "rover", "Sub": "submarine"})
 MAV_TYPES: Mapping[int, str] = MappingProxyType(
@@ -172,8 +175,11 @@ MAV_TYPES: Mapping[int, str] = MappingProxyType(
 )
 """Kinds of vehicles by MAV_TYPE, common.xml."""
 
-PX4, PX4_MANUAL = 12, 1 << 16  # MAV_AUTOPILOT_PX4, and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
-STEP_NS, LOST_NS = NANOSECONDS, 60 * NANOSECONDS  # an autopilot that goes back by a step has started again; a link may be lost
+PX4 = 12  # MAV_AUTOPILOT_PX4
+PX4_MANUAL = 1 << 16  # and its custom_mode with the main mode MANUAL (px4_custom_mode.h)
+# an autopilot that goes back by a step has started again; a link may be lost
+STEP_NS = NANOSECONDS
+LOST_NS = 60 * NANOSECONDS
 AGREEING = 5  # samples, after which another time is that of the clock
 
 
@@ -322,7 +328,8 @@ def _read_tlog(path: Path, kind: str) -> VehicleLog:
     first, *others = map(str, autopilots) if autopilots else ("none",)
     left_out = f", system {first} alone; it also has {', '.join(others)}" if others else ""
     autopilot, mav_type = next(iter(autopilots.values()), (0, 1))
-    vehicle, manual = MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}"), PX4_MANUAL if autopilot == PX4 else 0
+    vehicle = MAV_TYPES.get(mav_type, f"vehicle of MAV_TYPE {mav_type}")
+    manual = PX4_MANUAL if autopilot == PX4 else 0
     return VehicleLog(kind + left_out + parts, tables, parameters, TLOG, vehicle, manual)
 
 
@@ -387,7 +394,8 @@ def _tables(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tuple[
     stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it. A parameter belongs
     to the part of the next sample: an autopilot that starts writes its parameters first.
     """
-    parts, newest_ns = [list[Sample]()], 0
+    parts = [list[Sample]()]
+    newest_ns = 0
     apart: list[Sample] = []  # the samples before, near each other and not near those of the part
     settings = [list[Sample]()]  # by part
     next_settings: list[Sample] = []
@@ -397,7 +405,8 @@ def _tables(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tuple[
             continue
         if parts[-1] and abs(sample[1] - newest_ns) <= STEP_NS:
             parts[-1].append(sample)
-            newest_ns, apart = max(newest_ns, sample[1]), []
+            newest_ns = max(newest_ns, sample[1])
+            apart = []
         else:
             apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
             if len(apart) < AGREEING:
@@ -485,7 +494,8 @@ def read_foreign_log(path: Path) -> VehicleLog:
     """`read_vehicle_log` in an isolated process: a log of a few bytes may claim billions of values. Raises ParameterError."""
     require(path.is_file(), str(path), "no such file", EXPECTED)
     size = path.stat().st_size
-    timeout, memory = LIMITS[0] + LIMITS[1] * size / 1e6, MEMORY[0] + MEMORY[1] * size
+    timeout = LIMITS[0] + LIMITS[1] * size / 1e6
+    memory = MEMORY[0] + MEMORY[1] * size
     try:
         return isolated.call(_read_absolute, str(path.absolute()), timeout=timeout, memory=memory)
     except isolated.IsolatedCallError as error:

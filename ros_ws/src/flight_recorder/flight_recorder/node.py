@@ -56,7 +56,9 @@ LOOP = (Y, Y_M, U)  # every flight has these topics
 SILENCE_NS = 3 * NANOSECONDS  # a killed controller is back within 1 s
 
 STEADY = (Y, Y_M, U, INTERNALS, TRUTH, POSE)  # topics that no mode of a flight stops while the publisher runs
-STEADY_MESSAGES, STEADY_INTERVAL_NS = 20, NANOSECONDS // 5  # a topic is steady after so many messages at such intervals
+# a topic is steady after so many messages at such intervals
+STEADY_MESSAGES = 20
+STEADY_INTERVAL_NS = NANOSECONDS // 5
 TOPIC_SILENCE_NS = NANOSECONDS
 
 DRAIN_NS = 10 * NANOSECONDS  # at most, at the end, for the messages that were sent before
@@ -113,7 +115,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._ended = ""  # the reason why recording ended
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
-        self._heard, self._heard_ns = 0, time.monotonic_ns()  # messages of LOOP, and when the last message arrived
+        self._heard = 0  # messages of LOOP
+        self._heard_ns = time.monotonic_ns()  # and when the last message arrived
         self.get_logger().info(bounded(f"recording to {self._bag.path}"))
 
     def _full_name(self, name: str) -> str:
@@ -144,7 +147,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _space_shortage(self, directory: Path) -> str:
         """The sentence about too little free space; empty with enough."""
-        free, least = free_bytes(directory) / MEGABYTE, self.parameters.min_free
+        free = free_bytes(directory) / MEGABYTE
+        least = self.parameters.min_free
         return "" if free >= least else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
 
     def _poll(self, topic: Topic, qos: QoSProfile) -> PolledSubscription:
@@ -215,12 +219,16 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _hear(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         """Note the time of the newest message of a topic."""
-        now_ns, last = time.monotonic_ns(), received[-1]
-        topic.first_ns, topic.heard_ns, topic.sent_ns = topic.first_ns or now_ns, now_ns, last.sent_ns
+        now_ns = time.monotonic_ns()
+        last = received[-1]
+        topic.first_ns = topic.first_ns or now_ns
+        topic.heard_ns = now_ns
+        topic.sent_ns = last.sent_ns
         if topic.subscription.topic in LOOP:
             topic.stamp_ns = stamp_of(last.message)
         if topic.silent_ns:
-            silent_ns, topic.silent_ns = now_ns - topic.silent_ns, 0
+            silent_ns = now_ns - topic.silent_ns
+            topic.silent_ns = 0
             self.silent[topic.name] += silent_ns
             self.get_logger().info(f"{topic.name}: received again after {silent_ns / NANOSECONDS:.1f} s")
 
@@ -231,7 +239,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
             self._publish_recorded(instant(min(stamps)))
 
     def _append(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
-        write, channel = self._bag.write, topic.channel
+        write = self._bag.write
+        channel = topic.channel
         # The sequences of several publishers interleave: a gap between publishers is no loss. Foreign topics name no publisher.
         counted = not topic.foreign and not topic.shared
         for message, sent_ns, received_ns, sequence in received:
@@ -329,7 +338,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         """
         heard = sum(topic.channel.messages for topic in self._topics if topic.subscription.topic in LOOP)
         if heard != self._heard:
-            self._heard, self._heard_ns = heard, now_ns
+            self._heard = heard
+            self._heard_ns = now_ns
         elif heard and now_ns - self._heard_ns > SILENCE_NS:
             self._heard_ns = sys.maxsize
             self.get_logger().warning(
@@ -376,7 +386,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
         """Subscribe again with a weaker QoS when a new publisher offers less than is requested."""
-        subscription, offered = topic.subscription, self._offered(topic.name, topic.channel.type.name)
+        subscription = topic.subscription
+        offered = self._offered(topic.name, topic.channel.type.name)
         if all(qos_check_compatible(profile, subscription.qos)[0] != QoSCompatibility.ERROR for profile in offered):
             return
         # Volatile, because the transient-local samples have been recorded already.
@@ -404,7 +415,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _drain(self) -> None:
         """Write the messages that were sent before the end: this process may be seconds behind on a busy host."""
-        end_ns, sent_ns = time.monotonic_ns(), time.time_ns()
+        end_ns = time.monotonic_ns()
+        sent_ns = time.time_ns()
         heard_ns = end_ns
         self._drain_subscriptions()
         while (now_ns := time.monotonic_ns()) - end_ns < DRAIN_NS and now_ns - heard_ns < QUIET_NS:

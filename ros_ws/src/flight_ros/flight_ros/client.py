@@ -46,9 +46,11 @@ class Client:
                 self._shut_down()
                 key = "--namespace" if isinstance(error, NameValidationException) else "ROS 2"
                 raise ParameterError(f"{key}: {' '.join(str(error).split())}") from None
-            self._node, self._cancelled = node, threading.Event()
+            self._node = node
+            self._cancelled = threading.Event()
         else:
-            self._node, self._cancelled = parent._node, parent._cancelled
+            self._node = parent._node
+            self._cancelled = parent._cancelled
 
     def __enter__(self) -> Self:
         return self

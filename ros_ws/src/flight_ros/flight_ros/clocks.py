@@ -85,10 +85,12 @@ class PeerClocks:
     """Measures the clocks of the other nodes over `clocks`."""
 
     def __init__(self, node: Node, instance: str) -> None:
-        self._peers, self._instance = Peers(instance), instance
+        self._peers = Peers(instance)
+        self._instance = instance
         self._told: dict[str, float] = {}
         self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, NEWEST_SAMPLES).publish
-        self._subscription, self._decoder = PolledSubscription(node, CLOCKS, NEWEST_SAMPLES, raw=True), NamedDecoder()
+        self._subscription = PolledSubscription(node, CLOCKS, NEWEST_SAMPLES, raw=True)
+        self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
         """Take what the others have sent, and send; once a second. `ahead_ns`: the system clock less the time of the node."""

@@ -43,7 +43,8 @@ class EndpointMonitor:
     """Logs an error for each peer of a node that does not match: the topic would stay silent."""
 
     def __init__(self, node: Node) -> None:
-        self._node, self._throttle = node, Throttle(LOG_PERIOD_NS)
+        self._node = node
+        self._throttle = Throttle(LOG_PERIOD_NS)
 
     def check_publishers(self, topic: str, message_type: str, qos: QoSProfile | None = None) -> None:
         """Log an error for each publisher of a topic that does not match a subscription of this type and QoS."""

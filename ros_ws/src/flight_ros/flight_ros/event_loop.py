@@ -27,7 +27,9 @@ from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, dest
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
-BAD_PARAMETERS, ENDED_EARLY = 2, 3  # exit statuses
+# exit statuses
+BAD_PARAMETERS = 2
+ENDED_EARLY = 3
 
 PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
 
@@ -135,7 +137,8 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     while not stop.requested:
         advanced = [node.advance() for node in nodes]  # each of them, without a short circuit
         if any(advanced):
-            began, advance_ns = True, now_ns
+            began = True
+            advance_ns = now_ns
         elif not wait_set.wait(nanoseconds(IDLE_POLL_PERIOD)):
             serve_ns = 0  # no message: check the liveliness of the peers now
         now_ns = time.monotonic_ns()
@@ -178,7 +181,8 @@ class RealTime:
             raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
         begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
         node.time_offset_ns = start_ns - begin_ns
-        self.node, self._start_ns = node, start_ns
+        self.node = node
+        self._start_ns = start_ns
         self.ticker = Ticker(node.period_ns(), begin_ns, spin=spin)
         if (lead := start_ns - time.time_ns()) > nanoseconds(60):
             node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")

@@ -140,7 +140,8 @@ class FlightNode(Node, Generic[P]):
 
     def next_period_ns(self) -> int:
         """The next whole period of the system clock, ns."""
-        now_ns, period_ns = time.time_ns(), self.period_ns()
+        now_ns = time.time_ns()
+        period_ns = self.period_ns()
         return now_ns - now_ns % period_ns + period_ns
 
     def advertise(self, topic: Topic) -> Callable[[bytes], None]:
@@ -226,7 +227,8 @@ class FlightNode(Node, Generic[P]):
     def _change_parameters(self, changes: list[Parameter]) -> SetParametersResult:
         """Accept a change of tunable parameters as a whole, or reject it with a sentence and change nothing."""
         if self._adopted is not None:
-            self.parameters, self._adopted = self._adopted, None
+            self.parameters = self._adopted
+            self._adopted = None
             return SetParametersResult(successful=True)
         try:
             sim_time = any(change.name == SIM_TIME and change.value for change in changes)
@@ -321,7 +323,8 @@ class FlightNode(Node, Generic[P]):
         """Publish the 1 Hz report: loop period, compute time, missed ticks (overruns), rejected samples and more."""
         level, sentence, further = self.status()
         if conflict := self.refusals.conflict():
-            level, sentence = DiagnosticStatus.ERROR, conflict
+            level = DiagnosticStatus.ERROR
+            sentence = conflict
         refused = {f"refused {reason}": count for reason, count in self.refusals.counts.items()}
         clocks = {} if self.clocks is None else self.clocks.report()
         report: dict[str, object] = {**self._tick_times.report(), **refused, **further, **clocks}

@@ -82,4 +82,5 @@ class LivelinessMonitor:
         if event.current_count > 0:
             self._left = "" if self._left == role else self._left
         elif event.current_count_change < 0 and not self._left:
-            self._left, self._left_ns = role, time.monotonic_ns()
+            self._left = role
+            self._left_ns = time.monotonic_ns()

@@ -31,8 +31,10 @@ class LockstepInputs:
     ) -> None:
         """`is_ready` tells of an instant of a step whether what else the step needs has arrived."""
         self._is_ready = is_ready
-        self._y_period_ns, self._period_ns = y_period_ns, period_ns
-        self._receive_y, self._receive_other = receive_y, receive_other
+        self._y_period_ns = y_period_ns
+        self._period_ns = period_ns
+        self._receive_y = receive_y
+        self._receive_other = receive_other
         self._number = 0  # of the next y
         self._y_due: deque[StampedVector | None] = deque()
         self._others_due: deque[StampedVector] = deque()

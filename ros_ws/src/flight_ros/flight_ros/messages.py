@@ -127,7 +127,8 @@ class Decoder:
         stamp = message.header.stamp
         if encoder.encode(stamp.sec * NANOSECONDS + stamp.nanosec, np.array(message.position)) != raw:
             return  # more than a named vector: the middleware decodes it each time
-        self._names, self._place = list(message.name), encoder.place
+        self._names = list(message.name)
+        self._place = encoder.place
         self._sender = message.header.frame_id
         self._order = [self._names.index(name) for name in self._wanted]
         self._fixed = self._fixed_part(raw)
@@ -147,7 +148,8 @@ class NamedDecoder:
     def decode(self, raw: bytes) -> NamedSample:
         """The sample. Raises ChannelError for an invalid message."""
         message = _message(raw)
-        sample, names = from_message(message, message.name), list(message.name)
+        sample = from_message(message, message.name)
+        names = list(message.name)
         if len(set(names)) < len(names):
             raise ChannelError("name", f"each channel expected once among {', '.join(names)}")
         return NamedSample(sample.stamp_ns, dict(zip(names, sample.value.tolist(), strict=True)), sample.sender)

@@ -13,7 +13,8 @@ PEER_RANGE = 20  # participants of each host that are found
 ANNOUNCEMENT_NS = 500_000_000
 """A participant announces itself to each of the PEER_RANGE places of each host. At the 0.1 s of the loopback profile five nodes
 would send 1000 packets a second to each host."""
-FIRST_PORT, PORTS_A_DOMAIN = 7400, 250  # DDSI-RTPS 2.3, section 9.6.1.1
+FIRST_PORT = 7400  # DDSI-RTPS 2.3
+PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
 
 def addresses(text: str) -> tuple[str, ...]:

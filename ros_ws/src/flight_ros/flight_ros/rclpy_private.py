@@ -36,7 +36,9 @@ def destroy_participant(participant: Participant) -> None:
 
 def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any]]:
     """At most `limit` messages (or their bytes) with their metadata, oldest first, without an executor."""
-    handle, kind, raw = subscription.handle, subscription.msg_type, subscription.raw
+    handle = subscription.handle
+    kind = subscription.msg_type
+    raw = subscription.raw
     taken = []
     with handle:
         for _ in range(limit):

@@ -84,7 +84,8 @@ class Refusals:
 
     def conflict(self) -> str:
         """The last sample of a conflicting publisher since the last call, as a sentence; empty without a conflict."""
-        sentence, self._conflict = self._conflict, ""
+        sentence = self._conflict
+        self._conflict = ""
         return sentence
 
 
@@ -110,10 +111,14 @@ class Receiver(Generic[S]):
         lock: PublisherLock | None = None,
         max_size: int | None = None,
     ) -> None:
-        self.subscription, self.lock = subscription, lock
-        self._max_size, self._grows = max_size or MAX_SIZE, max_size is not None
+        self.subscription = subscription
+        self.lock = lock
+        self._max_size = max_size or MAX_SIZE
+        self._grows = max_size is not None
         self._longest = 0  # bytes, of the valid messages
-        self._refusals, self._decode, self._take = refusals, decode, take
+        self._refusals = refusals
+        self._decode = decode
+        self._take = take
         self._max_age_ns = max_age_ns
 
     @property

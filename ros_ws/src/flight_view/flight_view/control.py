@@ -29,7 +29,8 @@ from rise_di_controller.params import ControllerConfig
 
 RANGE = (0.5, 2.0)  # of a gain in the scenario: what the page may set
 LEASE = 5.0  # s that a page controls after its last request
-RATE, BURST = 5.0, 10.0  # requests a second, and at once
+RATE = 5.0  # requests a second
+BURST = 10.0  # and at once
 KEY_PERIOD = 1.0  # s between two wrong keys
 MAX_WAYPOINTS = 200
 GUIDED = ("hold", "skip", "resume", "home")  # services of guidance without arguments
@@ -89,7 +90,8 @@ class RefusedError(Exception):
 
     def __init__(self, status: HTTPStatus, sentence: str) -> None:
         super().__init__(sentence)
-        self.status, self.sentence = status, sentence
+        self.status = status
+        self.sentence = sentence
 
 
 @contextmanager
@@ -120,10 +122,19 @@ class Control:
         assess: Assess | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._flight, self._link, self._key, self._real, self._assess, self._now = flight, link, key, real, assess, now
-        self._worker, self._assessor = ThreadPoolExecutor(max_workers=1), ThreadPoolExecutor(max_workers=1)
-        self._lease, self._lease_end = "", -math.inf
-        self._wrong_key, self._requests, self._refilled = -math.inf, BURST, now()
+        self._flight = flight
+        self._link = link
+        self._key = key
+        self._real = real
+        self._assess = assess
+        self._now = now
+        self._worker = ThreadPoolExecutor(max_workers=1)
+        self._assessor = ThreadPoolExecutor(max_workers=1)
+        self._lease = ""
+        self._lease_end = -math.inf
+        self._wrong_key = -math.inf
+        self._requests = BURST
+        self._refilled = now()
         self._cancellations = 0
         self._undo: list[dict[str, Any]] = []  # earlier values, the last change at the end
         self._digest = 0  # of the controller's parameters, as far as known
@@ -234,7 +245,8 @@ class Control:
 
     def state(self) -> dict[str, Any]:
         """State for the page: lease, nodes, gains with their ranges, digests, faults, the bridge."""
-        nodes, scenario = self._link.nodes(), self._flight.scenario
+        nodes = self._link.nodes()
+        scenario = self._flight.scenario
         shown: dict[str, Any] = {"lease": self._lease, "nodes": nodes, "undo": len(self._undo), "targets": list(TARGETS)}
         known = scenario is not None and self._digest and "controller" in nodes  # the digest is that of a refresh
         if scenario is not None and known and gains_of(scenario.controller):
@@ -267,7 +279,8 @@ class Control:
     def _refresh(self, request: Mapping[str, Any]) -> str:
         """Read the faults; at first, and where the digest in the log differs, also the controller's parameters."""
         stale = not self._digest or self._flight.digest not in {0, self._digest}  # 0 before the first tick
-        scenario, nodes = self._flight.scenario, self._link.nodes()
+        scenario = self._flight.scenario
+        nodes = self._link.nodes()
         if scenario is not None and "controller" in nodes and stale:
             self._read()
         if scenario is not None and "aircraft" in nodes:
@@ -286,7 +299,9 @@ class Control:
         return type(base).validate_mapping(nest(content), "controller")
 
     def _set_gains(self, request: Mapping[str, Any]) -> str:
-        values, gains, chosen = _mapping(request, "values"), gains_of(self._controller()), {}
+        values = _mapping(request, "values")
+        gains = gains_of(self._controller())
+        chosen = {}
         for name, value in values.items():
             if name not in gains:
                 raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no gain, expected one of {', '.join(gains)}")
@@ -314,7 +329,8 @@ class Control:
         digest = self._with({**self._values, **values}).digest()
         if refusal := self._link.set_parameters("controller", values):
             return refusal
-        self._values, self._digest = {**self._values, **values}, digest
+        self._values = {**self._values, **values}
+        self._digest = digest
         if undo:
             self._undo.append(before)
         return ""
@@ -323,7 +339,8 @@ class Control:
         """Margins of the gains in flight with some changed."""
         if self._assess is None or self._flight.scenario is None:
             return {}
-        values, gains = _mapping(request, "values"), gains_of(self._controller())
+        values = _mapping(request, "values")
+        gains = gains_of(self._controller())
         chosen = {name: _like(name, gains[name], value) for name, value in values.items() if name in gains}
         with _refusing():
             return self._assess(self._flight.scenario, self._with(self._values | chosen))
@@ -351,7 +368,8 @@ class Control:
     def _set_faults(self, request: Mapping[str, Any]) -> str:
         if self._flight.scenario is None:
             return "the log has no scenario"
-        known, values = _faults_of(self._flight.scenario), _mapping(request, "values")
+        known = _faults_of(self._flight.scenario)
+        values = _mapping(request, "values")
         for name in values:
             if name not in known:
                 raise RefusedError(HTTPStatus.BAD_REQUEST, f"{short_repr(name)}: no fault, expected one of {', '.join(known)}")
@@ -433,7 +451,8 @@ def _require_range(name: str, value: Any, base: Any) -> None:
 
 def _like(name: str, base: Any, value: Any) -> Any:
     """A value as a float or a list, by the type of the parameter."""
-    values, expected = _as_list(_numbers(name, value)), len(_as_list(base))
+    values = _as_list(_numbers(name, value))
+    expected = len(_as_list(base))
     if len(values) != expected:
         raise RefusedError(HTTPStatus.BAD_REQUEST, f"{name}: found {len(values)} values, expected {expected}")
     return values if isinstance(base, tuple) else values[0]

@@ -72,13 +72,20 @@ GROUPS = {
 }
 """Channels and groups of channels that are kept; of the other topics all."""
 
-LOG, LOG_TYPE, WARN = "/rosout", "rcl_interfaces/msg/Log", 30  # rcl_interfaces/msg/Log: WARN=30
+# rcl_interfaces/msg/Log: WARN=30
+LOG = "/rosout"
+LOG_TYPE = "rcl_interfaces/msg/Log"
+WARN = 30
 CONTROL = "control"  # name of the node that carries out the requests of a page
 SHARED = (LOG, PARAMETER_EVENTS)  # topics of all aircraft
 POSE = "pose"
-ROUTE, ROUTE_TYPE = "route", "nav_msgs/msg/Path"
+ROUTE = "route"
+ROUTE_TYPE = "nav_msgs/msg/Path"
 LIVE_BACKLOG = 200_000  # bytes of the log, about 1 s, that a busy host may leave unread: above it the state is "reading"
-MAX_EVENTS, MAX_NOTES, MAX_CHANNELS, MAX_SPANS = 5000, 50, 200, 200
+MAX_EVENTS = 5000
+MAX_NOTES = 50
+MAX_CHANNELS = 200
+MAX_SPANS = 200
 BATCH = 2000  # messages that are decoded together
 MAX_TEXT = 400  # characters of a text from the log
 MAX_VALUES = 16  # of a parameter: one a channel, not a matrix
@@ -233,7 +240,9 @@ class Flight:
 
         Raises ParameterError where the log cannot be read, or for a folder with several bags.
         """
-        deadline, news, self._behind = time.monotonic() + budget, False, False
+        deadline = time.monotonic() + budget
+        news = False
+        self._behind = False
         try:
             for record in self._follower.read():
                 news = True
@@ -337,7 +346,8 @@ class Flight:
 
     def _decode(self, topic: _Topic) -> None:
         """Decode the messages read of a topic together: single messages are slow."""
-        messages, topic.messages = topic.messages, []
+        messages = topic.messages
+        topic.messages = []
         for decoded in map(topic.decode, tables(messages)):
             self._unreadable += decoded.unreadable
             for samples in decoded.samples:
@@ -355,7 +365,8 @@ class Flight:
             chosen = [i for i, name in enumerate(names) if kept is None or name in kept or name.partition(".")[0] in kept]
             if len(chosen) > MAX_CHANNELS:
                 self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
-            topic.names, topic.columns = names, np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
+            topic.names = names
+            topic.columns = np.array(chosen[:MAX_CHANNELS], dtype=np.intp)
             narrower = self.samples.get(topic.name)
             samples = self.samples[topic.name] = Series(tuple(_text(names[i]) for i in topic.columns))
             samples.thinned = 0 if narrower is None else narrower.thinned + 1  # pages read the topic again
@@ -388,10 +399,13 @@ class Flight:
 
     def _take_errors(self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray) -> None:
         """Sum the squares of e in the engaged ticks under each set of parameters."""
-        flown, engaged = values[:, names.index("parameters")], values[:, names.index("mode")] == Mode.ENGAGED
+        flown = values[:, names.index("parameters")]
+        engaged = values[:, names.index("mode")] == Mode.ENGAGED
         errors = {_text(name[2:]): values[:, k] for k, name in enumerate(names[:MAX_CHANNELS]) if name.startswith("e.")}
         for rows in np.split(np.arange(len(flown)), np.flatnonzero(np.diff(flown)) + 1):
-            digest, start_ns, stop_ns = float(flown[rows[0]]), int(stamp_ns[rows[0]]), int(stamp_ns[rows[-1]])
+            digest = float(flown[rows[0]])
+            start_ns = int(stamp_ns[rows[0]])
+            stop_ns = int(stamp_ns[rows[-1]])
             counted = rows[engaged[rows]]
             squares = {name: float(np.sum(e[counted] ** 2)) for name, e in errors.items()}
             span = _Flown(digest, start_ns, stop_ns, len(counted), squares)
@@ -497,7 +511,8 @@ def _described(scenario: Scenario) -> dict[str, Any]:
 
     Raises ParameterError where the airframe cannot be read.
     """
-    controller, guided = scenario.controller, scenario.guidance
+    controller = scenario.controller
+    guided = scenario.guidance
     limits = controller.effector_limits()
     bounds = zip(controller.effectors, limits.lower.tolist(), limits.upper.tolist(), strict=True)
     waypoints = () if guided is None else guided.waypoints()

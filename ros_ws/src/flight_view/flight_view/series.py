@@ -45,7 +45,8 @@ class Series:
         ordered = np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[1:]
         kept = stamp_ns >= ordered - DISORDER_NS
         self.refused += int(np.count_nonzero(~kept))
-        ordered, values = ordered[kept], values[kept]
+        ordered = ordered[kept]
+        values = values[kept]
         for start in range(0, len(ordered), self._max_rows // 2):
             part = slice(start, start + self._max_rows // 2)
             self._append_part(ordered[part], values[part])
@@ -65,11 +66,13 @@ class Series:
 
     def _thin(self) -> None:
         """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps the peaks."""
-        whole, k = self.count - self.count % 4, len(self.names)
+        whole = self.count - self.count % 4
+        k = len(self.names)
         for start in range(0, whole, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
             groups = self._values[start : min(start + BLOCK, whole)].reshape(-1, 4, k)
             thin = np.stack([np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1).reshape(-1, k)
             self._values[start // 2 : start // 2 + len(thin)] = thin
         half = whole // 2
         self._stamp_ns[:half] = self._stamp_ns[:whole:2].copy()
-        self.count, self.thinned = half, self.thinned + 1
+        self.count = half
+        self.thinned = self.thinned + 1

@@ -60,11 +60,14 @@ MAX_REQUEST_BYTES = 8192
 MAX_WAIT = 2.0  # s that a request for samples waits for new samples
 MAX_ROWS = 10_000  # of a topic in one answer
 MAX_DIGITS = 18  # of a number of rows: below 2^63
-POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013  # status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA
+# status of a closed WebSocket, RFC 6455, 7.4.1, and the registry of IANA
+POLICY_VIOLATION = 1008
+TRY_AGAIN_LATER = 1013
 TOKEN_HEADER = "X-Page-Token"  # noqa: S105 - a name
 NO_TOKEN = "Open the whole address that rise-di watch printed"  # noqa: S105 - a sentence
 FULL = f"{MAX_CONNECTIONS} connections are open"
-REST, POLL_PERIOD = 0.09, 0.03  # s, after a chunk and until the next: the recorder closes a chunk each 0.1 s
+REST = 0.09  # s
+POLL_PERIOD = 0.03  # after a chunk and until the next: the recorder closes a chunk each 0.1 s
 STATE_PERIOD = 0.25  # s, between two looks at the state of the recording
 BUDGET = 0.05  # s of reading between two answers
 
@@ -77,7 +80,8 @@ class Server:
     """
 
     def __init__(self, flights: Sequence[Flight], token: str, control: Control | None = None, *, fleet: bool = False) -> None:
-        self.followed, self.fleet = flights, fleet
+        self.followed = flights
+        self.fleet = fleet
         self.flights: Sequence[Flight | Fleet] = [*flights, Fleet(flights)] if fleet else flights
         self.control = control
         self.token = token
@@ -125,7 +129,8 @@ class Server:
         """Read the logs, and answer the WebSockets, until cancelled. Raises as `Flight.update` does."""
         looked = -math.inf
         while True:
-            changed, rest = [flight.update(BUDGET) for flight in self.followed], POLL_PERIOD
+            changed = [flight.update(BUDGET) for flight in self.followed]
+            rest = POLL_PERIOD
             if any(changed):
                 self._news.set()
                 self._news.clear()
@@ -187,7 +192,8 @@ def answer(
     then the channels as float32, filled up to a multiple of 8 bytes. At most MAX_ROWS rows of a topic.
     """
     first = _first_rows(flight, known)
-    topics, columns = [], []
+    topics = []
+    columns = []
     for name, samples in flight.samples.items():
         rows = slice(first[name], min(samples.count, first[name] + MAX_ROWS))
         t = (samples.stamp_ns[rows] - flight.start_ns) / NANOSECONDS
@@ -285,7 +291,8 @@ class _Handler(RequestHandler):
 
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
         """Send the answer, and close the connection as the class says."""
-        stream, kept = self.stream, self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
+        stream = self.stream
+        kept = self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
         if not kept:
             self.set_header("Connection", "close")
         sent = super().finish(chunk)

@@ -28,7 +28,8 @@ DEFAULT_PORT = 8077
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
     folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True) if is_folder(runs) else []
-    found, prefix = [], f"/{(namespace or '').strip('/')}/".replace("//", "/")
+    found = []
+    prefix = f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
         with suppress(ParameterError, OSError):
             held = any(is_locked(file) for file in bag_files(folder))

@@ -73,7 +73,10 @@ def dead_reckon(live: Live, y_m: FloatArray, period_ns: int, params: LiveParams)
     if live.attitude is None or params.channels is None:
         return live
     at_q, _, at_p, at_r = params.channels
-    p, q, r, dt = float(y_m[at_p]), float(y_m[at_q]), float(y_m[at_r]), seconds(period_ns)
+    p = float(y_m[at_p])
+    q = float(y_m[at_q])
+    r = float(y_m[at_r])
+    dt = seconds(period_ns)
     phi, theta = live.attitude
     phi_dot, theta_dot = euler_rates(phi, theta, p, q, r)
     return live._replace(attitude=(phi + dt * phi_dot, theta + dt * theta_dot))

@@ -41,11 +41,13 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
         self._start_ns = 0  # of the flight; in lockstep t = 0
         self._publish_y_m = self.advertise(Y_M)
         self._encoder = self.encoder(self.parameters.outputs)
-        self._decoder, self._attitude_decoder = Decoder(self.parameters.outputs), Decoder(ATTITUDE)
+        self._decoder = Decoder(self.parameters.outputs)
+        self._attitude_decoder = Decoder(ATTITUDE)
         rate = self.parameters.u_m_rate
         self._u_m_ns = period_ns(rate, "u_m_rate") if rate else 0
         if self.parameters.lockstep:
-            self._number, self._clock_ns = 0, -1
+            self._number = 0
+            self._clock_ns = -1
             self._next: FloatArray | None = None
             self._clock_subscription = self.subscribe(CLOCK)
         if self._u_m_ns or not self.parameters.lockstep:
@@ -106,7 +108,9 @@ class ReferenceModelNode(FlightNode[ReferenceModelConfig]):
             if self._next is None or t_ns > self._clock_ns:
                 return advanced
             self._publish_y_m(self._encoder.encode(t_ns, self._next))
-            self._number, self._next, advanced = self._number + 1, None, True
+            self._number = self._number + 1
+            self._next = None
+            advanced = True
 
     def _commands_known(self) -> bool:
         """Lockstep: whether u_m of the instant before the next sample is here, if there is one; it is taken."""

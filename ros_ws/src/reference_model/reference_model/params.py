@@ -132,7 +132,9 @@ class ReferenceModelConfig(NodeConfig):
             for name in ("natural_frequency", "damping"):
                 parameters.require_length(f"second_order.{name}", getattr(self.second_order, name), self.outputs)
         elif self.linear is not None:
-            key, n, m = "linear.A_m", len(self.linear.states), len(self.outputs)
+            key = "linear.A_m"
+            n = len(self.linear.states)
+            m = len(self.outputs)
             for name, rows, columns in (("A_m", n, n), ("B_m", n, m)):
                 count = len(getattr(self.linear, name))
                 require(count == rows * columns, f"linear.{name}", f"{count} values", f"{rows} rows of {columns}")
@@ -156,7 +158,8 @@ class ReferenceModelConfig(NodeConfig):
             return second_order(np.array(self.second_order.natural_frequency), np.array(self.second_order.damping))
         if self.linear is None:
             raise ParameterError("second_order: found no model, expected second_order or linear")
-        n, m = len(self.linear.states), len(self.outputs)
+        n = len(self.linear.states)
+        m = len(self.outputs)
         C = np.array([[float(state == output) for state in self.linear.states] for output in self.outputs])
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
@@ -165,10 +168,13 @@ class ReferenceModelConfig(NodeConfig):
 
         With a second-order reference of damping 0.9 this gain gives the loop of the angle a damping of about 0.74.
         """
-        section, channels, gain = self.live, None, (0.0, 0.0)
+        section = self.live
+        channels = None
+        gain = (0.0, 0.0)
         if section.speed is not None and self.second_order is not None:
             q, V, p, r = (self.outputs.index(name) for name in RATES_AND_SPEED)
-            channels, frequency = (q, V, p, r), self.second_order.natural_frequency
+            channels = (q, V, p, r)
+            frequency = self.second_order.natural_frequency
             gain = (frequency[p] / 4.0, frequency[q] / 4.0)
         return LiveParams(
             nanoseconds(section.max_age),
@@ -184,13 +190,16 @@ class ReferenceModelConfig(NodeConfig):
         """The commands u_m(t) as arrays over the outputs: two edges per pulse, padded with edges of height 0."""
         m = len(self.outputs)
         edges = 2 * max((len(pulses.start) for pulses in self.pulses.values()), default=0)
-        time, change = np.zeros((m, edges)), np.zeros((m, edges))
+        time = np.zeros((m, edges))
+        change = np.zeros((m, edges))
         for name, pulses in self.pulses.items():
-            row, count = self.outputs.index(name), 2 * len(pulses.start)
+            row = self.outputs.index(name)
+            count = 2 * len(pulses.start)
             time[row, :count] = (*pulses.start, *pulses.stop)
             change[row, :count] = (*pulses.value, *(-value for value in pulses.value))
         sines = [self.sines.get(name) for name in self.outputs]
-        bank_rate, turn_rate = np.zeros(m), np.zeros(m)
+        bank_rate = np.zeros(m)
+        turn_rate = np.zeros(m)
         if (turn := self.coordinated_turn) is not None:
             bank_rate[self.outputs.index(turn.bank_rate)] = 1.0
             turn_rate[self.outputs.index(turn.turn_rate)] = GRAVITY / turn.speed

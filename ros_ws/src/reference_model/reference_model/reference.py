@@ -18,7 +18,8 @@ class Reference:
     """Equation (2) with the state x_m at the instants k periods. The commands are the profile's until the first live u_m."""
 
     def __init__(self, parameters: ReferenceModelConfig) -> None:
-        self._model, self._profile = parameters.model(), parameters.profile()
+        self._model = parameters.model()
+        self._profile = parameters.profile()
         self.period_ns = period_ns(parameters.rate, "rate")
         self._stepper = model.stepper(seconds(self.period_ns), self._model)
         self._x_m = np.zeros(len(self._model.A_m))  # the reference starts in trim

@@ -62,7 +62,8 @@ def export(
     Whether the proof holds is `proof.holds` of the result. Raises ParameterError for what has no C code, without a compiler,
     and for a folder that cannot be written.
     """
-    chosen, folder = find_scenario(scenario), as_path(folder, "c", "the path of a folder")
+    chosen = find_scenario(scenario)
+    folder = as_path(folder, "c", "the path of a folder")
     title = printable(chosen.name)  # of a file, whose name may hold any character
     controller = exportable(chosen.controller)
     commands = compilers(compiler) if proof or fmu else []
@@ -80,7 +81,8 @@ def export(
         sets, recording, equal = run_recording(run if isinstance(run, RecordedRun) else read_run(run))
         same = sets[0].digest() == controller.digest()
         require(same, "run", "a flight with other parameters", f"those of {title}")
-        recordings, logged = iter([recording]), f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
+        recordings = iter([recording])
+        logged = f"{equal} of {recording.ticks} ticks have the u of the log to the bit\n"
     proved = prove(folder, commands, sets, recordings, float32=float32)
     text = report(proved, title) + logged
     with writing("c", folder, "a folder that can"):

@@ -92,7 +92,8 @@ def fly_campaign(
     units = None if score is None else _numbers(score, "score", '{"q": 0.02}')
     definition = define(chosen, aircraft, uncertainty, seed, chunk, _sweep(sweep), wind, spread, units)
     learner(chosen)  # refuses what the aircraft could not learn with
-    flies, report = _engine(definition, workers), _progress(progress)
+    flies = _engine(definition, workers)
+    report = _progress(progress)
     folder = new_run(chosen, as_path(runs, "runs", "the path of a folder"), "campaign-")
     return _fly(Campaign.begin(folder, definition), flies, report)
 
@@ -133,7 +134,8 @@ def _sweep(sweep: Mapping[str, ArrayLike] | None) -> Sweep | None:
 
 
 def _fly(campaign: Campaign, engine: engines.Engine, progress: Progress) -> CampaignResult:
-    definition, missing = campaign.definition, campaign.missing()
+    definition = campaign.definition
+    missing = campaign.missing()
     total = definition.aircraft * definition.cases
     flown = total - sum(definition.size(job) for job in missing)
     for flights in campaign.fly(engine, learner):

@@ -103,7 +103,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self._uncertainty = None if uncertainty is None else as_number(uncertainty, "uncertainty", 0.0, 1.0)
         controller = scenario.controller
         require(not (scenario.aircraft.is_jsbsim and uncertainty), "uncertainty", uncertainty, "0: JSBSim has no A and B")
-        self.outputs, self.inputs = controller.outputs, controller.effectors
+        self.outputs = controller.outputs
+        self.inputs = controller.effectors
         self.action_space, self.observation_space, self._units = _channels(scenario)
         self._period = 1.0 / controller.rate
         self._k, self._ticks = -1, nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
@@ -121,7 +122,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an episode."""
         super().reset(seed=seed, options=options)
         self._simulator = Simulator(self._drawn().aircraft)
-        self._reference, self._k = Reference(self.scenario.reference_model), 0
+        self._reference = Reference(self.scenario.reference_model)
+        self._k = 0
         self._y = np.zeros(len(self.outputs))
         self._advance(np.zeros(len(self.inputs)))
         return self._observed(), {}
@@ -156,7 +158,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
 
     def _advance(self, u: FloatArray) -> None:
         """The aircraft to the present tick, u held since the last tick."""
-        held, last = select(self._simulator.inputs, self.inputs, u), self._samples * self._k
+        held = select(self._simulator.inputs, self.inputs, u)
+        last = self._samples * self._k
         for number in range(last if self._last_alone else max(last - self._samples + 1, 0), last + 1):
             for sample in self._simulator.sample(number, held):
                 self._y = select(self.outputs, self._simulator.outputs, sample.value)
@@ -191,11 +194,15 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         self.num_envs = as_count(num_envs, "num_envs", 1)
         self._uncertainty = as_number(uncertainty, "uncertainty", 0.0, 1.0)
         plain = _without_models(self.scenario)
-        self._course, self._vehicle, self._fleet = build_course(plain), batch.vehicle(plain), batch
+        self._course = build_course(plain)
+        self._vehicle = batch.vehicle(plain)
+        self._fleet = batch
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
-        self._units, self._k, self._last = units[:, None], 0, 0
+        self._units = units[:, None]
+        self._k = 0
+        self._last = 0
         self._y, self._ended = np.zeros((len(units), self.num_envs)), np.zeros(self.num_envs, dtype=bool)
 
     @property
@@ -233,13 +240,16 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
 
     def _begin(self) -> FloatArray:
         """Draw N aircraft."""
-        aircraft, part = self.scenario.aircraft, self._uncertainty
-        airframe, seed = load_airframe(aircraft.airframe), int(self.np_random.integers(0, 2**31))
+        aircraft = self.scenario.aircraft
+        part = self._uncertainty
+        airframe = load_airframe(aircraft.airframe)
+        seed = int(self.np_random.integers(0, 2**31))
         A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread())
         directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
         drawn = self._fleet.assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
         self._flights = self._fleet.Stepper(drawn, self._vehicle, self._course)
-        self._k, self._last = 0, self._flights.ticks - 1
+        self._k = 0
+        self._last = self._flights.ticks - 1
         self._y, self._ended = np.zeros_like(self._y), np.zeros_like(self._ended)
         return self._observed(*self._sense())
 

@@ -102,7 +102,8 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
     """
     square = len(airframe.inputs) == len(airframe.outputs)
     inputs = [list(airframe.inputs)[j] for j in first_flight.pairing(airframe)] if square else []
-    reached, controller = "", first_flight.placeholder(airframe, lag)
+    reached = ""
+    controller = first_flight.placeholder(airframe, lag)
     for size in SIZES:
 
         def text(path: Path, section: str, size: float = size) -> str:

@@ -50,7 +50,8 @@ class Loop:
             controller = AnyLaw.validate_mapping(controller, "controller")
         self.config = controller
         self._controller = Controller(self.config)
-        self.outputs, self.inputs = self.config.outputs, self.config.effectors
+        self.outputs = self.config.outputs
+        self.inputs = self.config.effectors
         self.measured = self.config.measured
         self.period = seconds(self._controller.period_ns)
         self._now_ns = -1  # of the last tick
@@ -80,7 +81,8 @@ class Loop:
         last_ns = self._now_ns
         require(now_ns > last_ns, "t", f"{t:g} s", f"more than {seconds(last_ns):g} s, the t of the last tick")
         self._now_ns = now_ns
-        before, self.lost = self.lost, ""
+        before = self.lost
+        self.lost = ""
         for key, value, take in (("y", y, self._controller.take_y), ("y_m", y_m, self._controller.take_y_m)):
             if value is not None:
                 names = self.measured if key == "y" else self.outputs
@@ -117,20 +119,24 @@ def fly_plant(
     of the controller. A plant that raises FlightEnded ends the flight early, with the reason in `outcome` of the tape.
     Raises ParameterError for parameters, for a wrong y, and for outputs or rates that do not fit each other.
     """
-    loop, config = Loop(controller), reference_model
+    loop = Loop(controller)
+    config = reference_model
     if not isinstance(config, ReferenceModelConfig):
         config = ReferenceModelConfig.validate_mapping(config, "reference_model")
     require_channels("reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller")
-    reference, period_ns = Reference(config), nanoseconds(loop.period)
+    reference = Reference(config)
+    period_ns = nanoseconds(loop.period)
     whole = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
     require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", whole)
     each = period_ns // reference.period_ns
     ticks = int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
     channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
     rows: dict[str, list[tuple[int, FloatArray]]] = {topic: [] for topic in channels}
-    u, outcome = np.zeros(len(loop.inputs)), COMPLETED
+    u = np.zeros(len(loop.inputs))
+    outcome = COMPLETED
     for k in range(ticks):
-        t_ns, dt = k * period_ns, loop.period if k else 0.0
+        t_ns = k * period_ns
+        dt = loop.period if k else 0.0
         try:
             y = loop.vector(plant(seconds(t_ns) - dt, u.copy(), dt), "y of the plant", loop.measured)
         except FlightEnded as error:
@@ -162,13 +168,19 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
 
     config = Loop(controller).config
     require(config.feedforward is None, "controller.feedforward", "a section", "none: as_control has the law alone")
-    dt, tuned, guard, m = 1.0 / config.rate, config.tuned_law(), config.guard(), len(config.outputs)
-    measured, names = [f"y_{name}" for name in config.outputs], [f"u_{name}" for name in config.effectors]
+    dt = 1.0 / config.rate
+    tuned = config.tuned_law()
+    guard = config.guard()
+    m = len(config.outputs)
+    measured = [f"y_{name}" for name in config.outputs]
+    names = [f"u_{name}" for name in config.effectors]
     if linear:
-        near, T = linear_law(tuned, m, dt), np.eye(m) if guard.allocation is None else guard.allocation.T
+        near = linear_law(tuned, m, dt)
+        T = np.eye(m) if guard.allocation is None else guard.allocation.T
         return control.ss(near.A, near.B, T @ near.C, T @ near.D, dt, inputs=measured, outputs=names, name=config.law)
     law, params = tuned
-    zero, p = np.zeros(m), 0 if guard.allocation is None else len(names)
+    zero = np.zeros(m)
+    p = 0 if guard.allocation is None else len(names)
     start = fields(law.engage(Measurements(zero, zero, zero, zero, zero), params))
     sizes = [value.size for value in start.values()]
     offset = np.concatenate([value.ravel() for value in start.values()])  # so that x = 0 is the engagement in trim

@@ -94,16 +94,19 @@ def _towards(start: FloatArray, moves: list[FloatArray], low: FloatArray, high: 
     """
     u = start
     for move in moves:
-        begin, target = u, _exchanged(u + move, low, high, params.exchange)
+        begin = u
+        target = _exchanged(u + move, low, high, params.exchange)
         if _inside(target, low, high):
             u = target
             continue
-        part, size = 0.0, 1.0
+        part = 0.0
+        size = 1.0
         for _ in range(HALVINGS):
             size *= 0.5
             halfway = _exchanged(begin + (part + size) * move, low, high, params.exchange)
             if _inside(halfway, low, high):
-                u, part = halfway, part + size
+                u = halfway
+                part = part + size
             else:
                 target = halfway
         step = target - u
@@ -116,14 +119,16 @@ def _towards(start: FloatArray, moves: list[FloatArray], low: FloatArray, high: 
 
 def _exchanged(u: FloatArray, low: FloatArray, high: FloatArray, exchange: FloatArray) -> FloatArray:
     """U with the same effect, inside its limits where the sweeps find such a u."""
-    columns, ends = exchange.T.tolist(), list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
+    columns = exchange.T.tolist()
+    ends = list(enumerate(zip(low.tolist(), high.tolist(), strict=True)))
     moved = u.tolist()
     for _ in range(SWEEPS):
         inside = True
         for j, (least, largest) in ends:
             excess = moved[j] - min(max(moved[j], least), largest)
             if excess != 0.0 and abs(columns[j][j]) > SMALL:
-                inside, part = False, RELAXATION * excess / columns[j][j]
+                inside = False
+                part = RELAXATION * excess / columns[j][j]
                 moved = [value - part * move for value, move in zip(moved, columns[j], strict=True)]
         if inside:
             break

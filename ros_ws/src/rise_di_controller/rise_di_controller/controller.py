@@ -73,10 +73,13 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._first = self._parameters = parameters
-        self._first_law, self._learned = True, _with_feedforward(parameters)
+        self._first_law = True
+        self._learned = _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
-        self._errors, self._least = divergence.Errors(zero, zero), divergence.least(parameters.outputs)
-        self._oscillations, self._learns = divergence.Oscillations(self._least), parameters.history_ticks() > 0
+        self._errors = divergence.Errors(zero, zero)
+        self._least = divergence.least(parameters.outputs)
+        self._oscillations = divergence.Oscillations(self._least)
+        self._learns = parameters.history_ticks() > 0
         self._engaged_ns = 0
         self._vanes_moved = self._vanes_still = np.zeros(len(parameters.vanes), dtype=bool)
         self._samples: samples.SampleState | None = None  # None before the first y
@@ -134,8 +137,12 @@ class Controller:
             "the law and the observer that fly: these change at a restart",
         )
         self._state = guard.retune(self._state, self._law, new.law, (self._guard, new.guard))
-        self._law, self._guard, self._digest, self._parameters = new.law, new.guard, new.digest, new.parameters
-        self._first_law, self._learned = self._has_first_model(new.parameters), _with_feedforward(new.parameters)
+        self._law = new.law
+        self._guard = new.guard
+        self._digest = new.digest
+        self._parameters = new.parameters
+        self._first_law = self._has_first_model(new.parameters)
+        self._learned = _with_feedforward(new.parameters)
 
     def still_vanes(self) -> tuple[str, ...]:
         """The vanes left out by the observer: still vanes.
@@ -146,7 +153,8 @@ class Controller:
         return tuple(name for name, still in zip(self._parameters.vanes, self._vanes_still, strict=True) if still)
 
     def _measure_vanes(self, inputs: guard.TickInputs) -> None:
-        measures, observer = getattr(self._state.law, "vane_measures", None), self._parameters.observer
+        measures = getattr(self._state.law, "vane_measures", None)
+        observer = self._parameters.observer
         if measures is None or observer is None or observer.vanes is None:
             return
         if self.mode is Mode.ENGAGED and inputs.dt == 0.0:
@@ -213,7 +221,8 @@ class Controller:
 
     def restarted(self) -> str:
         """Why the law has engaged again by itself since the last call, as a sentence; empty if it has not."""
-        sentence, self._restarted = self._restarted, ""
+        sentence = self._restarted
+        self._restarted = ""
         return sentence
 
     def tick(self, now_ns: int, late_ns: int = 0, *, active: bool = True) -> ControlOutput | None:
@@ -232,7 +241,8 @@ class Controller:
         if self._learns:
             self._oscillations.take(e, inputs.dt, None if self._first_law else self._learned)
         age = seconds(now_ns - inputs.stamp_ns)
-        limits, digest = self._guard, self._digest
+        limits = self._guard
+        digest = self._digest
         log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
         return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log)
 
@@ -260,7 +270,8 @@ class Controller:
 
     def stale(self, now_ns: int) -> tuple[str, ...]:
         """Names of the stale inputs: y or y_m never received or older than the age limit."""
-        ages, limit = self.ages(now_ns), seconds(self._guard.max_age_ns)
+        ages = self.ages(now_ns)
+        limit = seconds(self._guard.max_age_ns)
         return tuple(name for name in ("y", "y_m") if ages.get(name, limit + 1.0) > limit)
 
 

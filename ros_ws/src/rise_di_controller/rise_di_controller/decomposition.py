@@ -70,7 +70,8 @@ def decompose(Omega: ArrayLike) -> SDU:
     Decomposition and Some of Its Applications", Systems & Control Letters 21, 1993.
     """
     L, p, W, L_inverse = _eliminate(Omega)
-    D, S = np.sign(p), (L * np.abs(p)) @ L.T
+    D = np.sign(p)
+    S = (L * np.abs(p)) @ L.T
     return SDU((S + S.T) / 2.0, D, (D[:, None] * L_inverse.T * D) @ W + 0.0)  # no -0.0
 
 
@@ -144,15 +145,18 @@ def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
 
     rows, columns = _sizes(matrix)
-    rest, m = matrix / rows[:, None] / columns, len(matrix)
+    rest = matrix / rows[:, None] / columns
+    m = len(matrix)
     places = tuple(range(m))
     assigned = linear_sum_assignment(np.log(np.maximum(np.abs(rest), np.finfo(float).tiny)), maximize=True)[1]
     orders = {(places, places), (places, tuple(assigned.tolist()))}
-    outputs, inputs = list[int](), list[int]()
+    outputs = list[int]()
+    inputs = list[int]()
     while rest.any():
         i, j = (int(place) for place in np.unravel_index(np.argmax(np.abs(rest)), rest.shape))
         rest = rest - np.outer(rest[:, j], rest[i] / rest[i, j])
-        rest[i], rest[:, j] = 0.0, 0.0
+        rest[i] = 0.0
+        rest[:, j] = 0.0
         outputs.append(i)
         inputs.append(j)
     return orders | {(tuple(outputs), tuple(inputs))} if len(outputs) == m else orders
@@ -187,10 +191,12 @@ def _sizes(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     zeros keeps the scale 1. Source: D. Ruiz, "A Scaling Algorithm to Equilibrate Both Rows and Columns Norms in
     Matrices", RAL-TR-2001-034.
     """
-    rows, columns = np.ones(len(matrix)), np.ones(len(matrix))
+    rows = np.ones(len(matrix))
+    columns = np.ones(len(matrix))
     for _ in range(_EQUILIBRATIONS):
         scaled = np.abs(matrix) / rows[:, None] / columns
-        row, column = scaled.max(axis=1), scaled.max(axis=0)
+        row = scaled.max(axis=1)
+        column = scaled.max(axis=0)
         rows *= np.sqrt(np.where(row > 0.0, row, 1.0))
         columns *= np.sqrt(np.where(column > 0.0, column, 1.0))
     return rows, columns
@@ -204,7 +210,10 @@ def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, Fl
     rest = _square(Omega)
     m = len(rest)
     rows, columns = _sizes(rest)
-    L, W, L_inverse, W_inverse = np.eye(m), np.eye(m), np.eye(m), np.eye(m)
+    L = np.eye(m)
+    W = np.eye(m)
+    L_inverse = np.eye(m)
+    W_inverse = np.eye(m)
     p = np.zeros(m)
     for k in range(m):
         p[k] = rest[k, k]

@@ -15,7 +15,9 @@ FACTOR = 3.0  # of the largest rms error before: gusts that come later are up to
 LEAST = {"V": 1.0}  # m/s, rms error that does not count as a divergence
 LEAST_RATE = 0.1  # rad/s, the same of other outputs: five times that of the law alone in moderate turbulence
 
-WINDOW, STEP = 10.0, 0.02  # s, length of the record of e, and of the means in it: a loop with servos oscillates slower
+# s, length of the record of e, and of the means in it: a loop with servos oscillates slower
+WINDOW = 10.0
+STEP = 0.02
 TEST = 50  # means between two tests for an oscillation, 1 s
 LIKENESS = 0.7  # correlation of e with e a period later: 0.9 in a limit cycle, at most 0.5 in turbulence and gusts
 GROWN = 1.5  # of the largest rms error over WINDOW before: below this the law of the start is not clearly better
@@ -57,9 +59,14 @@ class Oscillations:
     def __init__(self, least: FloatArray) -> None:
         """`least`: mean squares below a divergence, (m,)."""
         self.periods = np.zeros_like(least)  # s, of the oscillations at the last test, (m,); 0 for none
-        self._least, self._largest = HARMLESS**2 * least, np.zeros_like(least)
+        self._least = HARMLESS**2 * least
+        self._largest = np.zeros_like(least)
         self._record = deque[FloatArray](maxlen=round(WINDOW / STEP))
-        self._sum, self._count, self._time, self._means, self._first_law = 0.0 * least, 0, 0.0, 0, True
+        self._sum = 0.0 * least
+        self._count = 0
+        self._time = 0.0
+        self._means = 0
+        self._first_law = True
 
     def take(self, e: FloatArray, dt: float, learned: NDArray[np.bool_] | None) -> None:
         """Record a tick, and test once a second. `learned`: outputs with a learned model, (m,); None under the first law."""
@@ -67,12 +74,17 @@ class Oscillations:
             self._first_law = learned is None
             self._record.clear()
             self.periods = 0.0 * self.periods
-        self._sum, self._count, self._time = self._sum + e, self._count + 1, self._time + dt
+        self._sum = self._sum + e
+        self._count = self._count + 1
+        self._time = self._time + dt
         if self._time < 0.99 * STEP:  # dt is rounded
             return
         self._record.append(self._sum / self._count)
-        spacing, self._means = self._time, self._means + 1
-        self._sum, self._count, self._time = 0.0 * e, 0, 0.0
+        spacing = self._time
+        self._means = self._means + 1
+        self._sum = 0.0 * e
+        self._count = 0
+        self._time = 0.0
         if self._means % TEST:
             return
         record = np.array(self._record)
@@ -97,7 +109,8 @@ def period(x: FloatArray) -> int:
 
     The period is that of the first peak above LIKENESS beyond the first negative r.
     """
-    n, lags = len(x), len(x) // 4
+    n = len(x)
+    lags = len(x) // 4
     x = x - np.mean(x)
     sums = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2)[:lags]
     r = n / (n - np.arange(lags)) * sums / max(sums[0], np.finfo(float).tiny)

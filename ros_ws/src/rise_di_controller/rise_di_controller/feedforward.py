@@ -55,7 +55,8 @@ class FeedforwardState(NamedTuple):
 def initial_state(y_m: Array, nominal: Nominal) -> FeedforwardState:
     """State at engagement: the outputs at y_m, shape (m,), the remaining states at 0, the trim."""
     xp = array_namespace(y_m)
-    zeros, zero = xp.zeros_like(y_m), xp.zeros_like(y_m[0])
+    zeros = xp.zeros_like(y_m)
+    zero = xp.zeros_like(y_m[0])
     return FeedforwardState(product(nominal.C.T, y_m), zeros, zero, zero, zeros)
 
 

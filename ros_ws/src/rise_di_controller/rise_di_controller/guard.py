@@ -128,7 +128,8 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
     older = [sample for sample in samples if sample.stamp_ns < stamp_ns]
     newer = [sample for sample in samples if sample.stamp_ns > stamp_ns]
     if older and newer:
-        before, after = older[-1], newer[0]
+        before = older[-1]
+        after = newer[0]
     elif not older or stamp_ns - older[-1].stamp_ns > reach_ns:
         return None
     else:
@@ -182,7 +183,10 @@ def tick(
     nominal = seconds(guard.period_ns)
     dt = min(max(seconds(y.stamp_ns - state.y.stamp_ns), DT_RANGE[0] * nominal), DT_RANGE[1] * nominal)
     control_law, params = law
-    law_state, u_trim, u_ff, ff_state = state.law, state.u_trim, state.u_ff, state.feedforward
+    law_state = state.law
+    u_trim = state.u_trim
+    u_ff = state.u_ff
+    ff_state = state.feedforward
     missed = max(round(dt / nominal) - 1, 0)
     if missed:
         held = Measurements(state.y.value, state.y_m, np.zeros_like(reference), u_trim + u_ff, state.u)
@@ -196,7 +200,8 @@ def tick(
         u_ff = u_ff_recorded
         u_trim = u_trim + u_ff
     vanes = _vanes(vane, ff_state, guard, vane_m_recorded)
-    slope, vane_m = (reference - state.y_m) / dt, None if vanes is None else vanes.reference
+    slope = (reference - state.y_m) / dt
+    vane_m = None if vanes is None else vanes.reference
     measured = Measurements(y.value, reference, slope, u_trim, state.u, vane=vane, vane_m=vane_m)
     after, u_free, u, effectors = law_within_limits(law_state, measured, dt, law, guard, state.effectors)
     stepped = state._replace(
@@ -230,7 +235,8 @@ def _engaged(
     vane_m_recorded: FloatArray | None,
 ) -> ControllerState:
     """The state at an engagement: the law begins from the present u."""
-    reference, zero = inputs.y_m, np.zeros_like(state.u)
+    reference = inputs.y_m
+    zero = np.zeros_like(state.u)
     ff_state = None if guard.nominal is None else feedforward.initial_state(reference, guard.nominal)
     measured = Measurements(y.value, reference, zero, state.u, state.u, vane=vane)
     return state._replace(
@@ -320,13 +326,15 @@ def retune(
     present speed, and over the record those of every tick. Arguments: `guards`, old and new, with the models of the
     feedforward.
     """
-    y, y_m = state.y, state.y_m
+    y = state.y
+    y_m = state.y_m
     if state.law is None or y is None or y_m is None:
         return state
     law = new.control_law.retune(state.law, old.params, new.params)
     before, after = (None, None) if guards is None else (_nominal(guard, law) for guard in guards)
     other_nominal = not _same_arrays(before, after)
-    observing, observers = law, (old.params, new.params)
+    observing = law
+    observers = (old.params, new.params)
     if isinstance(law, ScheduleState):
         observing, observers = law.law, tuple(law_at(params, law.scale) for params in observers)
     other_model = isinstance(observing, (ObserverState, VaneObserverState)) and _is_replaced(*observers)
@@ -337,7 +345,8 @@ def retune(
         if other_model or other_nominal:
             # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part of the law: what
             # the law has integrated beside an observer stays there, which would take it long to integrate again.
-            rest, limits = state.u - state.u_trim - state.u_ff, observers[1].limits
+            rest = state.u - state.u_trim - state.u_ff
+            limits = observers[1].limits
             acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
             goes_on = np.where(acted, observing.u_o - change, rest)
             u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
@@ -360,9 +369,11 @@ def retune(
 
 def _with_nominal(state: ControllerState, y_m: FloatArray, nominal: Nominal | None) -> tuple[ControllerState, Array]:
     """The state with the feedforward of another model in the same motion, and the change of u_ff, (m,)."""
-    u_ff, goes_on = np.zeros_like(state.u), None
+    u_ff = np.zeros_like(state.u)
+    goes_on = None
     if nominal is not None:
-        earlier, last = state.history[-2], state.history[-1]
+        earlier = state.history[-2]
+        last = state.history[-1]
         goes_on = feedforward.continued(state.feedforward, y_m, (last.y_m - earlier.y_m) / last.dt, last.dt, nominal)
         u_ff = feedforward.acting(goes_on.u - goes_on.u_0, nominal)
     return state._replace(u_ff=u_ff, feedforward=goes_on), u_ff - state.u_ff
@@ -388,7 +399,8 @@ def _failsafe(
     state: ControllerState, now_ns: int, guard: GuardParams, active: bool
 ) -> tuple[ControllerState, TickInputs | None]:
     """A tick without fresh inputs, or of a deactivated controller."""
-    y, y_m = state.y, state.y_m
+    y = state.y
+    y_m = state.y_m
     if y is None or y_m is None:
         return state._replace(mode=Mode.WAITING if active else Mode.INACTIVE), None
     was_active = state.mode is not Mode.INACTIVE

@@ -16,10 +16,9 @@ OUTPUT_GROUPS = ("y", "y_m", "e")
 INPUT_GROUPS = ("u_free", "u", "u_trim", "limited", "u_ff")
 OBSERVER_GROUPS = ("z", "u_o", "sigma")
 EFFECTOR = "effector"  # group of an allocation
-VANE_STATE, VANE_READING = (
-    ("vane_mean", "vane_square", "vane_measures"),
-    ("vane", "vane_m"),
-)  # groups of the vanes of an observer
+# groups of the vanes of an observer
+VANE_STATE = ("vane_mean", "vane_square", "vane_measures")
+VANE_READING = ("vane", "vane_m")
 RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, *VANE_STATE, *VANE_READING, EFFECTOR}) - {"e"}
 """Names reserved by the log, not for the state of a law. e is y - y_m."""
 
@@ -77,7 +76,8 @@ def values(
     if state.law is None:
         raise ValueError("internals: found a controller that was never engaged, expected an engaged one")
     scalars = np.array([float(state.mode), inputs.dt, inputs.y_m_offset, late, age, float(number), float(parameters)])
-    limits, at_stop = guard.limits, False
+    limits = guard.limits
+    at_stop = False
     if guard.allocation is not None and state.effectors is not None:
         stops = guard.allocation.limits
         at_stop = bool(((state.effectors <= stops.lower) | (state.effectors >= stops.upper)).any())

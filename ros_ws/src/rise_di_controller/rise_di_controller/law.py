@@ -135,10 +135,12 @@ def step_with_anti_windup(
     after, u = step(state, y, y_m, dt, params)
     total = u_trim + u
     beyond = total - saturate(total, u_before, dt, limits)
-    increment, increment_Pi = after.integral_e - state.integral_e, after.Pi - state.Pi
+    increment = after.integral_e - state.integral_e
+    increment_Pi = after.Pi - state.Pi
     change = -params.input_scale * params.D * params.K * params.Lambda * increment
     change_Pi = -params.input_scale * params.D * increment_Pi
-    outward, outward_Pi = change * beyond > 0, change_Pi * beyond > 0
+    outward = change * beyond > 0
+    outward_Pi = change_Pi * beyond > 0
     zero = xp.zeros_like(total)
     excess = xp.maximum(xp.abs(beyond) - xp.where(outward, xp.abs(change), zero), zero)
     size_Pi = xp.where(outward_Pi, xp.abs(change_Pi), zero)
@@ -181,7 +183,10 @@ def _control_law(sign: Sign) -> ControlLaw:
     def limited(
         state: LawState, measured: Measurements, dt: Array, params: LawParams, limits: Limits
     ) -> tuple[LawState, Array, Array]:
-        y, y_m, u_trim, u_before = measured.y, measured.y_m, measured.u_trim, measured.u_before
+        y = measured.y
+        y_m = measured.y_m
+        u_trim = measured.u_trim
+        u_before = measured.u_before
         return step_with_anti_windup(state, y, y_m, dt, u_trim, u_before, with_sign(params), limits)
 
     return ControlLaw(LawState, start, tick, limited, retune)

@@ -67,7 +67,8 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     sets = () if candidates is None else (candidates,)
-    zero, vanes = np.zeros((m, *sets)), getattr(params, "vanes", None)
+    zero = np.zeros((m, *sets))
+    vanes = getattr(params, "vanes", None)
     none = None if vanes is None else np.zeros((len(vanes.H), *sets))
     wide = m if none is None else m + len(none)
     if vanes is not None:
@@ -91,7 +92,8 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
     columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in units]
     matrix = np.array(columns).T
-    above, below = matrix[..., :size, :], matrix[..., size:, :]
+    above = matrix[..., :size, :]
+    below = matrix[..., size:, :]
     return LinearLaw(above[..., :size], above[..., size:], below[..., :size], below[..., size:])
 
 
@@ -102,7 +104,8 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
     """
     n, m = B.shape[-2:]
     whole = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
-    whole[..., :n, :n], whole[..., :n, n:] = A, B
+    whole[..., :n, :n] = A
+    whole[..., :n, n:] = B
     exponential = _exponential((whole * period).tobytes(), whole.shape)
     return exponential[..., :n, :n], exponential[..., :n, n:]
 
@@ -135,15 +138,21 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     batch = np.broadcast_shapes(plant.A.shape[:-2], plant.B.shape[:-2])
     has_lag = loop.lag > 0.0
     rate = np.where(has_lag, 1.0 / np.where(has_lag, loop.lag, 1.0), 1.0)  # without an actuator: any rate, unused
-    motion, drive = np.zeros((*batch, n + m, n + m)), np.zeros((*batch, n + m, m))
-    motion[..., :n, :n], motion[..., :n, n:], motion[..., n:, n:] = plant.A, plant.B * has_lag, -np.diag(rate)
-    drive[..., :n, :], drive[..., n:, :] = plant.B * ~has_lag, np.diag(rate * has_lag)
+    motion = np.zeros((*batch, n + m, n + m))
+    drive = np.zeros((*batch, n + m, m))
+    motion[..., :n, :n] = plant.A
+    motion[..., :n, n:] = plant.B * has_lag
+    motion[..., n:, n:] = -np.diag(rate)
+    drive[..., :n, :] = plant.B * ~has_lag
+    drive[..., n:, :] = np.diag(rate * has_lag)
     whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
     part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
     held = int(whole.max()) + 1  # earlier ticks whose u still acts, the newest first
 
     size = n + m + held * m
-    A, B, C = np.zeros((*batch, size, size)), np.zeros((*batch, size, m)), np.zeros((*batch, len(plant.C), size))
+    A = np.zeros((*batch, size, size))
+    B = np.zeros((*batch, size, m))
+    C = np.zeros((*batch, len(plant.C), size))
     C[..., :n] = plant.C
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
     inputs = np.zeros((*batch, n + m, m + held * m))  # effect of u of this tick, then of earlier ticks
@@ -152,7 +161,8 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
         _, old = zero_order_hold(motion, drive, part[i])
         inputs[..., whole[i] * m + i] += new[..., i]
         inputs[..., (whole[i] + 1) * m + i] += (rest @ old)[..., i]
-    B[..., : n + m, :], A[..., : n + m, n + m :] = inputs[..., :m], inputs[..., m:]
+    B[..., : n + m, :] = inputs[..., :m]
+    A[..., : n + m, n + m :] = inputs[..., m:]
     B[..., n + m : n + 2 * m, :] = np.eye(m)
     A[..., n + 2 * m :, n + m : -m] = np.eye((held - 1) * m)
     return SampledPlant(A, B, C)
@@ -164,10 +174,13 @@ def closed_loop(plant: LinearPlant, law: LinearLaw, loop: Loop, extra: FloatArra
     The state is the state of `sampled_plant`, then the state of the law. Leading axes of plant and law are batches.
     """
     A, B, C = sampled_plant(plant, loop, extra)
-    k, size = A.shape[-1], A.shape[-1] + law.A.shape[-1]
+    k = A.shape[-1]
+    size = A.shape[-1] + law.A.shape[-1]
     matrix = np.zeros((*np.broadcast_shapes(A.shape[:-2], law.A.shape[:-2]), size, size))
-    matrix[..., :k, :k], matrix[..., :k, k:] = A + B @ law.D @ C, B @ law.C
-    matrix[..., k:, :k], matrix[..., k:, k:] = law.B @ C, law.A
+    matrix[..., :k, :k] = A + B @ law.D @ C
+    matrix[..., :k, k:] = B @ law.C
+    matrix[..., k:, :k] = law.B @ C
+    matrix[..., k:, k:] = law.A
     return matrix
 
 
@@ -192,7 +205,8 @@ def delay_margin(
     delayed = np.ones(len(loop.lag)) if channel is None else np.eye(len(loop.lag))[channel]
     if not is_stable(plant, law, loop, 0.0 * delayed):
         return 0.0
-    lower, stride = 0.0, loop.period / 2.0
+    lower = 0.0
+    stride = loop.period / 2.0
     while is_stable(plant, law, loop, (lower + stride) * delayed):
         lower += stride
         if lower > longest:

@@ -29,7 +29,8 @@ from rise_di_controller.linear_loop import (
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.intp]
 
-DECADES, PER_DECADE = 5, 40
+DECADES = 5
+PER_DECADE = 40
 """Grid of frequencies below pi / T. The frequencies of the modes are added, and eight points around every peak."""
 
 SLOW = np.pi / 2.0
@@ -40,7 +41,10 @@ VANISHED = 1e-9  # magnitude of an eigenvalue of a motion ended within a period:
 BATCH = 16  # aircraft computed together: larger arrays leave the cache
 SERIAL_SIZE = 4000  # entries of a complex matrix below which OpenBLAS starts no threads: threads would only wait
 PHASE_AT_ZERO = 0.01  # rad, phase of -L at the lowest frequency below which L is taken as real there
-BALANCED_ROUNDS, DESCENT_STEPS, MAX_REFINED = 6, 40, 40  # of `scaled_norm`, and of the search for the peak
+# of `scaled_norm`, and of the search for the peak
+BALANCED_ROUNDS = 6
+DESCENT_STEPS = 40
+MAX_REFINED = 40
 
 
 class Margins(NamedTuple):
@@ -162,10 +166,13 @@ def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_Sc
     def each(matrix: FloatArray) -> FloatArray:
         return np.broadcast_to(matrix, (*shape, *matrix.shape[-2:])).reshape(count, *matrix.shape[-2:])
 
-    A, B, laws = each(plant.A), each(plant.B), [each(matrix) for matrix in law]
+    A = each(plant.A)
+    B = each(plant.B)
+    laws = [each(matrix) for matrix in law]
     for k in range(0, count, BATCH):
         of = slice(k, k + BATCH)
-        aircraft, its_law = LinearPlant(A[of], B[of], plant.C), LinearLaw(*(matrix[of] for matrix in laws))
+        aircraft = LinearPlant(A[of], B[of], plant.C)
+        its_law = LinearLaw(*(matrix[of] for matrix in laws))
         yield _schur_form(aircraft, its_law, loop)
 
 
@@ -198,16 +205,19 @@ def _sensitivity(form: _SchurForm, z: ComplexArray) -> ComplexArray:
 
 def _margins(form: _SchurForm, period: float, *, together: bool) -> Margins:
     """Margins of the aircraft of a batch."""
-    stable, m = _stable(form), form.R.shape[-1]
+    stable = _stable(form)
+    m = form.R.shape[-1]
     w, S = _on_grid(form, period)
     near = _around_peaks(S, w)
     every = np.concatenate([S, _balanced(_sensitivity(form, np.exp(1j * near * period)))], axis=1)
     diagonal = np.einsum("NFii->NFi", every)
     norm = norm_half = np.full(len(every), np.nan)
     if together:
-        norm, norm_half = _largest_norm(every), _largest_norm(np.asarray(every - np.eye(m) / 2.0))
+        norm = _largest_norm(every)
+        norm_half = _largest_norm(np.asarray(every - np.eye(m) / 2.0))
     with np.errstate(divide="ignore"):
-        disk, disk_all = 1.0 / np.max(np.abs(diagonal - 0.5), axis=1), 1.0 / norm_half
+        disk = 1.0 / np.max(np.abs(diagonal - 0.5), axis=1)
+        disk_all = 1.0 / norm_half
     L = _loop_of_sensitivity(S)
     phase, crossover = _phase_margins(form, w, L, period)
     decrease, increase = _gain_margins(form, w, L, period)
@@ -258,7 +268,8 @@ def _around_peaks(S: ComplexArray, w: FloatArray) -> FloatArray:
     half = S - np.eye(S.shape[-1]) / 2.0
     norms = [_norm_bound(matrix)[..., None] for matrix in (S, half)]
     peaks = np.argmax(np.concatenate([np.abs(diagonal), np.abs(diagonal - 0.5), *norms], axis=2), axis=1)  # (N, Q)
-    first, last = np.maximum(peaks - 1, 0), np.minimum(peaks + 1, w.shape[1] - 1)
+    first = np.maximum(peaks - 1, 0)
+    last = np.minimum(peaks + 1, w.shape[1] - 1)
     rows = np.arange(len(w))[:, None]
     parts = (np.arange(1, 5) / 5.0)[:, None, None]
     sides = [low + parts * (high - low) for low, high in ((w[rows, first], w[rows, peaks]), (w[rows, peaks], w[rows, last]))]
@@ -284,9 +295,13 @@ def _refined(
     """Frequencies of of_L(L_i) = 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
     aircraft, place, channel = places
     of_each = _SchurForm(*(part[aircraft] for part in form))
-    low, high = w[aircraft, place], w[aircraft, place + 1]
-    at_low, at_high = values[aircraft, place, channel], values[aircraft, place + 1, channel]
-    middle, L, before = low, np.zeros(len(low), dtype=np.complex128), np.zeros(len(low))
+    low = w[aircraft, place]
+    high = w[aircraft, place + 1]
+    at_low = values[aircraft, place, channel]
+    at_high = values[aircraft, place + 1, channel]
+    middle = low
+    L = np.zeros(len(low), dtype=np.complex128)
+    before = np.zeros(len(low))
     for _ in range(8 if len(low) else 0):
         gap = at_high - at_low
         middle = np.where(gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap))
@@ -295,8 +310,10 @@ def _refined(
         value = of_L(L)
         side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
         kept = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved
-        low, high = np.where(side > 0.0, low, middle), np.where(side > 0.0, middle, high)
-        at_low, at_high = np.where(side > 0.0, kept * at_low, value), np.where(side > 0.0, value, kept * at_high)
+        low = np.where(side > 0.0, low, middle)
+        high = np.where(side > 0.0, middle, high)
+        at_low = np.where(side > 0.0, kept * at_low, value)
+        at_high = np.where(side > 0.0, value, kept * at_high)
         before = side
     return middle, L
 
@@ -311,10 +328,12 @@ def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: flo
     gains = _log_gain(L)
     places = _crossings(gains)
     frequency, at = _refined(form, w, places, gains, period, _log_gain)
-    phase, crossover = np.full(gains[:, 0].shape, np.inf), np.zeros(gains[:, 0].shape)
+    phase = np.full(gains[:, 0].shape, np.inf)
+    crossover = np.zeros(gains[:, 0].shape)
     angle = np.abs(np.angle(-at))
     for k in np.argsort(-angle, kind="stable"):
-        phase[places[0][k], places[2][k]], crossover[places[0][k], places[2][k]] = angle[k], frequency[k]
+        phase[places[0][k], places[2][k]] = angle[k]
+        crossover[places[0][k], places[2][k]] = frequency[k]
     return phase, crossover
 
 
@@ -327,7 +346,8 @@ def _gain_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: floa
     places = (places[0][inside], places[1][inside], places[2][inside])
     _, at = _refined(form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L)))
     ends = np.concatenate([np.where(np.abs(np.angle(-L[:, :1])) < PHASE_AT_ZERO, L[:, :1].real, 0.0), L[:, -1:].real], axis=1)
-    decrease, increase = np.zeros(L[:, 0].shape), np.full(L[:, 0].shape, np.inf)
+    decrease = np.zeros(L[:, 0].shape)
+    increase = np.full(L[:, 0].shape, np.inf)
     for row, channel, value in zip(places[0], places[2], at.real, strict=True):
         _narrow(decrease, increase, (row, channel), value)
     for row, end, channel in np.ndindex(ends.shape):
@@ -350,7 +370,8 @@ def _narrow(decrease: FloatArray, increase: FloatArray, place: tuple[int, int], 
 
 def _balanced(matrices: ComplexArray) -> ComplexArray:
     """D M D^-1, (..., m, m), with about equal norms of row i and column i without the diagonal: Osborne's iteration."""
-    M, off = matrices.copy(), ~np.eye(matrices.shape[-1], dtype=bool)
+    M = matrices.copy()
+    off = ~np.eye(matrices.shape[-1], dtype=bool)
     least = 1e-9 * np.linalg.norm(M, axis=(-2, -1)) + 1e-300
     for _ in range(BALANCED_ROUNDS if len(off) > 1 else 0):
         for i, places in enumerate(off):
@@ -387,7 +408,8 @@ def scaled_norm(matrices: ComplexArray) -> FloatArray:
 
 def _largest_norm(balanced: ComplexArray) -> FloatArray:
     """Largest `scaled_norm` over the second axis of (N, F, m, m): the peak of an upper bound is refined to convergence."""
-    bounds, rows = _norm_bound(balanced), np.arange(len(balanced))
+    bounds = _norm_bound(balanced)
+    rows = np.arange(len(balanced))
     least = np.abs(np.einsum("NFii->NFi", balanced)).max(axis=(1, 2))  # a diagonal entry, unchanged by D
     near = bounds > least[:, None]
     bounds[near] = np.linalg.norm(balanced[near], ord=2, axis=(1, 2))

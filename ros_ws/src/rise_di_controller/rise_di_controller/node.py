@@ -144,7 +144,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def _tell_vanes(self) -> None:
         """Log a vane at the begin and the end of a standstill."""
-        before, self._still_vanes = self._still_vanes, self._controller.still_vanes()
+        before = self._still_vanes
+        self._still_vanes = self._controller.still_vanes()
         if before == self._still_vanes:
             return
         if still := set(self._still_vanes) - set(before):
@@ -259,7 +260,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
 
     def _take_proposal(self, report: Report, now_ns: int) -> None:
         change = dict(report.values)
-        start, flown = change.pop("start", None), change.pop("flown", None)
+        start = change.pop("start", None)
+        flown = change.pop("flown", None)
         if not isinstance(start, int) or not isinstance(flown, int):
             raise ChannelError("malformed", "a proposal without the digests start and flown")
         assert self._learning is not None  # noqa: S101 - the receiver was made beside it

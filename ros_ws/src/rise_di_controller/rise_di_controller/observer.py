@@ -103,8 +103,10 @@ def estimates_after(history: tuple[PastTick, ...], change: Array, filters: Seque
     by_e, by_u = np.zeros((2, len(filters[0].Phi), len(history)))
     steps: dict[int, tuple[Array, Array]] = {}
     for params in {id(params): params for params in filters}.values():
-        own, gain = of_tick == id(params), product(params.Phi, params.L)
-        by_e[:, own], by_u[:, own] = product(gain, e[:, own]), product(params.Gamma, u[:, own])
+        own = of_tick == id(params)
+        gain = product(params.Phi, params.L)
+        by_e[:, own] = product(gain, e[:, own])
+        by_u[:, own] = product(params.Gamma, u[:, own])
         steps[id(params)] = params.Phi, params.Phi - product(gain, params.H)
     _, corrected = steps[id(filters[0])]
     z = product(inverse(np.eye(len(corrected)) - corrected), np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1))

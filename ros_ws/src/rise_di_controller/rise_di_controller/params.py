@@ -73,7 +73,8 @@ class FeedforwardConfig(Config):
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
         """The arrays of the feedforward. Raises ParameterError for sizes that do not match and for a C B whose D differs."""
-        n, m = len(self.states), len(outputs)
+        n = len(self.states)
+        m = len(outputs)
         for name in outputs:
             require(self.states.count(name) == 1, "feedforward.states", ", ".join(self.states), f"the output {name} once")
         for key, columns in (("A", n), ("B", m), ("gravity", n), ("deviation", m)):
@@ -81,7 +82,8 @@ class FeedforwardConfig(Config):
             fits = values is None or len(values) == n * columns
             require(fits, f"feedforward.{key}", f"{len(values or ())} values", f"{n * columns}: {n} rows of {columns}")
         require_length("feedforward.lead", self.lead, inputs)
-        A, B = np.reshape(self.A, (n, n)), np.reshape(self.B, (n, m))
+        A = np.reshape(self.A, (n, n))
+        B = np.reshape(self.B, (n, m))
         gravity = np.zeros((n, n)) if self.gravity is None else np.reshape(self.gravity, (n, n))
         C = np.array([[float(state == name) for state in self.states] for name in outputs])
         try:
@@ -108,7 +110,9 @@ class VanesConfig(Config):
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
         """The arrays. Raises ParameterError for channels without a state, and for wrong sizes."""
-        k, s, m = len(self.channels), estimates, len(outputs)
+        k = len(self.channels)
+        s = estimates
+        m = len(outputs)
         others = [name for name in states if name not in outputs]
         expected = f"states of the feedforward that are no outputs: {', '.join(others)}"
         known = set(self.channels) <= set(others) and len(set(self.channels)) == k
@@ -116,7 +120,8 @@ class VanesConfig(Config):
         for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
             found = len(getattr(self, key))
             require(found == size, f"observer.vanes.{key}", f"{found} values", f"{size} for {k} vanes, {s} estimates")
-        least, L = np.array(self.least) ** 2, np.reshape(self.L, (k, s, m + 1))
+        least = np.array(self.least) ** 2
+        L = np.reshape(self.L, (k, s, m + 1))
         return VaneParams(np.reshape(self.H, (k, s)), L, least, np.float64(self.time))
 
 
@@ -169,13 +174,16 @@ class AllocationConfig(Config):
 
     def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
         """The allocation of `inputs` for the same inputs in another order."""
-        places, p = [list(inputs).index(name) for name in wanted], len(self.effectors)
-        T, effect = np.reshape(self.T, (p, -1))[:, places], np.reshape(self.effect, (-1, p))[places]
+        places = [list(inputs).index(name) for name in wanted]
+        p = len(self.effectors)
+        T = np.reshape(self.T, (p, -1))[:, places]
+        effect = np.reshape(self.effect, (-1, p))[places]
         return self.model_copy(update={"T": tuple(T.ravel().tolist()), "effect": tuple(effect.ravel().tolist())})
 
     def arrays(self, inputs: Sequence[str]) -> Allocation:
         """The arrays of the allocation. Raises ParameterError for sizes that do not match and for an effect T that is not I."""
-        p, m = len(self.effectors), len(inputs)
+        p = len(self.effectors)
+        m = len(inputs)
         require(p >= m, "allocation.effectors", ", ".join(self.effectors), f"{m} or more, for {', '.join(inputs)}")
         require(len(set(self.effectors)) == p, "allocation.effectors", ", ".join(self.effectors), "different names")
         for key, rows, columns in (("T", p, m), ("effect", m, p)):
@@ -188,7 +196,8 @@ class AllocationConfig(Config):
             require(within, "allocation.lower", f"{low:g} and upper {high:g} of {name}", "a range with trim, 0, inside")
         priority = self.priority or tuple(inputs)
         require_channels("allocation.priority", priority, inputs, "the inputs of the law")
-        T, effect = np.reshape(self.T, (p, m)), np.reshape(self.effect, (m, p))
+        T = np.reshape(self.T, (p, m))
+        effect = np.reshape(self.effect, (m, p))
         error = float(np.abs(effect @ T - np.eye(m)).max())
         require(error < MAX_INVERSE_ERROR, "allocation.T", f"effect T that is off I by {error:.3g}", "T with effect T = I")
         slew = (np.inf,) * p if self.slew is None else self.slew
@@ -302,7 +311,8 @@ class ControllerConfig(NodeConfig):
 
     def _check_nominal(self, nominal: Nominal) -> None:
         zeros = zero_dynamics(nominal)
-        rightmost, fastest = float(np.max(zeros.real, initial=-np.inf)), float(np.max(np.abs(zeros), initial=0.0))
+        rightmost = float(np.max(zeros.real, initial=-np.inf))
+        fastest = float(np.max(np.abs(zeros), initial=0.0))
         stable = "none in the right half plane: u_ff would grow without bound"
         eigenvalue = f"zero dynamics with an eigenvalue at {rightmost:.3g} 1/s"
         require(rightmost <= ZERO_REAL_PART, "feedforward.A", eigenvalue, stable)
@@ -394,15 +404,19 @@ class ControllerConfig(NodeConfig):
 
     def tuned_law(self) -> TunedLaw:
         """The law with its parameters, extended by the observer where there is one."""
-        law, params, nominal = self.control_law(), self.law_params(), self.nominal()
+        law = self.control_law()
+        params = self.law_params()
+        nominal = self.nominal()
         if self.observer is None or nominal is None:
             return TunedLaw(law, params)
-        bound, part = self._limits(), self.observer.part
+        bound = self._limits()
+        part = self.observer.part
         rate = part / self.observer.within * (bound.upper - bound.lower) / 2.0
         limits = Limits(part * bound.lower, part * bound.upper, rate)
         fade_rate = 1.0 / self.observer.fade if self.observer.fade else np.inf
         Phi, Gamma, H, L, F = self.observer.matrices(nominal)
-        section, vanes = self.observer.vanes, None
+        section = self.observer.vanes
+        vanes = None
         if section is not None:
             vanes = section.params(self.outputs, self._model_states(), len(Phi))
         observed = ObserverParams(params, Phi, Gamma, H, L, F, limits, np.float64(fade_rate), vanes)

@@ -30,7 +30,8 @@ OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation"
 """Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
 
 
-FLIES, REFUSED = "flies", "refused"
+FLIES = "flies"
+REFUSED = "refused"
 """First words of the sentence of an event: a proposal is taken, a proposal fails a check."""
 
 
@@ -87,7 +88,8 @@ class Updates:
         self._first_ns = now_ns if self._first_ns is None else self._first_ns
         due = False
         while now_ns - self._first_ns >= self._times_ns[0]:
-            due, last_ns = True, self._times_ns.popleft()
+            due = True
+            last_ns = self._times_ns.popleft()
             if not self._times_ns:
                 self._times_ns.append(last_ns + self._check_ns)
         return due
@@ -102,8 +104,11 @@ class Learning:
 
     def __init__(self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool) -> None:
         assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
-        self._start, self._digest, self._settings = parameters, parameters.digest(), parameters.learn
-        self._announce, self._simulated = announce, simulated
+        self._start = parameters
+        self._digest = parameters.digest()
+        self._settings = parameters.learn
+        self._announce = announce
+        self._simulated = simulated
         self._updates = Updates(parameters.learn)
         self._due = deque[int]()  # ends of the windows whose proposals have not acted, in simulated time
         self._received: dict[int, Proposal] = {}  # by the end of the window, in simulated time
@@ -191,7 +196,10 @@ class Learning:
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """Forget what is under way; the parameters of the start where a learned model flew."""
-        self._updates, self._certificate, self._last_ns, self._since_ns = Updates(self._settings), None, None, now_ns
+        self._updates = Updates(self._settings)
+        self._certificate = None
+        self._last_ns = None
+        self._since_ns = now_ns
         self._due.clear()
         self._received.clear()
         self._fallbacks.clear()
@@ -343,8 +351,10 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
     A gain K below that of the last channel is this one with a smaller input scale: the same loop. A dead input gets the least
     input scale, so that the law holds it.
     """
-    law, own = start.law_params(), designed.law_params()
-    last, channels = own.K[-1], np.array(bare)
+    law = start.law_params()
+    own = designed.law_params()
+    last = own.K[-1]
+    channels = np.array(bare)
     K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
     K[-1] = last
     share = np.where(channels, law.K / K, 1.0)
@@ -365,7 +375,9 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
         "softening": tuple(softening.tolist()),
         "input_scale": tuple(np.where(dead, SMALLEST, scale).tolist()),
     }
-    observer, feedforward, schedule = designed.observer, designed.feedforward, designed.schedule
+    observer = designed.observer
+    feedforward = designed.feedforward
+    schedule = designed.schedule
     if channels.any() and observer is not None and feedforward is not None:
 
         def without(F: Sequence[float]) -> dict[str, Any]:
@@ -383,7 +395,9 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
 
 def acting_inputs(parameters: RiseDiConfig) -> tuple[str, ...]:
     """The inputs with a feedforward or an observer: those of the parts with a model."""
-    feedforward, observer, inputs = parameters.feedforward, parameters.observer, parameters.inputs
+    feedforward = parameters.feedforward
+    observer = parameters.observer
+    inputs = parameters.inputs
     fed = () if feedforward is None else feedforward.inputs or inputs
     models = () if parameters.schedule is None else parameters.schedule.models
     F = np.hstack([np.reshape(model.F, (len(inputs), -1)) for model in (observer, *models) if model is not None])
@@ -404,7 +418,9 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     models at further speeds it is the least over the speeds.
     For an input without effect 0; UNKNOWN without a limit, and for an output under the law of the start.
     """  # noqa: D400, D415 - what follows is an equation
-    m, model, acting = len(flown.outputs), flown.feedforward, acting_inputs(flown)
+    m = len(flown.outputs)
+    model = flown.feedforward
+    acting = acting_inputs(flown)
     dead = np.array(flown.input_scale) <= SMALLEST
     found = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
     if model is None or flown.models() == start.models():
@@ -426,7 +442,8 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
     """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
-    acting, is_first = acting_inputs(flown), flown.models() == start.models()
+    acting = acting_inputs(flown)
+    is_first = flown.models() == start.models()
     if is_first or all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
         return start
     mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
@@ -461,5 +478,6 @@ def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:
     """What differs between two parameter sets, by dotted name; None for a parameter that is gone."""
-    before, after = dict(flatten(old.model_dump())), dict(flatten(new.model_dump()))
+    before = dict(flatten(old.model_dump()))
+    after = dict(flatten(new.model_dump()))
     return {name: after.get(name) for name in before | after if before.get(name) != after.get(name)}

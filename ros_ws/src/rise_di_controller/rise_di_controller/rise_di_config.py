@@ -260,7 +260,8 @@ class RiseDiConfig(ControllerConfig):
             over = self._over_speed(
                 lambda config, scale: side_by_side(config.tuned_law().params, scale), partial(observer_of, law.params)
             )
-        speed, time = np.float64(self.schedule.speed), np.float64(self.schedule.time)
+        speed = np.float64(self.schedule.speed)
+        time = np.float64(self.schedule.time)
         return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
 
     def history_ticks(self) -> int:
@@ -293,7 +294,8 @@ class RiseDiConfig(ControllerConfig):
         """How the sign is sampled, and the reason as a sentence."""
         if self.sign != "auto":
             return Sign[self.sign.upper()], f"{self.sign} sign, as configured"
-        lag, half = max(self.lag) + self.delay, 0.5 / self.rate
+        lag = max(self.lag) + self.delay
+        half = 0.5 / self.rate
         if lag < half:
             return Sign.IMPLICIT, f"implicit sign, because lag and delay of {lag:g} s are below half a period ({half:g} s)"
         return Sign.SOFT, f"softened sign, because lag and delay of {lag:g} s reach half a period ({half:g} s)"

@@ -56,7 +56,9 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     """
     if parameters is None:
         raise ParameterError("the log: found guidance, expected its section in the scenario too")
-    signal, t, outputs = tape["guidance"], tape.time("guidance"), parameters.outputs
+    signal = tape["guidance"]
+    t = tape.time("guidance")
+    outputs = parameters.outputs
     names = signal.names
     if tuple(name for name in guidance.names(outputs) if name in names or name not in guidance.ADDED) != names:
         why = "a different version recorded their channels"
@@ -64,7 +66,9 @@ def replay_guidance(tape: Tape, parameters: GuidanceConfig | None) -> GuidanceRe
     legs = {guidance.digest(None): None} | known_routes(tape, parameters)
     published = {} if "u_m" not in tape else dict(zip(tape["u_m"].stamp_ns.tolist(), tape["u_m"].values, strict=True))
     recorded_of = [name in names for name in guidance.names(outputs)]
-    params, checked, differing = parameters.params(), 0, 0
+    params = parameters.params()
+    checked = 0
+    differing = 0
     first: Difference | None = None
     previous: GuidanceState | None = None
     for k, (stamp_ns, row) in enumerate(zip(signal.stamp_ns.tolist(), signal.values, strict=True)):

@@ -78,7 +78,9 @@ class Identifications:
     """The identifications of a learner that has them, each once."""
 
     def __init__(self, learner: Learner, outputs: tuple[str, ...]) -> None:
-        self._learner, self._outputs, self._last = learner, outputs, None
+        self._learner = learner
+        self._outputs = outputs
+        self._last = None
         self._names: tuple[str, ...] = ()
 
     def next(self, proposal: LearnerResult) -> Learned | None:
@@ -102,7 +104,8 @@ class LearningLoop:
     """Steps a learner with the ticks of a controller, in simulated time."""
 
     def __init__(self, parameters: RiseDiConfig, learn: Learn, announce: Callable[[Event], None]) -> None:
-        self._parameters, self._learner = parameters, learn(parameters)
+        self._parameters = parameters
+        self._learner = learn(parameters)
         self._identifications = Identifications(self._learner, parameters.outputs)
         self._learning = Learning(parameters, announce, simulated=True)
 

@@ -68,7 +68,8 @@ def margins(
     for an aircraft of JSBSim under a controller without a model.
     """
     flown = as_scenario(scenario)
-    count, numbered = as_count(aircraft, "aircraft", 0), as_count(seed, "seed", 0)
+    count = as_count(aircraft, "aircraft", 0)
+    numbered = as_count(seed, "seed", 0)
     deviation = as_number(uncertainty, "uncertainty", 0.0, 1.0)
     return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
 
@@ -188,10 +189,12 @@ def _model(scenario: Scenario, controller: ControllerConfig) -> Airframe:
         return load_airframe(aircraft.airframe)
     if controller.feedforward is not None and set(controller.feedforward.states) == set(controller.outputs):
         names = controller.feedforward.states
-        A, B = np.reshape(controller.feedforward.A, (len(names), -1)), np.reshape(controller.feedforward.B, (len(names), -1))
+        A = np.reshape(controller.feedforward.A, (len(names), -1))
+        B = np.reshape(controller.feedforward.B, (len(names), -1))
     elif isinstance(controller, RiseDiConfig):
         names = controller.outputs
-        A, B = np.zeros((len(names), len(names))), np.diag(np.array(controller.D) * controller.omega / controller.input_scale)
+        A = np.zeros((len(names), len(names)))
+        B = np.diag(np.array(controller.D) * controller.omega / controller.input_scale)
     else:
         expected = "a controller with a feedforward, or RISE-DI with its omega"
         raise ParameterError(f"{scenario.name}: found no linear model of {aircraft.airframe}, expected {expected}")

@@ -88,7 +88,8 @@ class ReplayResult(NamedTuple):
             return None
         row = int(rows[0])
         column = min(np.flatnonzero(different[row]).tolist(), key=lambda k: not self.names[k].startswith(U_PREFIXES))
-        recorded, computed = float(self.recorded[row, column]), float(self.computed[row, column])
+        recorded = float(self.recorded[row, column])
+        computed = float(self.computed[row, column])
         return Difference(int(self.number[row]), float(self.t[row]), self.names[column], recorded, computed)
 
     def group(self, values: FloatArray, prefix: str) -> Signal:
@@ -157,17 +158,20 @@ def _replay(
     changes: Sequence[Change] | None,
 ) -> ReplayResult:
     if others is not None:
-        others, changes = as_controller(others, "others"), changes or ()
+        others = as_controller(others, "others")
+        changes = changes or ()
     elif changes is not None:
         listed = isinstance(changes, Sequence) and all(isinstance(change, Mapping) for change in changes)
         require(listed, "changes", short_repr(changes), "a list of changes, each a mapping of dotted names")
     tape, parameters, changes = _recorded(run, parameters, changes)
     ticks = _Ticks(tape, parameters)
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
-        wanted, found = getattr(parameters, names), getattr(others or parameters, names)
+        wanted = getattr(parameters, names)
+        found = getattr(others or parameters, names)
         require(found == wanted, f"controller.{key}", ", ".join(found), f"{', '.join(wanted)}, as recorded")
     in_force = _ParametersInForce(others or parameters, changes)
-    computed, checked = np.full_like(ticks.values, np.nan), np.zeros(len(ticks.number), dtype=bool)
+    computed = np.full_like(ticks.values, np.nan)
+    checked = np.zeros(len(ticks.number), dtype=bool)
     other_parameters = checked.copy()
     state: ControllerState | None = None
     for k in range(len(ticks.number)):
@@ -221,7 +225,8 @@ class _ParametersInForce:
 
     def __init__(self, parameters: ControllerConfig, changes: Sequence[Change]) -> None:
         self.notes: list[str] = []
-        self._first, self._changes = parameters, list(changes)
+        self._first = parameters
+        self._changes = list(changes)
         self.begin()
 
     def begin(self) -> None:
@@ -230,8 +235,10 @@ class _ParametersInForce:
         self._apply(self._first)
 
     def _apply(self, parameters: ControllerConfig) -> None:
-        self._parameters, self.digest = parameters, parameters.digest()
-        self.law, self.limits = parameters.tuned_law(), parameters.guard()
+        self._parameters = parameters
+        self.digest = parameters.digest()
+        self.law = parameters.tuned_law()
+        self.limits = parameters.guard()
 
     def change(self, digest: int, number: int, state: ControllerState | None) -> ControllerState | None:
         """Apply the changes up to the parameters with a digest, if any. Returns the state afterwards."""
@@ -245,7 +252,8 @@ class _ParametersInForce:
         else:
             self._unmatched.add(digest)
             return state
-        applied, self._changes = self._changes[: len(steps) - 1], self._changes[len(steps) - 1 :]
+        applied = self._changes[: len(steps) - 1]
+        self._changes = self._changes[len(steps) - 1 :]
         changed = sorted(
             {name for change, old, new in zip(applied, steps, steps[1:], strict=False) if new != old for name in change}
         )
@@ -253,7 +261,8 @@ class _ParametersInForce:
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
-            law, limits = self.law, self.limits
+            law = self.law
+            limits = self.limits
             self._apply(step)
             if state is not None:
                 state = guard.retune(state, law, self.law, (limits, self.limits))
@@ -274,11 +283,15 @@ class _Ticks:
         values = np.column_stack([signal[name] for name in names])
         valid = np.isfinite(values).all() and np.isin(signal["mode"], list(Mode)).all()
         require(bool(valid), "internals", "a value that is not finite, or an unknown mode", "what a controller publishes")
-        self.m, self.p, self._allocation = len(parameters.inputs), len(parameters.effectors), parameters.guard().allocation
+        self.m = len(parameters.inputs)
+        self.p = len(parameters.effectors)
+        self._allocation = parameters.guard().allocation
         # Sort by the instants of the ticks. Stamps may decrease: a late y is older than a failsafe tick before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order = np.argsort(now_ns, kind="stable")
-        self.stamp_ns, self.now_ns, self.t = signal.stamp_ns[order], now_ns[order], tape.time("internals")[order]
+        self.stamp_ns = signal.stamp_ns[order]
+        self.now_ns = now_ns[order]
+        self.t = tape.time("internals")[order]
         signal = Signal(self.stamp_ns, names, values[order])
         self.number = signal["number"].astype(np.int64)
         self.parameters = signal["parameters"].astype(np.int64)
@@ -309,7 +322,10 @@ class _Ticks:
         """The recorded state after a tick. Values outside the log come from the computed state, if any."""
         row = {name: values[k] for name, values in self._groups.items()}
         of_law = restored(law.control_law, row)
-        mode, u, y_m, effectors = Mode(int(self._signal["mode"][k])), row["u"], row["y_m"], row.get(internals.EFFECTOR)
+        mode = Mode(int(self._signal["mode"][k]))
+        u = row["u"]
+        y_m = row["y_m"]
+        effectors = row.get(internals.EFFECTOR)
         if computed is not None and not self.flies[k]:
             return computed._replace(mode=mode, law=of_law, u=u, u_free=row["u_free"], effectors=effectors)
         feedforward_state = None if computed is None else computed.feedforward
@@ -323,7 +339,8 @@ class _Ticks:
     def tick(self, k: int, state: ControllerState, limits: GuardParams, law: TunedLaw) -> tuple[ControllerState, FloatArray]:
         """A tick: (state afterwards, row of `internals`); the row is NaN for a tick without output."""
         stamp_ns = int(self.stamp_ns[k])
-        y, y_m = None, []
+        y = None
+        y_m = []
         if self.flies[k]:
             y = StampedVector(stamp_ns, self._y[k])
             y_m = [StampedVector(stamp_ns, self._groups["y_m"][k])]
@@ -338,7 +355,8 @@ class _Ticks:
         after, used = guard.tick(state, int(self.now_ns[k]), y, y_m, limits, law, bool(self._active[k]), u_ff, vane_m)
         if used is None:
             return after, np.full(len(self.names), np.nan)
-        late, age = float(self._signal["late"][k]), float(self._signal["age"][k])
+        late = float(self._signal["late"][k])
+        age = float(self._signal["age"][k])
         row = internals.values(after, used, limits, late, age, 0, 0)
         row[self._copied] = self.values[k, self._copied]
         return after, np.concatenate([row, after.command])
@@ -351,7 +369,8 @@ def _as_published(
     matched = np.zeros(len(stamp_ns), dtype=bool)
     if topic not in tape or not set(names) <= set(tape[topic].names):
         return otherwise, matched
-    published, values = tape[topic].values[:, [tape[topic].names.index(name) for name in names]], otherwise.copy()
+    published = tape[topic].values[:, [tape[topic].names.index(name) for name in names]]
+    values = otherwise.copy()
     rows: dict[int, list[int]] = {}
     for row, stamp in enumerate(tape[topic].stamp_ns.tolist()):
         rows.setdefault(stamp, []).append(row)

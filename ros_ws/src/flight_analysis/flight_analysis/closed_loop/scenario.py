@@ -176,7 +176,8 @@ def guidance_by_rule(aircraft: AircraftConfig, reference: ReferenceModelConfig, 
     u from trim; none for a controller without these numbers. Raises ParameterError for a model or an aircraft beyond
     guidance.
     """
-    key, channels = "reference_model.second_order", aircraft.channels()
+    key = "reference_model.second_order"
+    channels = aircraft.channels()
     if reference.second_order is None:
         raise ParameterError(f"{key}: found linear, expected second_order: guidance needs its bounds on y_m_ddot")
     missing = [name for name in RATES_AND_SPEED if name not in reference.outputs]
@@ -226,7 +227,8 @@ def _yaml_values(values: Any) -> Any:
 def check_together(scenario: Scenario) -> None:
     """Check the channels and rates of the sections together. Raises ParameterError."""
     channels = scenario.aircraft.channels()
-    controller, reference = scenario.controller, scenario.reference_model
+    controller = scenario.controller
+    reference = scenario.reference_model
     airframe = f"the airframe {scenario.aircraft.airframe}"
     effectors = "controller.inputs" if controller.allocation is None else "controller.allocation.effectors"
     require_channels(effectors, controller.effectors, tuple(channels.inputs), f"the channels of {airframe}")
@@ -246,8 +248,10 @@ def check_together(scenario: Scenario) -> None:
 
 def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     """A sentence for each limit of the controller outside the end stops of the actuators: the anti-windup starts too late."""
-    controller, actuators = scenario.controller, scenario.aircraft.actuators
-    section, sentences = "controller" if controller.allocation is None else "controller.allocation", []
+    controller = scenario.controller
+    actuators = scenario.aircraft.actuators
+    section = "controller" if controller.allocation is None else "controller.allocation"
+    sentences = []
     for key, sign in (("lower", -1.0), ("upper", 1.0)):
         stops = dict(zip(scenario.aircraft.channels().inputs, getattr(actuators, key), strict=bool(getattr(actuators, key))))
         own = dict(zip(controller.effectors, getattr(controller.effector_limits(), key).tolist(), strict=True))
@@ -263,7 +267,8 @@ def require_guidable(scenario: Scenario) -> None:
 
     Behind a bridge the airframe of the scenario does not fly.
     """
-    aircraft, guidance = scenario.aircraft, scenario.guidance
+    aircraft = scenario.aircraft
+    guidance = scenario.guidance
     if guidance is None:
         return
     turns = aircraft.is_jsbsim or aircraft.kinematics == "euler"
@@ -275,7 +280,8 @@ def require_guidable(scenario: Scenario) -> None:
 
 
 def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
-    reference, aircraft = scenario.reference_model, scenario.aircraft
+    reference = scenario.reference_model
+    aircraft = scenario.aircraft
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
     for key in ("speed", "outputs", "natural_frequency"):
         found = getattr(guidance, key)

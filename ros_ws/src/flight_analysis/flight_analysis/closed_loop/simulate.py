@@ -45,7 +45,8 @@ class _SignalBuilder:
         """The samples since the last call."""
         values = np.array(self.rows) if self.rows else np.zeros((0, len(self.names)))
         signal = Signal(np.array(self.stamps[: len(values)], dtype=np.int64), self.names, values)
-        self.stamps, self.rows = [], []
+        self.stamps = []
+        self.rows = []
         return signal
 
 

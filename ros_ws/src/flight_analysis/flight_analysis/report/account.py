@@ -140,7 +140,8 @@ def final_outcome(outcome: str, account: Account) -> str:
         return base
     parts = [base, *outside, *(f"{MISSED} leg {leg.leg} by {leg.missed:.0f} m" for leg in account.legs if leg.missed)]
     if account.unflown:
-        first, last = account.unflown[0], account.unflown[-1]
+        first = account.unflown[0]
+        last = account.unflown[-1]
         parts.append(f"leg {last} {NOT_FLOWN}" if first == last else f"legs {first} to {last} {NOT_FLOWN}")
     if account.lacks:
         parts.append(f"{INCOMPLETE}: {'; '.join(account.lacks)}")
@@ -173,7 +174,9 @@ def flown(tape: Tape) -> Tape:
     others = [int(tape[name].stamp_ns[-1]) for name in ("y", "y_m") if name in tape and len(tape[name].stamp_ns)]
     if not ticks:
         return tape
-    end_ns, planned_ns = max(ticks), _planned_ns(tape)  # one tick publishes u and internals
+    # one tick publishes u and internals
+    end_ns = max(ticks)
+    planned_ns = _planned_ns(tape)
     if planned_ns is not None and end_ns < planned_ns - LATE_TICK_NS and end_ns < max(others, default=0) - LATE_TICK_NS:
         end_ns = planned_ns
     elif min(others, default=end_ns) - end_ns > nanoseconds(SILENCE):
@@ -195,7 +198,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     that a busy host left out. `simulated`: the aircraft of the scenario flew, no autopilot.
     """
     lasts = [int(signal.stamp_ns.max()) for name, signal in tape.signals.items() if name in RATED and len(signal.stamp_ns)]
-    planned_ns, end_ns = _planned_ns(tape), max(lasts, default=tape.start_ns)
+    planned_ns = _planned_ns(tape)
+    end_ns = max(lasts, default=tape.start_ns)
     from_start = planned_ns is not None and simulated
     if planned_ns is not None and simulated and outcome.startswith((COMPLETED, UNKNOWN)):
         end_ns = planned_ns
@@ -275,7 +279,9 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
     """The number of samples by topic that the log of a flight should hold, where this is known."""
-    sensors, pose, expected = scenario.aircraft.sensors, scenario.aircraft.pose, {}
+    sensors = scenario.aircraft.sensors
+    pose = scenario.aircraft.pose
+    expected = {}
     delays = {"y": sensors.delay, "pose": pose.delay}
     for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
         first_ns = tape.start_ns
@@ -364,7 +370,8 @@ def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, en
     of = tape.recording.get(name, Recording(0))
     signal = tape.signals.get(name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))).until(end_ns)
     early = 0 if begin_ns is None else int(np.searchsorted(signal.stamp_ns, begin_ns))
-    count, t = len(signal.stamp_ns), (signal.stamp_ns - tape.start_ns) / NANOSECONDS
+    count = len(signal.stamp_ns)
+    t = (signal.stamp_ns - tape.start_ns) / NANOSECONDS
     gaps = np.diff(t)
     longest = int(np.argmax(gaps)) if len(gaps) else None
     return TopicAccount(
@@ -431,7 +438,8 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     guided = summary["guidance"] or {}
     legs = tuple(FlownLeg(**leg) for leg in guided.get("legs", ()))
     outside = None if guided.get("fence") is None else Outside(**guided["fence"])
-    unguided, unflown = content.get("unguided", False), tuple(content.get("unflown", ()))
+    unguided = content.get("unguided", False)
+    unflown = tuple(content.get("unflown", ()))
     processes = {name: ProcessAccount(**of) for name, of in content.get("processes", {}).items()}
     commands = None if content.get("commands") is None else Commands(**content["commands"])
     lacks = tuple(content["lacks"])

@@ -75,7 +75,8 @@ def metric_tables(
     flights: Sequence[RecordedFlight], key: str, columns: Sequence[Column], *, lower_is_better: bool
 ) -> list[ComparisonTable]:
     """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with a value."""
-    display, tables = units(flights), []
+    display = units(flights)
+    tables = []
     for channel in dict.fromkeys(name for flight in flights for name in flight.summary[key]):
         factor = display.get(channel, summary.NO_UNIT).factor
         rows = []

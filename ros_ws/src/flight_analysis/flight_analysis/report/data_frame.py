@@ -32,7 +32,8 @@ def data_frame(tape: Tape) -> "pl.DataFrame":
         for name in signal.names:
             column = np.full(len(stamps), np.nan)
             column[rows] = signal[name]
-            columns[f"{topic}.{name}"], missing[f"{topic}.{name}"] = column, absent
+            columns[f"{topic}.{name}"] = column
+            missing[f"{topic}.{name}"] = absent
     return pl.DataFrame(columns).with_columns(
         pl.when(pl.Series(absent)).then(None).otherwise(pl.col(name)).alias(name)
         for name, absent in missing.items()

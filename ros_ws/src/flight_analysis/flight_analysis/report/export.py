@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     import polars as pl
     from matplotlib.axes import Axes
 
-FIGURE_WIDTH, ROW_HEIGHT = 15.0, 2.2  # inches
+# inches
+FIGURE_WIDTH = 15.0
+ROW_HEIGHT = 2.2
 DPI = 120
 
 

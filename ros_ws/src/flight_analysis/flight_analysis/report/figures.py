@@ -29,8 +29,14 @@ from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from rise_di_controller.internals import Saturation
 
-PLANT, REFERENCE, ERROR, MEASURED, WIND, GUST = "#123c52", "#f6a85f", "#8b1f4f", "#e3b6c9", "#2a7f62", "#7f7f7f"
-END_STOP, LIMIT = "#bbbbbb", "#444444"
+PLANT = "#123c52"
+REFERENCE = "#f6a85f"
+ERROR = "#8b1f4f"
+MEASURED = "#e3b6c9"
+WIND = "#2a7f62"
+GUST = "#7f7f7f"
+END_STOP = "#bbbbbb"
+LIMIT = "#444444"
 DARK = {
     PLANT: "#9edbff",
     REFERENCE: "#8f5820",
@@ -85,7 +91,8 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
     """Intervals of the modes of the controller except ENGAGED, by mode, from `internals`."""
     if "internals" not in tape:
         return []
-    t, modes = tape.time("internals"), tape["internals"]["mode"]
+    t = tape.time("internals")
+    modes = tape["internals"]["mode"]
     return [
         Interval(mode.name.lower(), start, stop, colour, False)
         for mode, colour in MODE_COLOURS.items()
@@ -104,16 +111,19 @@ def error_figure(context: PlotContext, floors: Mapping[str, float] | None = None
 
     Noise floors, by channel in SI, are lines above and below 0 where wide enough to see.
     """
-    measured, true = Curve(tracking_error(context.tape), ERROR), true_error(context.tape)
+    measured = Curve(tracking_error(context.tape), ERROR)
+    true = true_error(context.tape)
     curves = {"e": measured}
     if true is not None and _nonzero_group(context.tape, "noise").names:
         curves = {"measured": measured._replace(colour=MEASURED), "true": Curve(true, ERROR)}
     figure = time_series_figure(context, curves, height=110)
     for index, name in enumerate(measured.signal.names):
-        floor, largest = (floors or {}).get(name, 0.0), np.max(np.abs(measured.signal[name]), initial=0.0)
+        floor = (floors or {}).get(name, 0.0)
+        largest = np.max(np.abs(measured.signal[name]), initial=0.0)
         if floor > MIN_VISIBLE_FRACTION * largest > 0.0:
             level = floor * context.units.get(name, NO_UNIT).factor
-            x, y = [0.0, context.end, None, 0.0, context.end], [level] * 3 + [-level] * 2
+            x = [0.0, context.end, None, 0.0, context.end]
+            y = [level] * 3 + [-level] * 2
             add_line(figure, index, "noise floor", x, y, NOISE_FLOOR_LINE)
     return set_layout(figure, labels=16)
 
@@ -135,7 +145,8 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
         for (kind, pair), style in zip(bounds.items(), LIMIT_LINES, strict=False):
             for bound in pair[np.isfinite(pair)]:
                 add_line(figure, index, kind, [0.0, context.end], [bound, bound], style)
-        mark, top = high + 0.07 * (high - low), high + 0.14 * (high - low)
+        mark = high + 0.07 * (high - low)
+        top = high + 0.14 * (high - low)
         for saturation, colour in SATURATION_COLOURS.items():
             spans = mask_spans(*_saturated(tape, name, saturation), context.end * MIN_VISIBLE_FRACTION)
             x = [instant for start, stop in spans for instant in (start, stop, None)]
@@ -146,7 +157,8 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
 
 def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
     """Limits of u by kind and by input: end stops of the actuators where these are simulated, and limits of the controller."""
-    actuators, controller = scenario.aircraft.actuators, scenario.controller
+    actuators = scenario.aircraft.actuators
+    controller = scenario.controller
     own = controller.effector_limits()
     limits = {"limits of the controller": _limit_pairs(controller.effectors, own.lower.tolist(), own.upper.tolist())}
     if not _truth_group(tape, "actuator").names:
@@ -180,11 +192,15 @@ def learned_figure(context: PlotContext) -> Figure | None:
     """
     if "learned" not in context.tape:
         return None
-    t, found = context.tape.time("learned"), context.tape["learned"]
-    known, values, deviations = known_entries(found), found.group("value"), found.group("deviation")
+    t = context.tape.time("learned")
+    found = context.tape["learned"]
+    known = known_entries(found)
+    values = found.group("value")
+    deviations = found.group("deviation")
     if not known:
         return None
-    columns, symbols = min(len(known), 3), np.where(found["proposed"] > 0.0, "circle", "circle-open").tolist()
+    columns = min(len(known), 3)
+    symbols = np.where(found["proposed"] > 0.0, "circle", "circle-open").tolist()
     figure = Figure(len(known), columns, 110, spacing=0.06)
     for index, name in enumerate(known):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
@@ -263,7 +279,8 @@ def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
         samples = {label: run[quantity] for label, run in timing.items() if quantity in run}
         edges = np.histogram_bin_edges(np.concatenate(list(samples.values())), bins=HISTOGRAM_BINS)
         for label, values in samples.items():
-            counts, width = np.histogram(values, edges)[0].astype(float), edges[1] - edges[0]
+            counts = np.histogram(values, edges)[0].astype(float)
+            width = edges[1] - edges[0]
             bars = {
                 "type": "bar",
                 "x": edges[:-1] + width / 2.0,
@@ -306,7 +323,8 @@ def sensor_figure(context: PlotContext) -> Figure | None:
 
 def tick_figure(context: PlotContext) -> Figure | None:
     """Lateness, age of y and dt of the controller's ticks; None for ticks in time with a fresh y alone."""
-    tape, channels = context.tape, ("late", "age", "dt")
+    tape = context.tape
+    channels = ("late", "age", "dt")
     if "internals" not in tape:
         return None
     ticks = tape["internals"]
@@ -340,8 +358,10 @@ def _saturated(tape: Tape, name: str, kind: Saturation) -> tuple[FloatArray, NDA
 
 def _axis_range(values: FloatArray, bounds: FloatArray) -> tuple[float, float]:
     """Range of an axis: the values, and near bounds."""
-    low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    low = float(values.min(initial=0.0))
+    high = float(values.max(initial=0.0))
     near = [bound for bound in bounds if 0.0 < bound <= LIMIT_VIEW_RATIO * high or LIMIT_VIEW_RATIO * low <= bound < 0.0]
-    low, high = min([low, *near]), max([high, *near])
+    low = min([low, *near])
+    high = max([high, *near])
     margin = 0.06 * (high - low) or 1.0
     return low - margin, high + margin

@@ -71,7 +71,9 @@ class Segment(NamedTuple):
 
 def segments(tape: Tape) -> list[Segment]:
     """The segments of a guided flight, from `guidance`. Commands less than SETTLING_DWELL apart begin a single segment."""
-    t, errors, times = tape.time("guidance"), control_errors(tape), sample_times(tape["guidance"].stamp_ns)
+    t = tape.time("guidance")
+    errors = control_errors(tape)
+    times = sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
     targets = [name for name in (f"target.{name}" for name in TARGETS) if name in log.names]
     named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
@@ -86,7 +88,8 @@ def segments(tape: Tape) -> list[Segment]:
     found = []
     for first, after in zip(starts, [*starts[1:], len(t)], strict=True):
         last = after - 1  # its modes and commands are those that the segment ends with
-        lateral, vertical = Lateral(int(log["mode.lateral"][last])), Vertical(int(log["mode.vertical"][last]))
+        lateral = Lateral(int(log["mode.lateral"][last]))
+        vertical = Vertical(int(log["mode.vertical"][last]))
         on_path = "xtrack" if lateral in {Lateral.ORBIT, Lateral.ROUTE} else lateral.name.lower()
         quantities = (on_path, "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(), "V")
         held = [_held(name, t[first:after], errors[name][first:after], times[first:after]) for name in quantities]
@@ -100,7 +103,8 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
 
     Empty for a log of a version without the channels.
     """
-    t, log = tape.time("guidance"), tape["guidance"]
+    t = tape.time("guidance")
+    log = tape["guidance"]
     if "missed" not in log.names:
         return []
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
@@ -110,7 +114,8 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
     for first, after in zip([0, *edges], [*edges, len(t)], strict=True):
         if legs[first] < 0.0 or first == after:
             continue
-        on_leg, ends = np.flatnonzero(log["joining"][first:after] == 0.0), after < len(t) and not given[after]
+        on_leg = np.flatnonzero(log["joining"][first:after] == 0.0)
+        ends = after < len(t) and not given[after]
         ends = ends and legs[after] == legs[first] + 1.0
         missed = float(log["missed"][after]) if ends else 0.0
         result = "not ended" if not ends else "missed" if missed else "flown"
@@ -189,7 +194,8 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 
     The cross-track error comes from the log, positive to the right. Angles are within half a turn.
     """
-    log, pose = tape["guidance"], tape["guidance"].group("pose")
+    log = tape["guidance"]
+    pose = tape["guidance"].group("pose")
     measured = {
         "phi": pose["phi"],
         "heading": pose["psi"],
@@ -206,7 +212,8 @@ def control_errors(tape: Tape) -> dict[str, FloatArray]:
 
 
 def _held(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) -> Held:
-    metrics, first = error_metrics(error, times), float(error[0])
+    metrics = error_metrics(error, times)
+    first = float(error[0])
     if abs(first) <= BANDS[quantity]:
         return Held(quantity, *metrics, None, None)
     beyond = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
@@ -217,7 +224,8 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     """The notices of a guided flight with their times."""
     if section is None or "guidance" not in tape:
         return []
-    log, t = tape["guidance"], tape.time("guidance")
+    log = tape["guidance"]
+    t = tape.time("guidance")
     if not has_channels(log.names):
         return []
     flown = known_routes(tape, section)
@@ -233,7 +241,8 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
         return None
     log = tape["guidance"]
-    limited, outside = log.group("limited"), time_outside(tape, section)
+    limited = log.group("limited")
+    outside = time_outside(tape, section)
     return {
         "segments": [
             segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}

@@ -43,7 +43,8 @@ Bounds = Mapping[str, tuple[float, float]]  # least and largest command by chann
 
 def guided_context(context: PlotContext) -> PlotContext:
     """The context with the units of the held quantities, and the times of a stale pose."""
-    t, mode = context.tape.time("guidance"), context.tape["guidance"]["mode"]
+    t = context.tape.time("guidance")
+    mode = context.tape["guidance"]["mode"]
     stale = [
         Interval(f"guidance: {shaded.name.lower().replace('_', ' ')}", start, stop, colour, False)
         for shaded, colour in MODE_SHADES.items()
@@ -104,9 +105,11 @@ def _add_numbers(figure: Figure, route: Route) -> None:
 def _add_fence(figure: Figure, fence: Fence) -> None:
     for zone in fence.zones:
         turn = np.linspace(0.0, 2.0 * math.pi, 73)
-        north, east = np.array([*zone.north, zone.north[0]]), np.array([*zone.east, zone.east[0]])
+        north = np.array([*zone.north, zone.north[0]])
+        east = np.array([*zone.east, zone.east[0]])
         if zone.radius:
-            north, east = zone.north[0] + zone.radius * np.cos(turn), zone.east[0] + zone.radius * np.sin(turn)
+            north = zone.north[0] + zone.radius * np.cos(turn)
+            east = zone.east[0] + zone.radius * np.sin(turn)
         line = {"color": END_STOP, "width": 2.0, "dash": "dot" if zone.exclude else "solid"}
         name = "keep out" if zone.exclude else "fence"
         figure.add({"type": "scatter", "x": east, "y": north, "mode": "lines", "name": name, "line": line, "hoverinfo": "skip"})
@@ -123,7 +126,8 @@ def tracks_figure(tracks: Mapping[str, tuple[Tape, str]], routes: Sequence[Route
         outline = {"type": "scatter", "x": east, "y": north, "mode": "lines", "name": "route", "line": line}
         figure.add(outline | {"hoverinfo": "skip"})
     for label, (tape, colour) in tracks.items():
-        t, pose = tape.time("guidance"), tape["guidance"].group("pose")
+        t = tape.time("guidance")
+        pose = tape["guidance"].group("pose")
         keep = np.unique(np.linspace(0, len(t) - 1, TRACK_POINTS).astype(int))
         north, east = (pose[name][keep].astype(np.float32) for name in ("north", "east"))
         line = {"color": colour, "width": 1.4}
@@ -140,7 +144,8 @@ def mean_wind(tape: Tape, speed: float, parts: int = WIND_ARROWS) -> FloatArray:
     The wind is the velocity over ground less the velocity through the air, V cos(gamma) along psi + beta, with V = V0 + V of y.
     """
     log = tape["guidance"]
-    pose, heading = log.group("pose"), log["pose.psi"] + log["pose.beta"]
+    pose = log.group("pose")
+    heading = log["pose.psi"] + log["pose.beta"]
     wind = np.column_stack(wind_of(pose["v_north"], pose["v_east"], pose["climb"], heading, speed + log["y.V"]))
     return np.array([part.mean(axis=0) for part in np.array_split(wind, min(parts, len(wind)))])
 
@@ -187,7 +192,8 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     if not on_path.any():
         return None
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)
-    t, legs = context.tape.time("guidance"), np.where(lateral == Lateral.ROUTE, log["leg"], -1.0)
+    t = context.tape.time("guidance")
+    legs = np.where(lateral == Lateral.ROUTE, log["leg"], -1.0)
     spans = [
         Interval(f"leg {int(leg)}", *span, END_STOP if leg % 2 else "#ffffff", True)
         for leg in np.unique(legs[legs >= 0.0])
@@ -211,9 +217,11 @@ def _over_commands(
     for index, name in enumerate(flown):
         factor = context.units[name].factor
         values = np.concatenate([flown[name], commands[name]]) * factor
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+        low = float(np.nanmin(values))
+        high = float(np.nanmax(values))
         lower, upper = (bound * factor for bound in bounds.get(name, (-math.inf, math.inf)))
-        low, high = min([low, *filter(math.isfinite, (lower,))]), max([high, *filter(math.isfinite, (upper,))])
+        low = min([low, *filter(math.isfinite, (lower,))])
+        high = max([high, *filter(math.isfinite, (upper,))])
         margin = 0.06 * (high - low) or 1.0
         view = (low - margin, high + margin)
         for bound, edge in zip((lower, upper), view, strict=True):

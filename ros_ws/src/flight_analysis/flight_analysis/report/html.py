@@ -100,9 +100,12 @@ def write_loop_page(path: Path, title: str, loop: LinearLoop) -> None:
 
 def _imported_page(flight: RecordedFlight) -> Page:
     """What an autopilot logged of y, u and the pose."""
-    tape, source = flight.tape, flight.summary["source"]
-    context, of_flight = figures.plot_context(tape, flight.units, {}), tables.imported_tables(flight.summary, flight.units)
-    colour, pose = figures.PLANT, None
+    tape = flight.tape
+    source = flight.summary["source"]
+    context = figures.plot_context(tape, flight.units, {})
+    of_flight = tables.imported_tables(flight.summary, flight.units)
+    colour = figures.PLANT
+    pose = None
     spectrum = figures.spectrum_figure({"u": (tape, flight.period_ns)}, {"u": colour}, flight.units)
     if "pose" in tape:
         pose = time_series_figure(context._replace(units=QUANTITY_UNITS), {"pose": Curve(tape["pose"], colour)}, columns=2)
@@ -124,8 +127,10 @@ def _imported_page(flight: RecordedFlight) -> Page:
 
 
 def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
-    units, gusts = flight.units, flight.gusts
-    context, loop = figures.plot_context(flight.tape, units, gusts), _linear_loop(scenario)
+    units = flight.units
+    gusts = flight.gusts
+    context = figures.plot_context(flight.tape, units, gusts)
+    loop = _linear_loop(scenario)
     of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts, scenario))
     return Page(
         f"Flight {flight.name}",
@@ -144,7 +149,8 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
 
 
 def _comparison_page(flights: Sequence[RecordedFlight]) -> Page:
-    context, colours = comparison.plot_context(flights), comparison.colours(flights)
+    context = comparison.plot_context(flights)
+    colours = comparison.colours(flights)
     scenarios = [flight.scenario for flight in flights if flight.scenario is not None]
     runs = {label: (flight.tape, flight.period_ns) for label, flight in zip(colours, flights, strict=True)}
     lines = []
@@ -183,7 +189,8 @@ def _description(flight: RecordedFlight, scenario: Scenario) -> str:
 def _sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
     floors = {name: metrics["floor"] or 0.0 for name, metrics in flight.summary["errors"].items()}
     limits = figures.input_limits(scenario, flight.tape)
-    run, colour = (flight.tape, flight.period_ns), figures.PLANT
+    run = (flight.tape, flight.period_ns)
+    colour = figures.PLANT
     spectrum = figures.spectrum_figure({"u": run}, {"u": colour}, context.units)
     return [
         *_guidance_sections(flight, scenario, context),
@@ -245,9 +252,11 @@ def _loop_sections(loop: LinearLoop) -> list[Section]:
 def _guidance_sections(flight: RecordedFlight, scenario: Scenario, context: plotting.PlotContext) -> list[Section]:
     if flight.summary["guidance"] is None:
         return []
-    speed, bounds = scenario.aircraft.channels().speed, guided_figures.bounds_of(scenario)
+    speed = scenario.aircraft.channels().speed
+    bounds = guided_figures.bounds_of(scenario)
     guidance = scenario.guidance
-    routes, context = guided_figures.flown_routes(scenario, flight.tape), guided_figures.guided_context(context)
+    routes = guided_figures.flown_routes(scenario, flight.tape)
+    context = guided_figures.guided_context(context)
     return [
         Section(
             "Ground track",

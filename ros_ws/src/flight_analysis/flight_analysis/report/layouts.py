@@ -24,7 +24,9 @@ COLUMNS = 2
 MAP = "3D!map"
 """The 3-D panel of a guided flight: route and aircraft in the frame `map`, ENU."""
 MAP_TOPICS = ("odometry", "path", "markers")
-CAMERA_DISTANCE, GRID_SIZE = 3000.0, 10_000.0  # m
+# m
+CAMERA_DISTANCE = 3000.0
+GRID_SIZE = 10_000.0
 CHASE_DISTANCE = 15.0  # m, of the camera of RViz behind the aircraft
 
 SPAN = 3.0  # m, of the drawn aircraft
@@ -71,7 +73,8 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
 
     A guided flight has a further tab, of the commands and measurements of guidance.
     """
-    outputs, wind = channels["y_m"], [name for name in channels["truth"] if name.startswith("gust.")]
+    outputs = channels["y_m"]
+    wind = [name for name in channels["truth"] if name.startswith("gust.")]
     inputs = [name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")]
     integrals = [f"{group}.{name}" for name in outputs for group in ("integral_e", "Pi")]
     integrals = [name for name in integrals if name in channels["internals"]]  # another law may have neither

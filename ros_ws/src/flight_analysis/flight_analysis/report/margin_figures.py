@@ -36,7 +36,8 @@ SHOWN_DAMPING = 0.8  # slow modes with less damping are listed
 FREQUENCIES_SHOWN = 240  # of Bode and Nyquist plots
 LOWEST_SHOWN = 1e-3  # of pi / T, rad/s
 NYQUIST_RANGE = ((-3.0, 1.0), (-2.0, 2.0))  # around the point -1
-UNIT_CIRCLE, BOUND = "#bbbbbb", "#444444"
+UNIT_CIRCLE = "#bbbbbb"
+BOUND = "#444444"
 
 
 def decibels(factor: FloatArray | float) -> FloatArray:
@@ -58,7 +59,8 @@ def margin_rows(of: LoopMargins) -> list[list[str]]:
 
 def _values(margins: Margins, delay: Sequence[float]) -> list[list[float]]:
     """The values of MARGIN_COLUMNS by row, in the units of the columns; NaN for none."""
-    phase, gain = np.append(margins.phase, disk_phase(margins.disk_all)), np.append(margins.gain, disk_gain(margins.disk_all))
+    phase = np.append(margins.phase, disk_phase(margins.disk_all))
+    gain = np.append(margins.gain, disk_gain(margins.disk_all))
     return [
         np.degrees(phase).tolist(),
         [*margins.crossover.tolist(), math.nan],
@@ -94,7 +96,8 @@ def least_margins(of: LoopMargins | None) -> list[str]:
     """The values of LEAST_MARGINS: nominal (worst uncertain aircraft)."""
     if of is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
-    nominal, worst = _least(of.nominal, of.delay), None if of.worst is None else _least(of.worst, of.worst_delay or 0.0)
+    nominal = _least(of.nominal, of.delay)
+    worst = None if of.worst is None else _least(of.worst, of.worst_delay or 0.0)
     formats = LEAST_MARGINS.values()
     beside = [None] * len(nominal) if worst is None else worst
     return [_cell(*values) for values in zip(nominal, beside, formats, strict=True)]
@@ -102,7 +105,8 @@ def least_margins(of: LoopMargins | None) -> list[str]:
 
 def _least(margins: Margins, delay: float) -> list[float]:
     """LEAST_MARGINS of a set of margins, in the units of the names."""
-    phase, gain = np.degrees(margins.phase.min()), decibels(margins.gain.min())
+    phase = np.degrees(margins.phase.min())
+    gain = decibels(margins.gain.min())
     values = (phase, gain, margins.sensitivity.max(), margins.disk_all, margins.damping, 1e3 * delay)
     return [float(value) for value in values]
 

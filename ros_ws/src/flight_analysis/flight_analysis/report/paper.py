@@ -35,9 +35,15 @@ if TYPE_CHECKING:  # it loads in some tenths of a second
 
 FORMATS = ("pdf", "svg", "eps", "png")
 WIDTH = "88mm"  # a column of IEEE and of many journals
-NARROWEST, WIDEST = 0.03, 1.0  # m
-ROW_RATIO, LEGEND_HEIGHT = 0.42, 0.35  # height of a channel over the width; inches
-FONT_SIZE, LINE_WIDTH, DPI = 8.0, 0.8, 300.0  # points, points, of PNG
+# m
+NARROWEST = 0.03
+WIDEST = 1.0
+# height of a channel over the width; inches
+ROW_RATIO = 0.42
+LEGEND_HEIGHT = 0.35
+FONT_SIZE = 8.0  # points
+LINE_WIDTH = 0.8  # points
+DPI = 300.0  # of PNG
 STYLE: Any = {
     "font.size": FONT_SIZE,
     "axes.linewidth": 0.5,
@@ -95,7 +101,8 @@ def write_figure(
     require(suffix in FORMATS, "figure", f"{path.name}", f"a name that ends in {', '.join(f'.{name}' for name in FORMATS)}")
     metres = in_si(width, "width", "m")
     require(NARROWEST <= metres <= WIDEST, "width", f"{width}", "30 mm to 1 m, with a unit as in 88mm")
-    outputs, inputs = _names(flights, "y"), _names(flights, "u")
+    outputs = _names(flights, "y")
+    inputs = _names(flights, "u")
     known = [*outputs, *inputs, *(f"e.{name}" for name in outputs if _names(flights, "y_m"))]
     wanted = as_names(channels, "channels", "names of channels: q,V,elevator") or tuple(outputs)
     for name in wanted:
@@ -124,7 +131,8 @@ def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
     """Draw a channel of each flight, with the reference and the gusts of the first."""
     units = comparison.units(flights)
     plain = name.removeprefix("e.")
-    is_error, first = name != plain, flights[0]
+    is_error = name != plain
+    first = flights[0]
     is_output = any(plain in flight.tape["y"].names for flight in flights if "y" in flight.tape)
     factor = units.get(plain, NO_UNIT).factor
 
@@ -184,11 +192,13 @@ def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
 
 def matlab_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
     """Names that MATLAB permits by name: letters, digits and _, a letter first, 63 characters, no keyword, each once."""
-    used, permitted = set(taken), {}
+    used = set(taken)
+    permitted = {}
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
         plain = plain if re.match(r"[A-Za-z]", plain) and plain not in MATLAB_KEYWORDS else f"x_{plain}"
-        plain, count = plain[:MATLAB_NAME], 1
+        plain = plain[:MATLAB_NAME]
+        count = 1
         while plain in used:
             count += 1
             plain = f"{plain[: MATLAB_NAME - 4].removesuffix(f'_{count - 1}')}_{count}"

@@ -34,7 +34,10 @@ MIN_GAP_PERIODS = 10.0  # a curve is broken at a gap of this many median periods
 INTERVAL_OPACITY = 0.25
 LABEL_WIDTH = 0.08  # width of the label of an interval, as a fraction of the flight's duration
 TRANSPARENT = "rgba(0,0,0,0)"
-PAPER, INK, GRID, ZERO = "#ffffff", "#2b3640", "#e8ebee", "#c8ced4"
+PAPER = "#ffffff"
+INK = "#2b3640"
+GRID = "#e8ebee"
+ZERO = "#c8ced4"
 DARK = {PAPER: "#1b1f24", INK: "#d3d9df", GRID: "#2c323a", ZERO: "#4b545e"}
 """Colours of the frame on a light page, and the colours that replace them on a dark page."""
 
@@ -145,16 +148,19 @@ class Figure:
     """
 
     def __init__(self, count: int, columns: int, height: int, spacing: float | None = None) -> None:
-        self.rows, self.height = -(-count // columns), height
+        self.rows = -(-count // columns)
+        self.height = height
         across = 0.24 / columns
         between = min(0.14, 24.0 / (self.rows * height)) if spacing is None else spacing
-        wide, high = (1.0 - across * (columns - 1)) / columns, (1.0 - between * (self.rows - 1)) / self.rows
+        wide = (1.0 - across * (columns - 1)) / columns
+        high = (1.0 - between * (self.rows - 1)) / self.rows
         self.data: list[dict[str, Any]] = []
         self.x: list[dict[str, Any]] = []
         self.y: list[dict[str, Any]] = []
         for index in range(count):
             row, column = divmod(index, columns)
-            left, bottom = column * (wide + across), (self.rows - 1 - row) * (high + between)
+            left = column * (wide + across)
+            bottom = (self.rows - 1 - row) * (high + between)
             self.x.append({"anchor": axis("y", index), "domain": [left, left + wide]})
             self.y.append({"anchor": axis("x", index), "domain": [bottom, bottom + high]})
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
@@ -197,7 +203,8 @@ def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, col
 
 def set_layout(figure: Figure, labels: int = 6, below: int = 40) -> Figure:
     """Set size, margins and colours: the legend and `labels` pixels above the rows, the axis `below` the rows."""
-    above, rows = 24 * any(trace.get("showlegend") for trace in figure.data) + labels, figure.height * figure.rows
+    above = 24 * any(trace.get("showlegend") for trace in figure.data) + labels
+    rows = figure.height * figure.rows
     for axes, standoff in ((figure.x, 4), (figure.y, 6)):
         for axis in axes:
             axis |= {"gridcolor": GRID, "zerolinecolor": ZERO, "title": axis.get("title", {}) | {"standoff": standoff}}
@@ -254,7 +261,8 @@ def extremes(values: FloatArray, most: int) -> NDArray[np.intp]:
     bins = _bins(values, width)
     gaps = np.isnan(bins)
     below, above = (np.where(gaps, np.inf, bins), np.where(gaps, -np.inf, bins)) if gaps.any() else (bins, bins)
-    low, high = below.argmin(axis=1), above.argmax(axis=1)
+    low = below.argmin(axis=1)
+    high = above.argmax(axis=1)
     gap = np.where(gaps.any(axis=1), gaps.argmax(axis=1), low)
     rows = np.unique(np.array([low, high, gap]) + width * np.arange(len(bins)))
     return rows[rows < len(values)]
@@ -280,7 +288,8 @@ def _extremes_of_bins(values: FloatArray, width: int) -> FloatArray:
     """Smallest and largest value of each bin in their order, two a bin; a NaN in place of the second in a bin with a gap."""
     bins = _bins(values, width)
     gaps = np.isnan(bins)
-    low, high = np.where(gaps, np.inf, bins).argmin(axis=1), np.where(gaps, -np.inf, bins).argmax(axis=1)
+    low = np.where(gaps, np.inf, bins).argmin(axis=1)
+    high = np.where(gaps, -np.inf, bins).argmax(axis=1)
     columns = np.sort(np.column_stack([low, high]), axis=1)
     drawn = np.take_along_axis(bins, columns, axis=1)
     drawn[gaps.any(axis=1), 1] = np.nan

@@ -34,7 +34,8 @@ class Replay(NamedTuple):
 
 def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     """The replay of a flight with a logged attitude, else None. Adds the poses to the samples of the page."""
-    tape, topics = flight.tape, {}
+    tape = flight.tape
+    topics = {}
     truth = tape.signals.get("truth")
     if (pose := tape.signals.get("pose")) is not None and "phi" in pose.names:
         topics["pose"] = _topic(context, _thinned(pose), {name: name for name in POSE})
@@ -59,7 +60,8 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
     """Where times and values of channels are, with the factors of their units; `channels` maps names to names of the units."""
-    found, times = {}, ""
+    found = {}
+    times = ""
     for name, quantity in channels.items():
         if name in signal.names:
             factor = context.units.get(quantity, NO_UNIT).factor

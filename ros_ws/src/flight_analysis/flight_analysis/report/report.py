@@ -83,7 +83,8 @@ def report(
     if alone:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
         result = write_report(folders[0], output=folder, namespace=namespace, scenario=scenario)
-        page, flights = result.report, [result.flight]
+        page = result.report
+        flights = [result.flight]
     else:
         flights = [read_flight(folder, namespace=namespace, scenario=scenario) for folder in folders]
         for folder, flight in zip(folders, flights, strict=True):

@@ -30,8 +30,12 @@ from flight_log.provenance import provenance
 from flight_log.rosbag2_metadata import bag_files
 from flight_log.tape_reader import AIRCRAFT_TOPICS, PARAMETERS, RecordedRun, read_run
 
-SUMMARY, REPORT = "summary.json", "report.html"
-AIRFRAME, AIRCRAFT, PROVENANCE = "airframe.yaml", "aircraft.zip", "provenance.yaml"  # attachments of the log
+SUMMARY = "summary.json"
+REPORT = "report.html"
+# attachments of the log
+AIRFRAME = "airframe.yaml"
+AIRCRAFT = "aircraft.zip"
+PROVENANCE = "provenance.yaml"
 
 
 class FlightResult(NamedTuple):
@@ -98,7 +102,8 @@ def read_flight(
 
 def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
     recorded.require()
-    folder, name = _folder(run), printable(run.resolve().name if run.is_dir() else run.stem)
+    folder = _folder(run)
+    name = printable(run.resolve().name if run.is_dir() else run.stem)
     if (source := recorded.metadata.get(IMPORTED)) is not None:
         recorded.require("y", "u")
         require(recorded.scenario is None, "scenario", "an imported log", "none: nothing of a scenario was flown")
@@ -112,7 +117,8 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     outcome = outcome or _previous_outcome(folder, recorded.tape, scenario, simulated=engagements is None)
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
-    tape, of = flown(log), account(log, scenario, outcome, simulated=engagements is None)
+    tape = flown(log)
+    of = account(log, scenario, outcome, simulated=engagements is None)
     engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
     summary = summarise(engaged if has_figures else tape, scenario, outcome, of)
@@ -198,7 +204,8 @@ def write_report(
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
     recorded = read_run(run, namespace, scenario)
-    flight, folder = _flight(recorded, run, outcome), output or _folder(run)
+    flight = _flight(recorded, run, outcome)
+    folder = output or _folder(run)
     with writing("", folder, "a folder that can"):
         folder.mkdir(parents=True, exist_ok=True)
         if scenario is None and flight.scenario is not None:
@@ -245,7 +252,8 @@ def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, si
 
 def link_latest(run: Path) -> None:
     """Point runs/latest at a run, atomically. Raises ParameterError where no link can be made."""
-    latest, temporary = run.parent / "latest", run.parent / f".latest-{os.getpid()}"
+    latest = run.parent / "latest"
+    temporary = run.parent / f".latest-{os.getpid()}"
     with writing("", latest, "a link to the last run"):
         temporary.symlink_to(run.name)
         try:

@@ -150,10 +150,12 @@ def summarise(
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refused = "".join(f" ({note})" for note in tape.notes if note.startswith(f"{topic}: ") and "refused" in note)
         require(topic in tape, "the log", f"no sample of {topic}{unset}{refused}", "a flight with y and y_m")
-    of, events = account(tape, scenario, outcome) if of is None else of, transients(scenario, tape)
+    of = account(tape, scenario, outcome) if of is None else of
+    events = transients(scenario, tape)
     of = of._replace(commands=_commands(tape, events, of.end))
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
-    latency, age = latency_metrics(tape), age_metrics(tape)
+    latency = latency_metrics(tape)
+    age = age_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS:  # in real time
         of = _with_late_ticks(of, ticks, scenario)
     notes = [of.busy] if of.busy else []
@@ -215,7 +217,8 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     except ParameterError:  # no linear model
         return []
     margin = delay_margin(of.nominal, of.law, of.loop)
-    late, beyond = f"u is {1e3 * age.mean:.1f} ms old at the aircraft", age.mean - controller.delay - margin
+    late = f"u is {1e3 * age.mean:.1f} ms old at the aircraft"
+    beyond = age.mean - controller.delay - margin
     made = f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of {1e3 * margin:.1f} ms"
     return [f"{late}, {made}: {'more than' if beyond > 0.0 else 'within'} the margin; see rise-di gains --delay"]
 
@@ -309,7 +312,9 @@ def vane_notes(tape: Tape) -> list[str]:
     """Sentences on vanes of an observer at a standstill at the end of a flight."""
     if "internals" not in tape:
         return []
-    measures, t, notes = tape["internals"].group("vane_measures"), tape.time("internals"), []
+    measures = tape["internals"].group("vane_measures")
+    t = tape.time("internals")
+    notes = []
     for name in measures.names:
         moved = np.flatnonzero(measures[name] != 0.0)
         since = float(t[moved[-1]] if len(moved) else t[0])
@@ -339,7 +344,9 @@ def empty_summary(scenario: Scenario | None, outcome: str) -> dict[str, Any]:
 
 
 def _errors(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
-    bands, floors, switches = settling_bands(tape), noise_floor(tape), sign_switches(tape)
+    bands = settling_bands(tape)
+    floors = noise_floor(tape)
+    switches = sign_switches(tape)
     return {
         channel: {part: metrics._asdict() for part, metrics in parts.items()}
         | {"bound": parts["calm"].max, "band": bands[channel], "floor": floors[channel]}

@@ -87,7 +87,9 @@ class Interval(NamedTuple):
 
 def _stands_still(measures: FloatArray, tape: Tape, time: float) -> NDArray[np.bool_]:
     """Ticks in which a vane stands still, shape (N,): from an engagement on once the vane has moved or `time` s have passed."""
-    internals, t, tick = tape["internals"], tape.time("internals"), np.arange(len(measures))
+    internals = tape["internals"]
+    t = tape.time("internals")
+    tick = np.arange(len(measures))
     engages = (internals["mode"] == Mode.ENGAGED) & (internals["dt"] == 0.0)
     engaged = np.maximum.accumulate(np.where(engages, tick, 0))
     has_moved = np.maximum.accumulate(np.where(measures > 0.0, tick, -1)) >= engaged
@@ -108,7 +110,8 @@ def events(tape: Tape, gusts: Windows, scenario: Scenario | None = None) -> list
         times = f", {len(spans)} times" if len(spans) > 1 else ""
         listed.append(Interval(label, spans[0][0], spans[-1][1], f"{sum(stop - start for start, stop in spans):.2f} s{times}"))
     if "internals" in tape:
-        limited, t = tape["internals"].group("limited"), tape.time("internals")
+        limited = tape["internals"].group("limited")
+        t = tape.time("internals")
         for name, kind in product(limited.names, (Saturation.MAGNITUDE, Saturation.RATE)):
             saturated = limited[name] == kind
             if saturated.any():
@@ -196,7 +199,8 @@ def _model_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -
 
 
 def _tick_table(summary: Mapping[str, Any]) -> Table:
-    ticks, latency = summary["ticks"], summary["latency"]
+    ticks = summary["ticks"]
+    latency = summary["latency"]
     rows: list[tuple[str, str]] = []
 
     def ms(*values: float) -> str:

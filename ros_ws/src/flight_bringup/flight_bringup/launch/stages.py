@@ -165,7 +165,8 @@ def on_state(
     context: LaunchContext, spec: NodeSpec, state: NodeState, then: Callable[[], Sequence[Action]]
 ) -> RegisterEventHandler:
     """Run the actions of `then` once, when a node of this launch publishes a state, or a later one."""
-    node, states = f"{_namespace(context)}/{spec.executable}", [*NodeState]
+    node = f"{_namespace(context)}/{spec.executable}"
+    states = [*NodeState]
     reached = {*states[states.index(state) :]}
 
     def matches(event: Event) -> bool:
@@ -209,7 +210,10 @@ def begin_when_matched(
     End the flight once the log holds y, y_m and u to the end; with rosbag2 once u has the stamp of the end. A node that does
     not get so far, and an aircraft that takes no u, end the launch with exit status 1.
     """
-    waiting, flying, start_ns, held_ns = dict.fromkeys(nodes), [], [0], [-1]
+    waiting = dict.fromkeys(nodes)
+    flying = []
+    start_ns = [0]
+    held_ns = [-1]
     publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", STATE).publish
 
     def matched(spec: NodeSpec) -> Sequence[Action]:

@@ -88,13 +88,17 @@ def airframe_facts(airframe: FilePath | Airframe) -> AirframeFacts:
     if len(airframe.inputs) > len(airframe.outputs):
         T = np.asarray(np.linalg.pinv(airframe.matrix_c() @ airframe.matrix_b()), dtype=np.float64)
         airframe = airframe.through(T, [f"{LAW_INPUT}{name}" for name in airframe.outputs])
-    A, B, C = airframe.matrix_a(), airframe.matrix_b(), airframe.matrix_c()
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
+    C = airframe.matrix_c()
     Omega, hidden, (_, unseen, _) = C @ B, np.logical_not(C.any(axis=0)), output_coordinates(C)
     zeros = invariant_zeros(A, B, C)
     try:
-        D, largest = signs(Omega), coupling(Omega)
+        D = signs(Omega)
+        largest = coupling(Omega)
     except DecompositionError:
-        D, largest = None, None
+        D = None
+        largest = None
     return AirframeFacts(
         name=airframe.name,
         n=len(A),

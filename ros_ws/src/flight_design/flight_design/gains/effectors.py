@@ -53,7 +53,8 @@ def design_allocation(
     Source of the pseudo-inverse: M. W. Oppenheimer, D. B. Doman, M. A. Bolender, "Control allocation for over-actuated
     systems", Proc. 14th Mediterranean Conference on Control and Automation, 2006.
     """
-    Omega, m = airframe.matrix_c() @ airframe.matrix_b(), len(airframe.outputs)
+    Omega = airframe.matrix_c() @ airframe.matrix_b()
+    m = len(airframe.outputs)
     names = tuple(airframe.inputs)
     require(len(names) >= m, f"airframe {airframe.name}: inputs", ", ".join(names), f"{m} or more, as many as outputs or more")
     for name, low, high in zip(names, effectors.lower.tolist(), effectors.upper.tolist(), strict=True):

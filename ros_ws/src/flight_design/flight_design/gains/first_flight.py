@@ -15,8 +15,12 @@ from flight_design.gains.effectors import Effectors, LawInputs, design_allocatio
 from rise_di_controller.decomposition import search
 from rise_di_controller.params import AllocationConfig
 
-SURFACE_LAG, ENGINE_LAG = 0.05, 0.3  # s, servos and engine of a light aircraft, assumed
-STOP, SURFACE_RATE = 0.35, 1.0  # rad, rad/s: 20 deg, 57 deg/s, assumed
+# s, servos and engine of a light aircraft, assumed
+SURFACE_LAG = 0.05
+ENGINE_LAG = 0.3
+# rad, rad/s: 20 deg, 57 deg/s, assumed
+STOP = 0.35
+SURFACE_RATE = 1.0
 AUTHORITY = {SPEED: 0.3 * GRAVITY, ANGULAR_RATE: 2.0}  # m/s^2, rad/s^2: what the end stop of another input gives, assumed
 USED = 0.4  # part of the authority that the edge of a command takes at most
 NOISE = {"V": 0.05, "u": 0.05}  # m/s; 0.001 rad/s of a rate
@@ -81,20 +85,26 @@ def scenario_text(
     Commands move V by 3 % of the trim speed, q by 0.05 rad/s, p by 0.2 rad/s, less where the edge of a command would take
     more than USED of the input's authority. Gusts have 3 % of the trim speed.
     """
-    inputs, outputs, V0 = list(airframe.inputs), list(airframe.outputs), airframe.speed
-    stops, rates = _stops(airframe), _rates(airframe)
+    inputs = list(airframe.inputs)
+    outputs = list(airframe.outputs)
+    V0 = airframe.speed
+    stops = _stops(airframe)
+    rates = _rates(airframe)
     if len(inputs) > len(outputs):
         _, law = _distributed(airframe, lag)
-        authority, lag_of = law.upper, dict(zip(outputs, law.lag.tolist(), strict=True))
+        authority = law.upper
+        lag_of = dict(zip(outputs, law.lag.tolist(), strict=True))
     else:
         paired = pairing(airframe)
         response = np.abs(airframe.matrix_c() @ airframe.matrix_b())[range(len(outputs)), paired]
-        authority, lag_of = response * np.array(stops)[list(paired)], {outputs[i]: lag[j] for i, j in enumerate(paired)}
+        authority = response * np.array(stops)[list(paired)]
+        lag_of = {outputs[i]: lag[j] for i, j in enumerate(paired)}
     fastest = {output: min(FASTEST.get(output, 1.2), LAG_PRODUCT / max(lag_of[output], 1e-3)) for output in outputs}
     banks = {"p", "r"} <= set(outputs) and bool({"beta", "v"} & set(airframe.states))  # a bank turns an aeroplane
     turn = {"bank_rate": "p", "turn_rate": "r", "speed": V0} if banks else None
     amplitude = {"q": 0.05, "p": 0.2, "V": 0.03 * V0, "u": 0.03 * V0, "r": 0.03}
-    start, pulses = 2.0, {}
+    start = 2.0
+    pulses = {}
     for k, output in enumerate(outputs):
         reachable = USED * float(authority[k]) / fastest[output]
         value = float(f"{size * min(amplitude.get(output, reachable), reachable):.3g}")
@@ -169,13 +179,17 @@ def default_lags(airframe: Airframe) -> tuple[float, ...]:
 
 def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
     """A section controller with gains of 1, for the selection of gains."""
-    allocation, m = None, len(airframe.outputs)
+    allocation = None
+    m = len(airframe.outputs)
     if len(airframe.inputs) > m:
         config, law = _distributed(airframe, lag)
-        allocation, inputs, lags = config.model_dump(exclude_none=True), list(law.names), law.lag.tolist()
+        allocation = config.model_dump(exclude_none=True)
+        inputs = list(law.names)
+        lags = law.lag.tolist()
     else:
         paired = pairing(airframe)
-        inputs, lags = [list(airframe.inputs)[j] for j in paired], [lag[j] for j in paired]
+        inputs = [list(airframe.inputs)[j] for j in paired]
+        lags = [lag[j] for j in paired]
     require(m > 1, "inputs", inputs[0], "two inputs or more: add a thrust with --thrust, or a second control")
     values: Mapping[str, Any] = {
         "rate": 100.0,

@@ -30,7 +30,8 @@ from rise_di_controller.linear_loop import MAX_DELAY_MARGIN
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
-OBSERVER_LAWS, OBJECTIVE = ("rise_observer", "pi_observer"), "gust_turbulence"
+OBSERVER_LAWS = ("rise_observer", "pi_observer")
+OBJECTIVE = "gust_turbulence"
 """Laws and cost of a search whose gains are taken: those of the least cost. PI is RISE-DI with a sign that is an integral."""
 SLOWER = 1.8
 """Gains of a search are taken below this factor on the total lag of a channel. On the `osprey`, searched with 38 ms in q, they
@@ -40,7 +41,8 @@ MESSAGES = 3.0  # of y: the age limit of the law, at least
 RATES = (1.0, 1000.0)  # Hz, the lowest and the highest
 MAX_SAMPLES = 10_000
 PERFECT_VANE = 1e-4  # rad, noise in place of none of a perfect vane
-LEAST_SPEED, MOST_SPEED = 0.6, 1.8  # parts of the trim speed, within the range of the schedule's factor
+LEAST_SPEED = 0.6  # parts of the trim speed
+MOST_SPEED = 1.8  # within the range of the schedule's factor
 
 
 def select_gains(
@@ -98,7 +100,8 @@ def select_gains(
 
     Raises ParameterError with one sentence, also for an airframe whose inputs cannot be paired with its outputs.
     """
-    chosen, frame = find_scenario(scenario), load_airframe(airframe)
+    chosen = find_scenario(scenario)
+    frame = load_airframe(airframe)
     chosen.rise_di()
     require(callable(progress), "progress", progress, "a function of a text")
     require(mixing in MIXINGS, "mixing", mixing, " or ".join(MIXINGS))
@@ -209,7 +212,8 @@ def _without_allocation(loop: LoopSetting, scenario: Scenario) -> LoopSetting:
     """The loop of a scenario with an allocation for the inputs of its aircraft, with the lags of the actuators."""
     if loop.base.allocation is None:
         return loop
-    names, actuators = tuple(scenario.aircraft.channels().inputs), scenario.aircraft.actuators
+    names = tuple(scenario.aircraft.channels().inputs)
+    actuators = scenario.aircraft.actuators
     plain = {"allocation": None, "inputs": names, **dict.fromkeys(gain_selection.INPUT_LIMITS)}
     lag = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True))
     return loop._replace(base=loop.base.model_copy(update=plain), lag=lag | dict(loop.lag))
@@ -220,7 +224,8 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tup
 
     Lags are those of the loop, else of the actuators. Raises ParameterError without the end stops of the airframe's actuators.
     """
-    actuators, names = scenario.aircraft.actuators, list(airframe.inputs)
+    actuators = scenario.aircraft.actuators
+    names = list(airframe.inputs)
     own = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
     stops = own and actuators.lower and actuators.upper
     require(bool(stops), "scenario", scenario.name, f"a scenario of {airframe.name} with aircraft.actuators, lower and upper")
@@ -231,7 +236,8 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tup
     earlier = loop.base.allocation
     kept = () if earlier is None or earlier.priority is None else [name.removeprefix(LAW_INPUT) for name in earlier.priority]
     allocation, law = design_allocation(airframe, effectors, kept)
-    m, slew = len(law.names), dict(zip(law.names, law.slew.tolist(), strict=True))
+    m = len(law.names)
+    slew = dict(zip(law.names, law.slew.tolist(), strict=True))
     base = {
         "outputs": airframe.outputs,
         "inputs": law.names,
@@ -304,7 +310,8 @@ def observed(
     searched = sorted(
         ((result.cost, law, result) for law, result in results.items() if result is not None), key=lambda row: row[0]
     )
-    axes, origin = tuple(model.gusts), "gains by a rule from the lags, a start"
+    axes = tuple(model.gusts)
+    origin = "gains by a rule from the lags, a start"
     candidates = [(gains_by_rule(nominal, axes, model.speed), origin)]
     if sketched:
         candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]

@@ -87,7 +87,9 @@ STEP = 0.01
 INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
 
 
-SPEED_STEP, MAX_SPEED_RATIO = 0.05, 3.0  # of the search for the speed up to which the delay margin lasts
+# of the search for the speed up to which the delay margin lasts
+SPEED_STEP = 0.05
+MAX_SPEED_RATIO = 3.0
 
 Controller = TypeVar("Controller", bound=ControllerConfig)
 
@@ -254,9 +256,12 @@ def study_airframe(
     stable = np.array(zeros) <= ZERO_REAL_PART
     require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
     # The last column is the nominal airframe without gusts: their speed is 0 there.
-    A, B = np.concatenate([A, A[:1]]), np.concatenate([B, B[:1]])
+    A = np.concatenate([A, A[:1]])
+    B = np.concatenate([B, B[:1]])
     aircraft = _columns(airframe, manoeuvre.gusts, len(A))
-    C, n, m = airframe.matrix_c(), len(airframe.states), len(airframe.outputs)
+    C = airframe.matrix_c()
+    n = len(airframe.states)
+    m = len(airframe.outputs)
     of_y, of_eta, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
     require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
@@ -299,10 +304,13 @@ def study_airframe(
 
 def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
     """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
-    matrices, profile = manoeuvre.reference.model(), manoeuvre.reference.profile()
-    near, step = 1e-5, model.stepper(STEP / 2.0, matrices)
+    matrices = manoeuvre.reference.model()
+    profile = manoeuvre.reference.profile()
+    near = 1e-5
+    step = model.stepper(STEP / 2.0, matrices)
     t = STEP / 2.0 * np.arange(2 * round(manoeuvre.duration / STEP) + 1)
-    u_m, half_later = command(t, profile), command(t + STEP / 4.0, profile)
+    u_m = command(t, profile)
+    half_later = command(t + STEP / 4.0, profile)
     u_m_dot = (command(t + near, profile) - command(t - near, profile)) / (2.0 * near)
     x = np.zeros((len(t), len(matrices.A_m)))
     for k, stages in enumerate(np.concatenate([u_m[:-1], half_later[:-1], u_m[1:]], axis=1)):
@@ -388,7 +396,8 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     pairing = ChannelPairing(airframe.outputs, setting.inputs or tuple(inputs))
     require(sorted(pairing.inputs) == sorted(inputs), "inputs", ", ".join(pairing.inputs), f"{', '.join(inputs)} in any order")
     paired = [inputs.index(name) for name in pairing.inputs]
-    Omega, slew = study.Omega[:, paired], study.slew[paired]
+    Omega = study.Omega[:, paired]
+    slew = study.slew[paired]
     require_channels(Omega, pairing)
     products = np.array([setting.crossover_lag_products.get(name, DEFAULT_CROSSOVER_LAG_PRODUCT) for name in pairing.outputs])
     loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
@@ -402,7 +411,8 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
     def controller(gains: GainSet, response: FloatArray, slower: FloatArray) -> RiseDiConfig:
-        scale, base_inputs = unit * response, setting.base.inputs
+        scale = unit * response
+        base_inputs = setting.base.inputs
         softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
         has_limits = set(channels.inputs) <= set(base_inputs)
         limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
@@ -437,7 +447,8 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
 
     ones = np.ones(len(places))
     bounds, *_ = _bounds(study, places, columns, unit, D, ones, setting.gamma_2)
-    sufficient, first = gain_conditions.theorem_gains(bounds, ones), engineering(ones, ones)
+    sufficient = gain_conditions.theorem_gains(bounds, ones)
+    first = engineering(ones, ones)
     # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the f16 of JSBSim.
     within = GainSet(
         min(sufficient.k_g, LARGEST),
@@ -480,7 +491,8 @@ def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainA
 
     Raises ParameterError for other outputs than those of the airframe, and if D or the pairing contradict the airframe.
     """
-    known, frame = scenario.controller.outputs, study.airframe
+    known = scenario.controller.outputs
+    frame = study.airframe
     fits = f"the outputs {', '.join(known)}"
     require(sorted(known) == sorted(frame.outputs), f"airframe {frame.name}", ", ".join(frame.outputs), fits)
     return assess_gains(study, scenario.controller, loop_setting(scenario, gamma_2))
@@ -488,7 +500,8 @@ def check_gains(scenario: Scenario, study: Study, gamma_2: float = 0.0) -> GainA
 
 def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
-    controller, rates = scenario.controller, scenario.aircraft.actuators.rate
+    controller = scenario.controller
+    rates = scenario.aircraft.actuators.rate
     own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
     limits = dict(zip(scenario.aircraft.channels().inputs, rates, strict=bool(rates)))
     return LoopSetting(
@@ -526,7 +539,8 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
     of_loop += (Condition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
-        observer, needed = controller.observer, above_zeros(setting.requirement, loop.nominal)
+        observer = controller.observer
+        needed = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
         needed = needed if observer is None else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
         of_loop += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))
@@ -546,7 +560,8 @@ def _rise_di_conditions(
     params = controller.law_params()
     bounds, holds, counts = _bounds(study, rows, columns, params.input_scale, D, params.Lambda, setting.gamma_2)
     gains = GainSet(controller.k_g, np.array(controller.k_d), params.Lambda, params.beta)
-    C, Bs = study.C[rows], study.B[:, :, columns]
+    C = study.C[rows]
+    Bs = study.B[:, :, columns]
     known = [
         KnownPlant(A, B * params.input_scale, C, lambda _, x: 0.0 * x) for A, B in zip(study.A[counts], Bs[counts], strict=True)
     ]
@@ -579,8 +594,10 @@ def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
     SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
-    of, steps = linear_loop(controller, study.airframe, study.A[:1], study.B[:1]), round(1.0 / SPEED_STEP)
-    surfaces, no_delay = np.array([name != "V" for name in controller.outputs]), np.zeros(len(of.inputs))
+    of = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
+    steps = round(1.0 / SPEED_STEP)
+    surfaces = np.array([name != "V" for name in controller.outputs])
+    no_delay = np.zeros(len(of.inputs))
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
         response = np.where(surfaces, (step / steps) ** 2, 1.0)
         if not is_stable(of.nominal._replace(B=of.nominal.B * response), of.law, of.loop, no_delay):
@@ -690,7 +707,8 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     """
     as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
     assessed = selection.theorem if theorem else selection.engineering
-    controller, study = assessed.controller, selection.study
+    controller = assessed.controller
+    study = selection.study
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
     responses = response(study, controller)
@@ -756,7 +774,8 @@ def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) 
         return ""
     each = zip(margins.inputs, np.degrees(margins.nominal.phase).tolist(), strict=True)
     phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
-    largest, damping = float(margins.nominal.sensitivity.max()), float(margins.nominal.damping)
+    largest = float(margins.nominal.sensitivity.max())
+    damping = float(margins.nominal.damping)
     worst = "" if margins.worst is None else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
     return f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping {damping:.2f}."
 

@@ -76,7 +76,8 @@ def from_tape(scenario: Scenario, tape: Tape) -> tuple[KnownPlant, FlightSamples
         aircraft.C[outputs],
         lambda t, x: np.asarray(dynamics.f(t, x, aircraft)),
     )
-    truth, internals = tape["truth"], tape["internals"]
+    truth = tape["truth"]
+    internals = tape["internals"]
     y_m = np.column_stack([tape["y_m"][name][ticks["y_m"]] for name in controller.outputs])
     x, f = (truth.group(name).values[ticks["truth"]] for name in ("x", "f"))
     return plant, FlightSamples(tape.time("internals"), x, f, y_m, internals.group("Pi").values)
@@ -92,9 +93,12 @@ def fly(plant: KnownPlant, y_m: FloatArray, dt: float, params: LawParams, x_0: F
     def x_dot(t: float, x: FloatArray, v: FloatArray, _: None) -> FloatArray:
         return plant.A @ x + plant.f(t, x) + plant.B @ v
 
-    x, state, v = x_0, engage(plant.C @ x_0, y_m[0]), np.zeros(y_m.shape[1])
+    x = x_0
+    state = engage(plant.C @ x_0, y_m[0])
+    v = np.zeros(y_m.shape[1])
     t = np.asarray(dt * np.arange(len(y_m)), dtype=np.float64)
-    xs, Pis = [x], [state.Pi]
+    xs = [x]
+    Pis = [state.Pi]
     for k in range(1, len(t)):
         x = rk4(x_dot, t[k - 1], x, v, None, dt)
         state, v = step(state, plant.C @ x, y_m[k], dt, params)
@@ -197,7 +201,8 @@ def example(dt: float, duration: float) -> Example:
     It is well conditioned (M between 0.8 and 1.3, zeros -1.48 and -1.02). Its gains meet the conditions of Theorem 1 on this
     flight: `decay_matrix` is positive definite and `lemma_2` finds a constant. Times in s.
     """
-    D, U = np.array([1.0, -1.0]), np.array([[1.0, 0.4], [0.0, 1.0]])
+    D = np.array([1.0, -1.0])
+    U = np.array([[1.0, 0.4], [0.0, 1.0]])
     S = np.array([[1.2, 0.2], [0.2, 0.9]])
     A = np.array([[-1.0, 0.3, 0.5, -0.2], [0.2, -0.8, 0.3, 0.4], [0.4, -0.3, -1.5, 0.2], [0.1, 0.5, -0.2, -1.0]])
     B = np.vstack([S * D @ U, 0.1 * np.eye(2)])
@@ -208,7 +213,9 @@ def example(dt: float, duration: float) -> Example:
 
     t = dt * np.arange(round(duration / dt) + 1)
     y_m = np.column_stack([0.5 * np.sin(t), 0.4 * np.sin(0.6 * t + 1.0)])
-    K, beta = np.array([6.0, 4.0]), np.array([5.0, 3.0])
-    ones, eps = np.ones(2), beta / K * 3.0 * 1.5 * dt
+    K = np.array([6.0, 4.0])
+    beta = np.array([5.0, 3.0])
+    ones = np.ones(2)
+    eps = beta / K * 3.0 * 1.5 * dt
     params = LawParams(K=K, Lambda=ones, beta=beta, D=D, input_scale=ones, omega=2.0 * ones, eps=eps, sign=Sign.IMPLICIT)
     return Example(KnownPlant(A, B, np.eye(2, 4), f), y_m, params, np.array([0.5, 0.0, 0.0, 0.0]))

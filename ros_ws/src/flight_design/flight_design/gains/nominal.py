@@ -29,8 +29,11 @@ def nominal_model(
 
     Arguments: `noise` of the outputs, (m,), rms per sample, and `loop`, in this order.
     """
-    rows, columns = [airframe.outputs.index(name) for name in outputs], [list(airframe.inputs).index(name) for name in inputs]
-    B, C, unlimited = airframe.matrix_b()[:, columns], airframe.matrix_c()[rows], np.full(len(columns), np.inf)
+    rows = [airframe.outputs.index(name) for name in outputs]
+    columns = [list(airframe.inputs).index(name) for name in inputs]
+    B = airframe.matrix_b()[:, columns]
+    C = airframe.matrix_c()[rows]
+    unlimited = np.full(len(columns), np.inf)
     return NominalModel(
         A=airframe.matrix_a(),
         B=B,

@@ -61,11 +61,16 @@ RELAXATION = 1.05
 RESOLUTION = 3e-4  # s: of the delay margin, and of what its digits in a file change
 
 MAX_RELAXATION = 18.0  # of a channel: beyond it the search ends
-PATIENCE, PROGRESS = 20, 1.01  # the search ends after so many steps in which the margins do not grow by this factor
+# the search ends after so many steps in which the margins do not grow by this factor
+PATIENCE = 20
+PROGRESS = 1.01
 MEND = "give the loop less delay or lag, ask for a smaller delay margin, or fly the law without an observer"
 DELAYS = 4.0  # of the delay margin that is asked for: how far the search looks for it
 
-WORST_OF, WORST_UNCERTAINTY, WORST_SEED = 50, 0.3, 1  # uncertain aircraft whose least phase margin counts
+# uncertain aircraft whose least phase margin counts
+WORST_OF = 50
+WORST_UNCERTAINTY = 0.3
+WORST_SEED = 1
 
 GUST_WITH_VANE = 2.0  # factor on the noise of the wind of a filter that has a vane: with 10 u moves three times as much
 STILL = 1.4  # of the noise of a vane: a motion of less counts as none
@@ -93,9 +98,11 @@ def gains_by_rule(model: NominalModel, axes: tuple[str, ...], speed: float) -> O
     Arguments: `axes` of the wind in the order of the model's columns; `speed` V0, m/s.
     """
     T = model.total_lag
-    spectrum, order = dryden(**MODERATE, sigma=0.0), {"longitudinal": 0, "lateral": 1, "vertical": 2}
+    spectrum = dryden(**MODERATE, sigma=0.0)
+    order = {"longitudinal": 0, "lateral": 1, "vertical": 2}
     places = [order[axis] for axis in axes]
-    length, sigma = spectrum.length[places], spectrum.sigma[places]
+    length = spectrum.length[places]
+    sigma = spectrum.sigma[places]
     gust = 0.12 * sigma * np.sqrt(2.0 * speed / length)
     weights = Weights(0.38 * T, 0.4 * 0.035 / T, gust, 17.0 * length / speed, np.array([0.0036]))
     K = 0.026 / T
@@ -123,7 +130,8 @@ def gains_of_search(gains: Mapping[str, list[float]], T: FloatArray) -> Observer
     """
     values = {name: np.array(row, dtype=np.float64) for name, row in gains.items()}
     weights = Weights(**{name: values[name] for name in Weights._fields})
-    K, Lambda = values["K"], values["Lambda"]
+    K = values["K"]
+    Lambda = values["Lambda"]
     if "beta" in values:
         return ObserverGains(K, Lambda, values["beta"], np.broadcast_to(values["softening"], K.shape), weights)
     return ObserverGains(K, SHARE * Lambda, K / T, 1.0 / ((1.0 - SHARE) * Lambda * T), weights)
@@ -188,7 +196,8 @@ def with_aircraft_observer(
 
     def at(ratio: float, gains: ObserverGains) -> AtSpeed:
         frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
-        model, feedforward = model_for(frame, controller, noise), with_feedforward(base, frame).feedforward
+        model = model_for(frame, controller, noise)
+        feedforward = with_feedforward(base, frame).feedforward
         assert feedforward is not None  # noqa: S101 - it was added
         plant = LinearPlant(model.A + model.gravity, model.B, model.C)
         scale = np.array([1.0 if name == "V" else ratio**-2.0 for name in controller.outputs])
@@ -221,7 +230,9 @@ def with_aircraft_observer(
 
 def _vanes(airframe: Airframe, model: NominalModel, names: Names, weights: Weights, vanes: Mapping[str, float]) -> VanesConfig:
     """The section of the vanes: alpha and beta less the wind along their axes over V0."""
-    sampled, H, L = aircraft_model(model, names, weights.wind_time), [], []
+    sampled = aircraft_model(model, names, weights.wind_time)
+    H = []
+    L = []
     blowing = {AIR_STATE[axis]: f"wind.{axis}" for axis in airframe.gusts}
     for name, noise in vanes.items():
         parts = {f"x.{name}": 1.0, blowing.get(name, ""): -1.0 / airframe.speed}
@@ -308,7 +319,11 @@ def with_extended_state_observer(
     _require_signs(Omega, controller, "Omega")
     values = controller.model_dump() | {"observer": None, "feedforward": integrator_model(controller, Omega).model_dump()}
     base = RiseDiConfig.validate_mapping(values, "controller")
-    none, eye, loop, one, effects = np.zeros((m, m)), np.eye(m), loop_of(controller), np.ones(m), np.diag(Omega)
+    none = np.zeros((m, m))
+    eye = np.eye(m)
+    loop = loop_of(controller)
+    one = np.ones(m)
+    effects = np.diag(Omega)
     model = NominalModel(
         A=none,
         B=np.diag(effects),
@@ -328,14 +343,16 @@ def with_extended_state_observer(
     )
     model = _limited(model, controller)
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
-    law, weights = controller.law_params(), extended_state_weights(controller.outputs, model.total_lag)
+    law = controller.law_params()
+    weights = extended_state_weights(controller.outputs, model.total_lag)
     response = np.abs(effects) * law.input_scale  # y_dot by a unit of scaled input: the gains are those for a unit response
     unused = Weights(weights.effort, weights.drift, np.zeros(0), np.zeros(0), np.zeros(1))
     softening = np.broadcast_to(controller.softening, (m,))
     gains = ObserverGains(law.K * response, law.Lambda, law.beta * response, softening, unused)
 
     def design(slower: FloatArray) -> ObserverDesign:
-        drift, rate_drift = weights.drift / slower, weights.rate_drift / slower**2
+        drift = weights.drift / slower
+        rate_drift = weights.rate_drift / slower**2
         changed = weights._replace(effort=slower * weights.effort, drift=drift, rate_drift=rate_drift)
         return extended_state_observer(model, names, changed)
 
@@ -359,7 +376,8 @@ def _least_relaxed(
 
     Raises the ParameterError of the last search where none has a result.
     """
-    reached, refusal = dict.fromkeys(range(len(searches)), 1.0), ParameterError("found no gains, expected a set")
+    reached = dict.fromkeys(range(len(searches)), 1.0)
+    refusal = ParameterError("found no gains, expected a set")
     while reached:
         place = min(reached, key=reached.__getitem__)
         try:
@@ -474,7 +492,8 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
 
 def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
     """The margins missing around the nominal aircraft at the last step of the search, in sentences."""
-    controller, lacking = selected.controller, []
+    controller = selected.controller
+    lacking = []
     for law in _laws(controller):
         margins = loop_margins(nominal, law, loop_of(controller), together=False)
         delay = Condition("delay margin (ms)", None, 1e3 * delay_margin(nominal, law, loop), 1e3 * margin)

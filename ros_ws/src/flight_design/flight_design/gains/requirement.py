@@ -31,11 +31,13 @@ ACCEPTED_PHASE_MARGIN = 40.0  # deg: a requirement below this has to be accepted
 PHASE_MARGINS = (5.0, 80.0)  # deg, the range of a requirement: a loop that integrates behind a lag has less than 90
 
 STEP = 1.05  # factor of the integral, and of the bandwidth, in a step of the search
-MAX_SLOWER, MAX_LOWER = 4.0, 18.0  # largest factors of the search, by which the integral and the bandwidth fall
+MAX_SLOWER = 4.0  # largest factors of the search
+MAX_LOWER = 18.0  # by which the integral and the bandwidth fall
 WORST_STEP = math.radians(2.5)  # by which the nominal phase margin rises while the worst aircraft has too little
 MAX_WORST_STEPS = 8
 
-OF_ZERO, NO_MOTION = 0.98, 1e-3  # of the damping of a zero that is asked for; 1/s, of a zero at the origin up to rounding
+OF_ZERO = 0.98  # of the damping of a zero that is asked for; 1/s
+NO_MOTION = 1e-3  # of a zero at the origin up to rounding
 
 
 class Requirement(NamedTuple):
@@ -196,7 +198,8 @@ def _nominal_search(
             best = _Reached(candidate, slower, lower, fraction)
         if fraction >= 1.0 or lower.max() > MAX_LOWER:
             return best
-        slower, lower = np.broadcast_to(slower, margins.phase.shape), np.broadcast_to(lower, margins.phase.shape)
+        slower = np.broadcast_to(slower, margins.phase.shape)
+        lower = np.broadcast_to(lower, margins.phase.shape)
         integral, bandwidth = _short(margins, needed)
         bandwidth |= integral & (slower >= MAX_SLOWER)
         slower = np.where(integral & ~bandwidth, STEP * slower, slower)
@@ -206,7 +209,8 @@ def _nominal_search(
 def _short(margins: Margins, needed: Requirement) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Channels that need a slower integral, and channels that need a lower bandwidth, (m,)."""
     phase, gain, damping = fractions(margins, needed)
-    integral, bandwidth = phase < 1.0, gain < 1.0
+    integral = phase < 1.0
+    bandwidth = gain < 1.0
     if damping < 1.0 and not (integral | bandwidth).any():
         integral = np.arange(len(phase)) == int(np.argmin(phase))
     return np.asarray(integral), np.asarray(bandwidth)

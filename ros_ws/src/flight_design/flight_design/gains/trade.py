@@ -59,7 +59,9 @@ def linear_error(of: LinearLoop, u_dot: FloatArray) -> FloatArray:
     held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
     step = closed_loop(of.nominal, of.law, of.loop, np.zeros(u.shape[1]))
     _, drive = zero_order_hold(of.nominal.A, of.nominal.B, period)
-    n, state, total = len(of.nominal.A), np.zeros(len(step)), np.zeros(len(of.nominal.C))
+    n = len(of.nominal.A)
+    state = np.zeros(len(step))
+    total = np.zeros(len(of.nominal.C))
     for disturbance in -(held @ drive.T):
         state = step @ state
         state[:n] += disturbance

@@ -64,14 +64,14 @@ REFERENCE_BANDWIDTH = 0.5  # of the loop: the reference model's natural frequenc
 HELD_FRACTION = 0.5  # of the limit of thrust, which the command of V or climb needs in the end; the rest is for disturbances
 HOVER = {"q": PULSE_P, "p": PULSE_P, "r": PULSE_P}  # rad/s, of the doublets without an airspeed; m/s of the climb: PULSE_V / 2
 FULL_RANGE_TIME = 1.0  # s: u may cross from trim to its limit in that time, which bounds beta from below
-UNCERTAINTY, SAMPLES = 0.3, 20  # of the uncertain aircraft whose phase margin counts
+# of the uncertain aircraft whose phase margin counts
+UNCERTAINTY = 0.3
+SAMPLES = 20
 MAX_SENSITIVITY = 2.0  # of a channel's loop with its integral: a gain margin of 2, a phase margin of 29 deg
 INTEGRALS = np.append(np.geomspace(1.0, 0.01, 40), 0.0)  # of the wanted one, those that are tried
-AGE, HOLD, RAMP = (
-    1.5,
-    0.5,
-    2.0,
-)  # failsafe of the controller: its age limit per largest one of the bridge, which acts first; s, s
+AGE = 1.5  # failsafe of the controller: its age limit per largest one of the bridge
+HOLD = 0.5  # which acts first; s
+RAMP = 2.0  # s
 WAIT = 30.0  # s before the first command of the flight: the time to engage
 
 
@@ -127,7 +127,8 @@ def experiment(
     """The experiment of a channel map: every input at `amplitude` of the smaller limit; `speed` in trim, m/s, None in hover."""
     pairing, sign = channel_pairs(channel_map)
     rows = [channel_map.inputs[name] for name in pairing.inputs]
-    m, chosen = len(rows), [EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()]
+    m = len(rows)
+    chosen = [EXCITATIONS.get(motion, Excitation()) for motion in motions(channel_map).values()]
     controller = ExcitationConfig.validate_mapping(
         _controller(channel_map, pairing)
         | {
@@ -175,7 +176,8 @@ def channel_models(channel_map: ChannelMap, tape: Tape, spans: Spans, speed: flo
     Dynamics", 2007, 4.3 (heave).
     """
     pairing, sign = channel_pairs(channel_map)
-    y, u = tape["y"].within(spans), tape["u"].within(spans)
+    y = tape["y"].within(spans)
+    u = tape["u"].within(spans)
     gravity = gravity_along_path(tape["pose"], speed) if "pose" in tape and speed is not None else None
     moved = motions(channel_map)
     return [
@@ -215,16 +217,26 @@ def join(channel_map: ChannelMap, response: Response, models: Sequence[ChannelMo
     Raises ParameterError for a channel without a certain result, and for signs in contradiction to the map or among themselves.
     """
     pairing, sign = channel_pairs(channel_map)
-    Omega, m = np.where(np.isfinite(response.Omega), response.Omega, 0.0), len(sign)
+    Omega = np.where(np.isfinite(response.Omega), response.Omega, 0.0)
+    m = len(sign)
     Omega = np.where(np.abs(Omega) > MIN_RATIO * np.nan_to_num(response.Omega_deviation, nan=np.inf), Omega, 0.0)
-    deviation, lag, delay = np.diag(response.Omega_deviation).copy(), response.lag.copy(), response.delay.copy()
-    damping, stiffness, zero, misfit = np.zeros(m), np.zeros(m), np.zeros(m), np.full(m, np.nan)
+    deviation = np.diag(response.Omega_deviation).copy()
+    lag = response.lag.copy()
+    delay = response.delay.copy()
+    damping = np.zeros(m)
+    stiffness = np.zeros(m)
+    zero = np.zeros(m)
+    misfit = np.full(m, np.nan)
     refused = []
     for i, (name, output, model) in enumerate(zip(pairing.inputs, pairing.outputs, models, strict=True)):
         if model is not None and model.usable:
-            Omega[i, i], deviation[i] = model.Omega, np.sqrt(model.covariance[2, 2])
-            lag[i], delay[i] = model.lag, model.delay
-            damping[i], stiffness[i], zero[i] = model.damping, model.stiffness, model.slow / model.Omega
+            Omega[i, i] = model.Omega
+            deviation[i] = np.sqrt(model.covariance[2, 2])
+            lag[i] = model.lag
+            delay[i] = model.delay
+            damping[i] = model.damping
+            stiffness[i] = model.stiffness
+            zero[i] = model.slow / model.Omega
             misfit[i] = model.misfit
         elif response.refusal[i] or response.sign_ratio[i] < MIN_RATIO:
             refused.append(response.refusal[i] or response.sign_refusal(i))
@@ -399,11 +411,13 @@ def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[C
 
     Raises ParameterError for a trim at a stop.
     """
-    values, sentences = channel_map.model_dump(exclude_unset=True), []
+    values = channel_map.model_dump(exclude_unset=True)
+    sentences = []
     for name, trim in trims.items():
         row = channel_map.inputs[name]
         low, high = sorted(to_channel(raw, row.line) for raw in row.range)
-        key, way_on = f"map {channel_map.name}: inputs.{name}", "fly slower, or trim the aircraft otherwise"
+        key = f"map {channel_map.name}: inputs.{name}"
+        way_on = "fly slower, or trim the aircraft otherwise"
         require(low < trim < high, key, f"a trim of {trim:.4g} at its stop", f"room on both sides: {way_on}")
         for side, limit, room in (("lower", row.lower, low - trim), ("upper", row.upper, high - trim)):
             if abs(limit) > abs(room):
@@ -504,7 +518,8 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
         A[i, i] = found.zero[i] - found.damping[i]
     for place, i in enumerate(second, m):
         A[i, place] = found.damping[i] * found.zero[i] - found.stiffness[i] - found.zero[i] ** 2
-        A[place, i], A[place, place] = 1.0, -found.zero[i]
+        A[place, i] = 1.0
+        A[place, place] = -found.zero[i]
     B = np.vstack([found.Omega, np.zeros((len(second), m))])
     states = {name: UNITS[motion] for name, motion in motions(channel_map).items()}
     states |= {f"{pairing.outputs[i]}_integral": "1" for i in second}

@@ -25,11 +25,14 @@ from rise_di_controller.linear_loop import Loop
 
 TRANSIENT = 0.5  # s at the begin of a recording whose innovations do not count: the filter starts from y alone
 MOST_GAPS = 10.0  # span of a log, times that of the samples of u: the gaps are filled
-DRIFT, LOOSE = 0.003, 1.5e-4  # noises of the filter beside the wind, as `observer_design.Weights` has them: small
+DRIFT = 0.003  # noises of the filter beside the wind
+LOOSE = 1.5e-4  # as `observer_design.Weights` has them: small
 MIN_NOISE = 1e-2  # 1, noise of y in the filter, in units of 1 m/s or 0.1 rad/s: what the model leaves out of a perfect sensor
 LEAK = 1e-3  # 1, of observer_design.LEAK: over a minute the filter must not forget its angles
 HOLD = 5  # periods of a block, for which sin(x) - x is held: it changes slowly
-GUST_TIME, RATE_TIME = 0.5, 0.2  # s, decay of the rate of a gust, and of the change of that rate
+# s, decay of the rate of a gust, and of the change of that rate
+GUST_TIME = 0.5
+RATE_TIME = 0.2
 LEAST_RATE = 1e-4  # m/s^3 per root s, noise of that change where there is no gust: negligible
 LEVELS = np.array(
     [(strength, 0.0) for strength in (0.002, 0.03, 0.1, 0.3, 1.0, 3.0)]
@@ -74,7 +77,8 @@ def recording(tape: Tape, airframe: Airframe) -> Recording:
     the channels of the airframe, or one shorter than ten times the transient, with gaps beyond MOST_GAPS, or with an output
     that never changes.
     """
-    y, u = tape["y"], tape["u"]
+    y = tape["y"]
+    u = tape["u"]
     for topic, names, expected in (("y", y.names, airframe.outputs), ("u", u.names, tuple(airframe.inputs))):
         require_channels(f"topic {topic}", names, expected, f"the channels of the airframe {airframe.name}")
     require(len(u.stamp_ns) > 1 and len(y.stamp_ns) > 1, "the log", f"{len(u.stamp_ns)} samples of u", "a flight")
@@ -109,7 +113,8 @@ def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:
     """u, (T, m), some periods later: between two samples the mean that acts in a period."""
-    whole, part = int(periods), periods % 1.0
+    whole = int(periods)
+    part = periods % 1.0
     late = np.concatenate([np.repeat(u[:1], whole + 1, axis=0), u])
     return np.asarray((1.0 - part) * late[1 : len(u) + 1] + part * late[: len(u)])
 
@@ -144,10 +149,14 @@ class FilterBank(NamedTuple):
 
     def lifted(self, level: int, seen: Sequence[bool]) -> FloatArray:
         """HOLD periods as a step, (N, HOLD m + s, ..): from z, then y and u of the periods, then sin(x) - x, to r and z."""
-        H, Phi, Gamma, L = self.sampled.H, self.sampled.Phi[:, 0], self.sampled.Gamma[:, 0], self.L[:, level]
+        H = self.sampled.H
+        Phi = self.sampled.Phi[:, 0]
+        Gamma = self.sampled.Gamma[:, 0]
+        L = self.L[:, level]
         (m, s), angles = H.shape, np.flatnonzero(self.gravity.any(axis=0))
         z = np.zeros((len(Phi), s, s + 2 * HOLD * m + len(angles)))
-        z[:, :, :s], rows = np.eye(s), []
+        z[:, :, :s] = np.eye(s)
+        rows = []
         for j in range(HOLD):
             r = -H @ z
             r[:, np.arange(m), s + j * m + np.arange(m)] += 1.0
@@ -170,7 +179,9 @@ class Passage:
     def __init__(self, bank: FilterBank, y: FloatArray, u: FloatArray, level: NDArray[np.int64]) -> None:
         (T, m), (N, _, s, _), blocks = y.shape, bank.L.shape, len(level)
         self._angles = np.flatnonzero(bank.gravity.any(axis=0))
-        short, self._shape = blocks * HOLD - T, (N, m, s)  # the last block is filled with lost samples
+        # the last block is filled with lost samples
+        short = blocks * HOLD - T
+        self._shape = (N, m, s)
         y = np.vstack([y, np.full((short, m), np.nan)])
         u = np.concatenate([u, np.zeros((*u.shape[:-2], short, m))], axis=-2)
         self._seen: NDArray[np.bool_] = np.asarray(np.isfinite(y).all(axis=1))
@@ -181,12 +192,14 @@ class Passage:
         kinds, self._kind = np.unique(code, return_inverse=True)
         lifted = [bank.lifted(kind >> HOLD, [bool(kind >> j & 1) for j in range(HOLD)]) for kind in kinds.tolist()]
         self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
-        own, driven = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]], slice(s, s + 2 * HOLD * m)
+        own = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
+        driven = slice(s, s + 2 * HOLD * m)
         following = HOLD * m + np.append(np.arange(s), self._angles)  # z, and again its angles, in place of sin(x) - x
         for k, matrix in enumerate(lifted):
             of = np.flatnonzero(self._kind == k)
             forced = matrix[..., driven] @ inputs[..., of]
-            self._forced[..., of], self._states[of + 1, ..., 0] = forced[:, :-s], np.moveaxis(forced[:, following], -1, 0)
+            self._forced[..., of] = forced[:, :-s]
+            self._states[of + 1, ..., 0] = np.moveaxis(forced[:, following], -1, 0)
         self._steps = [np.ascontiguousarray(matrix[:, following][..., own]) for matrix in lifted]
         self._outputs = [np.ascontiguousarray(matrix[:, :-s, own]) for matrix in lifted]
 
@@ -196,12 +209,14 @@ class Passage:
         kind = self._kind[first:last]
         states = self._states[first : first + len(kind) + 1]
         states[0, ..., 0] = np.concatenate([z, z[:, self._angles]], axis=1)
-        sine, moved = np.empty(states[0, :, s:].shape), np.empty(states[0].shape)
+        sine = np.empty(states[0, :, s:].shape)
+        moved = np.empty(states[0].shape)
         # the loop is half of a search: no array is made in it
         for k, now, turned, following in zip(kind.tolist(), states[:-1], states[:-1, :, s:], states[1:], strict=True):
             np.subtract(np.sin(turned, sine), turned, turned)
             np.add(following, np.matmul(steps[k], now, moved), following)
-        r, x = self._forced[..., first : first + len(kind)].copy(), np.moveaxis(states[:-1, ..., 0], 0, -1)
+        r = self._forced[..., first : first + len(kind)].copy()
+        x = np.moveaxis(states[:-1, ..., 0], 0, -1)
         for k in np.unique(kind).tolist():
             of = kind == k
             r[..., of] += self._outputs[k] @ x[..., of]
@@ -216,8 +231,10 @@ def wind_model(axes: Sequence[str], speed: float) -> tuple[FloatArray, FloatArra
     They have its spectrum at low and at high frequencies. With T = L / V0 that is 2 sigma^2 T / (1 + (T omega)^2) along the
     flight and sigma^2 T (1 + 3 (T omega)^2) / (1 + (T omega)^2)^2 across it. Arguments: `speed` V0, m/s.
     """
-    spectrum, places = dryden(**MODERATE, sigma=0.0), np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
-    time, along = spectrum.length[places] / speed, places == AXES.index("longitudinal")
+    spectrum = dryden(**MODERATE, sigma=0.0)
+    places = np.array([AXES.index(axis) for axis in axes], dtype=np.int64)
+    time = spectrum.length[places] / speed
+    along = places == AXES.index("longitudinal")
     noise = spectrum.sigma[places] * np.sqrt(np.where(along, 2.0, 3.0) / time)
     return np.where(along, time, time / np.sqrt(3.0)), noise
 
@@ -243,9 +260,16 @@ def filter_bank(
     (N, n, m), G = model.B.shape, model.wind.shape[-1]
     s = n + 3 * G
     x, w, v, a = np.split(np.arange(s), [n, n + G, n + 2 * G])
-    A, B, gravity = np.zeros((N, s, s)), np.zeros((N, s, m)), np.zeros((s, s))
-    A[:, x[:, None], x], A[:, x[:, None], w], B[:, x], gravity[:n, :n] = model.A, model.wind, model.B, model.gravity
-    A[:, w, w], A[:, v, v], A[:, a, a] = -1.0 / wind_time, -1.0 / GUST_TIME, -1.0 / RATE_TIME
+    A = np.zeros((N, s, s))
+    B = np.zeros((N, s, m))
+    gravity = np.zeros((s, s))
+    A[:, x[:, None], x] = model.A
+    A[:, x[:, None], w] = model.wind
+    B[:, x] = model.B
+    gravity[:n, :n] = model.gravity
+    A[:, w, w] = -1.0 / wind_time
+    A[:, v, v] = -1.0 / GUST_TIME
+    A[:, a, a] = -1.0 / RATE_TIME
     A[:, w, v] = A[:, v, a] = 1.0
     each = model._replace(
         A=A[:, None],
@@ -279,7 +303,9 @@ class Block(NamedTuple):
 
     def of(self, model: NominalModel) -> NominalModel:
         """The model of this part alone."""
-        x, u, y = self.states, self.inputs, self.outputs
+        x = self.states
+        u = self.inputs
+        y = self.outputs
         square = np.ix_(x, x)
         return model._replace(
             A=model.A[square],

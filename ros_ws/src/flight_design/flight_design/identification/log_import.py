@@ -232,7 +232,8 @@ def require_map_of_import(channel_map: ChannelMap, recorded: RecordedRun) -> Non
     source = recorded.metadata.get(IMPORTED)
     if source is None:
         return
-    key, again = str(recorded.path or "the log"), f"that of the map {channel_map.name}: import the log again, with --map"
+    key = str(recorded.path or "the log")
+    again = f"that of the map {channel_map.name}: import the log again, with --map"
     require(COMPARED in source, key, "a log of an earlier version, which did not compare its parameters with the map", again)
     maps = [stored.content for stored in recorded.attachments if stored.name != PARAMETERS]
     require(len(maps) == 1, key, f"{len(maps)} maps in the log", "the one of the import")

@@ -52,12 +52,20 @@ COUPLED_GAIN = 20.0  # of log-likelihood of held-out samples by coupling: uncoup
 COUPLING = 0.34  # of the largest effect on a row, unit of an entry that is 0: a deviation of 10 % before the flight
 
 DIFFERENCE = 1e-4  # 1, of a parameter, for the derivatives
-DAMPINGS, FRACTIONS = (0.0, 0.01, 0.1, 1.0, 10.0), (0.5, 0.25)  # of the steps that are tried side by side
+# of the steps that are tried side by side
+DAMPINGS = (0.0, 0.01, 0.1, 1.0, 10.0)
+FRACTIONS = (0.5, 0.25)
 GOOD = 0.7  # of the decrease by the quadratic model: the undamped step is taken, and no damped one is tried
 STARTS = (0, 3, 4, 9)  # levels with which the search begins: calm air, light and moderate turbulence, gusts
-START_STEPS, STEPS = 8, 12  # at most, of each start, and of the search from one of the best
-REFINED, CLOSE = 2, 100.0  # starts from which the search goes on, at most, and of cost above that of the best one
-START_PROGRESS, PROGRESS = 5.0, 0.3  # of the cost, a log-likelihood, in a step: a start ends, or the search
+# at most, of each start, and of the search from one of the best
+START_STEPS = 8
+STEPS = 12
+# starts from which the search goes on, at most, and of cost above that of the best one
+REFINED = 2
+CLOSE = 100.0
+# of the cost, a log-likelihood, in a step: a start ends, or the search
+START_PROGRESS = 5.0
+PROGRESS = 0.3
 
 CHANGE = 3.0  # of log-likelihood that a span has to gain by a stronger wind: odds of 20 to 1
 UNEXPLAINED = 5.0  # 1, mean square of the innovations of a span in parts of the median one: no level explains it
@@ -99,7 +107,8 @@ class Normalised(NamedTuple):
 def normalised(r: FloatArray, covariance: FloatArray, place: NDArray[np.int64]) -> Normalised:
     """Innovations r, (N, T, m), with covariances (N, levels, m, m); `place` is the level of a sample among these, (T,)."""
     root = np.linalg.cholesky(covariance)
-    inverse, half_log_det = np.linalg.inv(root), np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
+    inverse = np.linalg.inv(root)
+    half_log_det = np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=-1)
     e = np.empty_like(r)
     for k in np.unique(place).tolist():
         e[:, place == k] = r[:, place == k] @ np.swapaxes(inverse[:, k], -1, -2)
@@ -145,8 +154,10 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
     If `coupled`, an entry that is 0 has the unit COUPLING of the largest effect on its row, in units of motion; the columns of
     angles stay 0.
     """
-    free, turned = model.kinematic[:, None] == 0.0, model.kinematic == 0.0
-    of_A, of_B = np.where(free, model.A, 0.0), np.where(free, model.B, 0.0)
+    free = model.kinematic[:, None] == 0.0
+    turned = model.kinematic == 0.0
+    of_A = np.where(free, model.A, 0.0)
+    of_B = np.where(free, model.B, 0.0)
     if coupled:
         largest_A = np.max(np.abs(of_A) * model.size, axis=1, keepdims=True) / model.size * turned
         largest_B = np.max(np.abs(of_B), axis=1, keepdims=True)
@@ -187,14 +198,19 @@ class Search:
             slow = model._replace(noise=model.noise / np.sqrt(factor), period=factor * recorded.period)
             self.coarse = Search(coarser(recorded, factor), slow, block, airframe, delay, unknown, factor=1, coupled=coupled)
         self._period = recorded.period
-        self._delay, self._delay_deviation = delay / recorded.period, unknown.delay / recorded.period
+        self._delay = delay / recorded.period
+        self._delay_deviation = unknown.delay / recorded.period
         self._drift = unknown.drift
         angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
-        self._angles, self._angle_deviation = angles if unknown.angle else angles[:0], unknown.angle
-        self._model, self._block, self._airframe = block.of(model), block, airframe
+        self._angles = angles if unknown.angle else angles[:0]
+        self._angle_deviation = unknown.angle
+        self._model = block.of(model)
+        self._block = block
+        self._airframe = airframe
         named = (tuple(airframe.states), tuple(airframe.inputs), airframe.outputs, tuple(airframe.gusts))
         self.names = Names(*(tuple(names[k] for k in part) for names, part in zip(named, block, strict=True)))
-        self._y, self._u = recorded.y[:, block.outputs], recorded.u[:, block.inputs]
+        self._y = recorded.y[:, block.outputs]
+        self._u = recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
@@ -222,12 +238,14 @@ class Search:
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
         """The models of relative errors (N, p): A (N, n, n), B (N, n, m), and wind (N, n, G) that acts by the model's own A."""
-        matrices, parts = [], np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
+        matrices = []
+        parts = np.split(thetas, [np.count_nonzero(self._units[0]), self.count], axis=1)[:2]
         for matrix, unit, part in zip((self._model.A, self._model.B), self._units, parts, strict=True):
             changed = np.tile(matrix, (len(thetas), 1, 1))
             changed[:, unit != 0.0] += unit[unit != 0.0] * part
             matrices.append(changed)
-        whole, x = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1)), self._block.states
+        whole = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1))
+        x = self._block.states
         whole[:, x[:, None], x] = matrices[0]
         wind = gust_directions(self._airframe, whole, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
@@ -236,7 +254,8 @@ class Search:
         """The filters of theta, (N, p), at the winds of some levels; all may be `near` the first theta."""
         levels = np.unique(levels)
         strength = np.exp(thetas[:, self._winds])
-        airframe, drift = self._airframe, self._drift
+        airframe = self._airframe
+        drift = self._drift
         bank = filter_bank(self.with_errors(thetas), self.names, airframe.speed, strength, levels, drift, near=near)
         first = np.where(np.isfinite(self._y[0]), self._y[0], 0.0)
         begin = np.tile(first @ bank.sampled.H, (len(thetas), 1))
@@ -258,11 +277,15 @@ class Search:
         CHANGE of the best.
         """
         models = self.models(theta[None], np.arange(len(LEVELS)))
-        bank, u = models.bank.by_level(), models.u.reshape(self._u.shape)
-        precision, log_det = np.linalg.inv(bank.covariance[:, 0]), np.linalg.slogdet(bank.covariance[:, 0])[1]
+        bank = models.bank.by_level()
+        u = models.u.reshape(self._u.shape)
+        precision = np.linalg.inv(bank.covariance[:, 0])
+        log_det = np.linalg.slogdet(bank.covariance[:, 0])[1]
         length = self._spans[0].stop // HOLD
         flight = Passage(bank, self._y, u, np.zeros(-(-len(self._y) // HOLD), dtype=np.int64))
-        z, found, r_found = np.repeat(models.begin, len(LEVELS), axis=0), list[int](), list[FloatArray]()
+        z = np.repeat(models.begin, len(LEVELS), axis=0)
+        found = list[int]()
+        r_found = list[FloatArray]()
         for k in range(len(self._spans)):
             r, after = flight.run(z, k * length, (k + 1) * length)
             gain = -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1) / 2.0
@@ -392,12 +415,15 @@ class Search:
         The derivatives are differences, the filters side by side. The Hessian is J'J + prior^-2, with J the
         derivatives of the innovations over their rms. Source: L. Ljung, "System Identification", 7.4 and 10.2.
         """
-        size, moving = len(theta), np.flatnonzero(free)
+        size = len(theta)
+        moving = np.flatnonzero(free)
         models = self.models(theta + DIFFERENCE * np.vstack([np.zeros(size), np.eye(size)[moving]]), levels, near=True)
         costs, e, half_log_det = self._costs(self.innovations(models, levels), used, theta[None])
-        rms, J = np.sqrt(np.mean(e[0] ** 2, axis=0)), np.zeros((size, e[0].size))
+        rms = np.sqrt(np.mean(e[0] ** 2, axis=0))
+        J = np.zeros((size, e[0].size))
         J[moving] = ((e[1:] - e[0]) / DIFFERENCE / rms).reshape(len(moving), -1)
-        hessian, slope = J @ J.T + np.diag(self.prior**-2), J @ (e[0] / rms).ravel() + theta / self.prior**2
+        hessian = J @ J.T + np.diag(self.prior**-2)
+        slope = J @ (e[0] / rms).ravel() + theta / self.prior**2
         slope[moving] += (half_log_det[1:] - half_log_det[0]) / DIFFERENCE
         tried = np.clip(theta + damped_steps(theta, slope, hessian, self._lower, self._upper, free), self._lower, self._upper)
         expected = -float(slope @ (tried[0] - theta)) / 2.0
@@ -438,7 +464,9 @@ class Search:
 
     def of_model(self, airframe: Airframe) -> FloatArray:
         """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the bounds."""
-        A, B, inputs = airframe.matrix_a(), airframe.matrix_b(), list(airframe.inputs)
+        A = airframe.matrix_a()
+        B = airframe.matrix_b()
+        inputs = list(airframe.inputs)
         theta = np.zeros(len(self.prior))
         for k, entry in enumerate(self.nominal_entries()):
             row = airframe.index(entry.row)
@@ -480,7 +508,8 @@ class Search:
         self, found: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
-        e, total = found.e[:, used], np.sum(found.half_log_det[:, used], axis=1)
+        e = found.e[:, used]
+        total = np.sum(found.half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total
         costs = costs + np.sum((thetas / self.prior) ** 2, axis=1) / 2.0
         return np.where(np.isfinite(costs), costs, np.inf), e, total
@@ -579,7 +608,8 @@ def identify(
     still = [name for name, y in zip(airframe.outputs, recorded.y[known].T, strict=True) if not np.diff(y).any()]
     require(not still, "record", f"a constant {', '.join(still)}", "outputs that move, or the noise of their sensors")
     validating = known & held_out(len(recorded.t), span_length(recorded))
-    every, done = blocks(model), count(1)
+    every = blocks(model)
+    done = count(1)
     starts = len(STARTS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
@@ -591,7 +621,8 @@ def identify(
         progress(completed=next(done), total=total)
 
     def part_of(search: Search, fit: Fit) -> Part:
-        outputs, entries = search.names.outputs, search.entries(fit)
+        outputs = search.names.outputs
+        entries = search.entries(fit)
         predictions = prediction(fit.before, validating), prediction(fit.after, validating)
         sentences = (
             another_airframe(entries, airframe.name, at_bound),
@@ -599,7 +630,8 @@ def identify(
             other_signs(airframe, with_entries(airframe, entries), paired),
             no_better(*predictions),
         )
-        refusal, delay = next(filter(None, sentences), ""), recorded.period * search.delay(fit)
+        refusal = next(filter(None, sentences), "")
+        delay = recorded.period * search.delay(fit)
         gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
         delay_deviation = unknown.delay * float(fit.deviation[-1])
         return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
@@ -619,7 +651,9 @@ def identify(
         gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
         white = part.after.whiteness.max() <= MAX_WHITENESS
         if white and not part.refusal and gain * validating.sum() > COUPLED_GAIN:
-            parts, first, last = [part], fit.before, fit.after
+            parts = [part]
+            first = fit.before
+            last = fit.after
     identified = with_entries(airframe, (entry for part in parts for entry in part.entries))
     figures = prediction(first, validating), prediction(last, validating)
     return Identification(identified, recorded, validating, (first.r, last.r), *figures, tuple(parts))
@@ -627,7 +661,8 @@ def identify(
 
 def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
     """The airframe with identified entries; wind acts by its own A."""
-    A, B = airframe.matrix_a(), airframe.matrix_b()
+    A = airframe.matrix_a()
+    B = airframe.matrix_b()
     for entry in entries:
         row = airframe.index(entry.row)
         if entry.matrix == "A":

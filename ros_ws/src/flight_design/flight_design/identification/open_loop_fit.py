@@ -26,7 +26,9 @@ from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
 
 STEP = 0.004  # s, of the simulation
-BEFORE, AFTER = 0.3, 0.5  # s around the excitation of an input
+# s around the excitation of an input
+BEFORE = 0.3
+AFTER = 0.5
 MIN_CERTAINTY = 5.0  # standard errors: those from which on a sign of Omega is certain too
 LOOP_FREQUENCY = 0.5  # of 1 / (delay + lag): about where the loops of `rise-di gains` cross 1
 MAX_ZERO_LAG = 0.5  # zero times lag; at 1 they cancel

@@ -78,7 +78,8 @@ class Stick(NamedTuple):
 
 def stick_of(channel_map: ChannelMap, name: str) -> Stick:
     """What a map says of the channel of an input. Raises ParameterError for an input without a channel."""
-    row, trim = channel_map.inputs[name], channel_map.trims.get(name)
+    row = channel_map.inputs[name]
+    trim = channel_map.trims.get(name)
     match = CHANNEL.fullmatch(row.field if trim is None else trim.field)
     if match is None:
         expected = "a field such as channels[1]"
@@ -156,7 +157,8 @@ def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) ->
 
     `start_ns` is the begin of the log. Raises ParameterError for a change between the samples.
     """
-    within, outside = [], []
+    within = []
+    outside = []
     for name, records in sorted(recorded.items()):
         for before, after in pairwise(records if DECISIVE.fullmatch(name) else ()):
             if before.value == after.value:

@@ -25,7 +25,9 @@ from flight_core.vectors import FloatArray
 
 WINDOW = 0.02  # s, width of the windows over which u and older y are averaged: shorter than a servo's lag
 RECENT = 4  # samples of y that the predictor has one by one
-FINE_Y, FINE_U = 0.2, 0.45  # s before a sample that are covered by windows of equal width: the longest delay and a lag
+# s before a sample that are covered by windows of equal width: the longest delay and a lag
+FINE_Y = 0.2
+FINE_U = 0.45
 FAR = 2.0  # s before a sample that are covered by windows that double: the memory of disturbances and of a controller
 HORIZON = 0.8  # s of the step response
 MAX_DELAY = 0.3  # s
@@ -35,8 +37,11 @@ MEMORY = 0.2  # s, decay of the coefficients of the predictor before the fit
 MIN_ROWS_PER_COEFFICIENT = 5.0
 MIN_SHARE = 0.9  # of the motion in a closed loop: then feedback of disturbances is too little to be taken for a response
 CLOSED_LOOP_ERRORS = 2.0  # times as large as estimated: up to a tenth of the motion is feedback, a bias as large as the errors
-LOOP_MEMORY, LOOP_FINE, PERIOD = 8.0, 6, 0.05  # s before an instant that the excitation has an effect, windows of PERIOD, s
-FOLDS, RIDGES = 6, (1e-4, 1e-2)  # the better ridge counts: few commands need the one, many disturbances the other
+LOOP_MEMORY = 8.0  # s before an instant that the excitation has an effect
+LOOP_FINE = 6  # windows of PERIOD
+PERIOD = 0.05  # s
+FOLDS = 6  # the better ridge counts: few commands need the one
+RIDGES = (1e-4, 1e-2)  # many disturbances the other
 LEAST_DELAY = 0.01  # s, in a closed loop: an earlier response is the reaction of u to y, for no servo is as fast
 ITERATIONS = 3  # of the variance of a prediction and the coefficients
 MIN_RATIO = 5.0  # standard errors from which on the sign of Omega is certain
@@ -45,7 +50,8 @@ RANK = 1e-10  # of the largest eigenvalue of the normal equations: smaller ones 
 MAX_LAG = 1.0  # s
 RESOLUTION = 0.025  # s between the points of the step response that are fitted
 FLOOR = 0.01  # of the largest value of a step response: what windows and a linear model leave out
-STARTS_DELAY, STARTS_LAG = (0.02, 0.1, 0.2), (0.03, 0.2)  # s, of the search
+STARTS_DELAY = (0.02, 0.1, 0.2)  # s
+STARTS_LAG = (0.03, 0.2)  # of the search
 # Of delay s, lag s, Omega, damping 1/s, stiffness 1/s^2, slow part; Omega and slow part per largest value of the step response
 LOWER = np.array([0.0, 0.003, -np.inf, -2.0, -20.0, -np.inf])
 UPPER = np.array([MAX_DELAY, MAX_LAG, np.inf, 300.0, 5000.0, np.inf])
@@ -81,7 +87,9 @@ class Response(NamedTuple):
 
     def sign_refusal(self, i: int) -> str:
         """The reason of an uncertain sign of Omega_ii, a sentence; empty for a certain sign."""
-        output, name, ratio = self.outputs[i], self.inputs[i], float(self.sign_ratio[i])
+        output = self.outputs[i]
+        name = self.inputs[i]
+        ratio = float(self.sign_ratio[i])
         if ratio == 0.0 and self.refusal[i]:
             return self.refusal[i]
         if ratio >= MIN_RATIO:
@@ -136,7 +144,8 @@ class Layout(NamedTuple):
         """The layout for a period of y in s."""
 
         def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
-            width, ends = max(round(WINDOW / period), 1), [first]
+            width = max(round(WINDOW / period), 1)
+            ends = [first]
             while ends[-1] * period < FAR:
                 width = width if ends[-1] * period < fine else 2 * width
                 ends.append(ends[-1] + width)
@@ -212,7 +221,8 @@ class _Predictor(NamedTuple):
 
         At K whole periods after the step, up to HORIZON.
         """
-        m, layout = self.coefficients.shape[1], self.layout
+        m = self.coefficients.shape[1]
+        layout = self.layout
         normal = np.random.default_rng(0).standard_normal((DRAWS, *self.coefficients.shape))
         drawn = self.coefficients + np.einsum("ikl,dli->dki", self.roots, normal)
         every = np.concatenate([self.coefficients[None], drawn])
@@ -248,7 +258,8 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     prior = PRIOR * block_diag(np.diag(np.kron(layout.y_decay(), per_y)), np.kron(layout.u_root(), np.diag(per_u)))
     scaled = X @ prior
     normal = scaled.T @ scaled
-    fits, roots = [], []
+    fits = []
+    roots = []
     for i in range(m):
         variance = (1e-3 * moves[i]) ** 2 or 1.0
         for _ in range(ITERATIONS):
@@ -272,7 +283,8 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
     are predicted with coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
     1974.
     """
-    left, total = np.zeros((len(RIDGES), len(names))), np.zeros(len(names))
+    left = np.zeros((len(RIDGES), len(names)))
+    total = np.zeros(len(names))
     for span in spans:
         before = int(excitation.stamp_ns[0])
         (t, values), (t_w, w) = _within(signal, names, span), _within(excitation, excitation.names, (before, span[1]))
@@ -292,8 +304,10 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         X = X - X.mean(axis=0)
         fold = np.arange(len(at)) * FOLDS // len(at)
         for number in range(FOLDS):
-            others, own = Z[fold != number], fold == number
-            normal, product = others.T @ others, others.T @ X[fold != number]
+            others = Z[fold != number]
+            own = fold == number
+            normal = others.T @ others
+            product = others.T @ X[fold != number]
             for k, ridge in enumerate(RIDGES):
                 fit = np.linalg.solve(normal + ridge * np.eye(len(normal)), product)
                 left[k] += np.sum((X[own] - Z[own] @ fit) ** 2, axis=0)
@@ -323,8 +337,10 @@ def _responses(
     share: FloatArray,
 ) -> Response:
     every = max(round(RESOLUTION / layout.period), 1)
-    t, responses = layout.period * np.arange(every, responses.shape[1] + 1, every), responses[:, every - 1 :: every]
-    columns, refusal = [], []
+    t = layout.period * np.arange(every, responses.shape[1] + 1, every)
+    responses = responses[:, every - 1 :: every]
+    columns = []
+    refusal = []
     for j in range(len(inputs)):
         recorded = {inputs[j]: [part.u[:, j] for part in rows], outputs[j]: [part.y[:, j] for part in rows]}
         still = next(
@@ -420,16 +436,20 @@ def _column(t: FloatArray, responses: FloatArray, j: int) -> _Column:
     deviation = np.array([RESOLUTION, RESOLUTION, *np.zeros(4)])
     J = best.jacobian[:, inside]
     deviation[inside] = np.sqrt(misfit * np.diag(np.linalg.pinv(J.T @ J)))
-    delay, lag = float(best.theta[0]), float(best.theta[1])
+    delay = float(best.theta[0])
+    lag = float(best.theta[1])
     sign = math.sqrt(_significance(t, responses[:, :, j], best.theta, size) / misfit)
     early = (t > delay) & (t <= delay + lag + COUPLING_SPAN)
     basis = np.stack(second_order(t[early], delay, lag, 0.0, 0.0), axis=1)
-    Omega, error = np.zeros(step.shape[1]), np.zeros(step.shape[1])
+    Omega = np.zeros(step.shape[1])
+    error = np.zeros(step.shape[1])
     for i in range(step.shape[1]):
         whiten = _whitener(responses[:, early, i])
         solve = np.linalg.pinv(whiten @ basis)
-        Omega[i], error[i] = (solve @ (whiten @ step[early, i]))[0], np.linalg.norm(solve[0])
-    Omega[j], error[j] = best.theta[2] * size, deviation[2] * size
+        Omega[i] = (solve @ (whiten @ step[early, i]))[0]
+        error[i] = np.linalg.norm(solve[0])
+    Omega[j] = best.theta[2] * size
+    error[j] = deviation[2] * size
     return _Column(Omega, error, lag, float(deviation[1]), delay, float(deviation[0]), sign)
 
 
@@ -449,7 +469,8 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     first, second = second_order(t[early], *theta[[0, 1, 3, 4]])
     fitted = size * (theta[2] * first + theta[5] * second)
     whiten = _whitener(responses[:, early])
-    none, left = whiten @ responses[0, early], whiten @ (responses[0, early] - fitted)
+    none = whiten @ responses[0, early]
+    left = whiten @ (responses[0, early] - fitted)
     return max(float(none @ none - left @ left) - len(theta), 0.0) if begins_with_Omega(t, theta) else 0.0
 
 

@@ -59,7 +59,8 @@ def check_scenario(
     `namespace` selects the aircraft of a log with several.
     """
     controller = scenario.controller
-    outputs, inputs = controller.outputs, controller.effectors
+    outputs = controller.outputs
+    inputs = controller.effectors
     for key, names, expected in (
         (f"map {channel_map.name}: outputs", tuple(channel_map.outputs), outputs),
         (f"map {channel_map.name}: inputs", tuple(channel_map.inputs), inputs),
@@ -132,7 +133,8 @@ def check(
         for name, sign in zip(channel_map.outputs, output_signs(channel_map), strict=True)
         if sign < 0
     ]
-    channels, uncertain = [], []
+    channels = []
+    uncertain = []
     for i, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         effect = None if measured is None else float(measured.Omega[i, i])
         ratio = None if measured is None else float(measured.sign_ratio[i])
@@ -163,9 +165,11 @@ def check_effectors(
     """
     mapped = through(channel_map, Omega)[np.ix_(_places(outputs, channel_map.outputs), _places(effectors, channel_map.inputs))]
     largest = np.argmax(np.abs(effect) / np.abs(effect).max(axis=1, keepdims=True), axis=0).tolist()
-    channels, sentences = [], []
+    channels = []
+    sentences = []
     for j, (name, i) in enumerate(zip(effectors, largest, strict=True)):
-        found, expected = int(np.sign(mapped[i, j])), int(np.sign(effect[i, j]))
+        found = int(np.sign(mapped[i, j]))
+        expected = int(np.sign(effect[i, j]))
         channels.append(Channel(outputs[i], name, float(mapped[i, j]), found, expected, None, None))
         if found != expected:
             sentences.append(

@@ -50,9 +50,11 @@ def sketch(name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequenc
     `inputs`; input i drives output i. Raises ParameterError for outputs other than q, V, p, r.
     """
     require(sorted(outputs) == ["V", "p", "q", "r"], f"airframe {name}", f"the outputs {', '.join(outputs)}", "q, V, p, r")
-    n, size = GRAVITY / speed, dict(zip(outputs, np.abs(np.diag(Omega)).tolist(), strict=True))
+    n = GRAVITY / speed
+    size = dict(zip(outputs, np.abs(np.diag(Omega)).tolist(), strict=True))
     lift = 11.0 * n
-    P, R = 1.4 * np.sqrt(lift * size["p"]), 0.95 * np.sqrt(lift * size["r"])
+    P = 1.4 * np.sqrt(lift * size["p"])
+    R = 0.95 * np.sqrt(lift * size["r"])
     rows = {
         "V": {"V": -0.26 * n},
         "alpha": {"alpha": -lift, "q": 1.0},
@@ -64,7 +66,9 @@ def sketch(name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequenc
         "phi": {"p": 1.0},
     }
     A = np.array([[rows[row].get(column, 0.0) for column in STATES] for row in STATES])
-    gravity, B, places = np.zeros_like(A), np.zeros((len(STATES), len(inputs))), list(STATES)
+    gravity = np.zeros_like(A)
+    B = np.zeros((len(STATES), len(inputs)))
+    places = list(STATES)
     gravity[places.index("beta"), places.index("phi")] = n
     for part in PARTS:
         columns = [outputs.index(output) for output in part]
@@ -85,7 +89,8 @@ def sketched(name: str, controller: ControllerConfig, speed: float) -> Airframe:
     unknown = [state for state in model.states if state not in STATES]
     require(not unknown, "controller.feedforward.states", ", ".join(unknown), f"some of {', '.join(STATES)}")
     n = len(model.states)
-    A, B = np.reshape(model.A, (n, n)), np.reshape(model.B, (n, -1))
+    A = np.reshape(model.A, (n, n))
+    B = np.reshape(model.B, (n, -1))
     gravity = np.zeros((n, n)) if model.gravity is None else np.reshape(model.gravity, (n, n))
     return _airframe(
         name, "the feedforward of a controller", speed, A, B, gravity, model.states, controller.outputs, controller.inputs

@@ -57,7 +57,10 @@ WINDOW = 0.5  # s, the same for body rates
 SPAN = 0.025  # s, length of a chord
 TANGENT_CUTOFF = 0.7  # the search ends when the slope has fallen to this fraction of the largest one so far
 
-RATE, CONTROL_RATE, STEP = 200.0, 100.0, 0.005  # Hz, Hz, s: of y, of the law, of the integration
+# Hz, Hz, s: of y, of the law, of the integration
+RATE = 200.0
+CONTROL_RATE = 100.0
+STEP = 0.005
 SAMPLES = 5  # uncertain aircraft around the identified one: only the largest response of them is used
 DELAY = 0.006  # s, topics: y is at most 5 ms old at a tick, u waits at most 5 ms; half of both, and 1 ms of transport
 
@@ -126,7 +129,10 @@ def step_responses(
     Arguments: `lower`, `upper` the end stops of u from trim, (m,); `dt` that of `fly`.
     """
     m = len(inputs)
-    Omega, lag, size, spread = np.zeros((m, m)), np.zeros(m), np.zeros(m), np.zeros(m)
+    Omega = np.zeros((m, m))
+    lag = np.zeros(m)
+    size = np.zeros(m)
+    spread = np.zeros(m)
     rejected: list[str] = []
     for j, (output, name) in enumerate(zip(outputs, inputs, strict=True)):
         progress(f"steps of {name}")
@@ -154,17 +160,24 @@ def step_responses(
 
 # The manoeuvre: one rule for all aircraft
 
-PULSE_Q, PULSE_P, PULSE_V = 0.05, 0.15, 2.0  # rad/s, rad/s, m/s: heights of the pulses
+PULSE_Q = 0.05  # rad/s
+PULSE_P = 0.15  # rad/s
+PULSE_V = 2.0  # m/s: heights of the pulses
 HEIGHTS = {"q": PULSE_Q, "V": PULSE_V, "p": PULSE_P, "r": PULSE_Q}  # also the units of the outputs in the coupling
 NATURAL_FREQUENCY = {"q": 4.0, "V": 1.2, "p": 5.0, "r": 4.0}  # rad/s, as in osprey_gust
 DAMPING = {"q": 0.9, "V": 1.0, "p": 0.9, "r": 0.9}
 AUTHORITY_FRACTION = 1.0 / 3.0  # of the throttle's authority for the commanded V; the rest is for climbs, turns and gusts
 FASTEST_V = 0.46  # rad, bandwidth of V times the lag of its loop: it costs 26 degrees of phase, for an engine is no lag alone
 DURATION = 60.0  # s
-GUST_SPEED, GUST_LENGTH = 5.0, 30.48  # m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
+# m/s down, and m to the peak: 100 ft, within the 30 to 350 ft of FAR/CS 25.341
+GUST_SPEED = 5.0
+GUST_LENGTH = 30.48
 GUST_START = 50.0  # s
-TURN, CLIMB = math.pi / 2.0, 100.0  # rad, m: the targets of guidance in place of the pulses
-TURN_START, CLIMB_START = 2.0, 30.0  # s
+TURN = math.pi / 2.0  # rad
+CLIMB = 100.0  # m: the targets of guidance in place of the pulses
+# s
+TURN_START = 2.0
+CLIMB_START = 30.0
 LIGHT_SIGMA = 1.52  # m/s, of light turbulence at high altitude: 5 ft/s, MIL-F-8785C 3.7.2
 
 
@@ -178,7 +191,8 @@ def reference_parameters(speed: float, authority: float) -> dict[str, Any]:
 
     The rest is that of osprey_gust. Banks are short because q of a coordinated turn is not commanded: the nose drops in them.
     """
-    q, p = min(PULSE_Q, GRAVITY / speed), PULSE_P
+    q = min(PULSE_Q, GRAVITY / speed)
+    p = PULSE_P
     slow = min(NATURAL_FREQUENCY["V"], AUTHORITY_FRACTION * authority * math.e / PULSE_V)
     return {
         "rate": RATE,
@@ -300,7 +314,8 @@ def identify(
             rows.append(vehicle.y())
         return np.array(rows)
 
-    outputs, inputs = tuple(OUTPUTS), tuple(INPUTS)
+    outputs = tuple(OUTPUTS)
+    inputs = tuple(INPUTS)
     measured = step_responses(fly, trim.lower, trim.upper, outputs, inputs, STEP, progress)
     throttle = inputs.index("throttle")
     authority = abs(measured.Omega[throttle, throttle]) * min(-trim.lower[throttle], trim.upper[throttle])
@@ -338,7 +353,8 @@ def slowest_trim(condition: FlightCondition) -> float:
 
     Below it lift or thrust is not enough, so guidance takes it as the stall speed. By bisection, from 0.2 of the condition's.
     """
-    slow, fast = 0.2 * condition.speed, condition.speed
+    slow = 0.2 * condition.speed
+    fast = condition.speed
     while fast - slow > 0.01 * condition.speed:
         middle = (slow + fast) / 2.0
         try:
@@ -368,7 +384,8 @@ def that_learns(selection: Selection, condition: FlightCondition, Omega: FloatAr
     columns = [list(INPUTS).index(name) for name in start.inputs]
     name = Path(condition.name).stem
     rough = sketch(name, Omega[np.ix_(rows, columns)], start.outputs, start.inputs, condition.speed)
-    noise, axes = np.array([NOISE[output] for output in start.outputs]), tuple(rough.gusts)
+    noise = np.array([NOISE[output] for output in start.outputs])
+    axes = tuple(rough.gusts)
     gains = gains_beside_sketch(model_for(rough, start, noise), start.outputs, axes, condition.speed)
     designed = with_aircraft_observer(start, rough, [gains], noise, margin, uncertain=False).controller
     assert designed.observer is not None  # noqa: S101 - it was designed
@@ -458,7 +475,8 @@ def _slew(tape: Tape, lag: FloatArray) -> FloatArray:
     period = 1.0 / CONTROL_RATE
     slew = np.zeros(len(INPUTS))
     for j, (name, total) in enumerate(zip(INPUTS, total_lag(lag, DELAY, period), strict=True)):
-        count, u = max(round(float(total) / period), 1), tape["u"][name]
+        count = max(round(float(total) / period), 1)
+        u = tape["u"][name]
         slew[j] = np.max(np.abs(u[count:] - u[:-count]), initial=0.0) / (count * period)
     return slew
 

@@ -21,7 +21,8 @@ ANGLE = 0.3  # rad, standard deviation of pitch and bank at the begin of the rec
 FLOW = 0.03  # rad, the same of alpha and beta: with 0.3 a gust before the record passed for a loss of effect
 TURBULENT = STARTS[2]  # level of the wind with which a search begins: moderate turbulence, whose strength is free
 FACTOR = 1.0  # 1, standard deviation of a change of effect, in both hypotheses: half of it and none are as probable
-DEAD, MOST = -1.0, 2.0  # 1, bounds of a change of effect
+DEAD = -1.0  # 1
+MOST = 2.0  # bounds of a change of effect
 NONE = MAX_DEVIATION  # 1, of an effect: what is known no better is none
 DEAD_WITHIN = MAX_GAIN / 2.0  # of log-likelihood: so close to the best loss an input without effect explains the flight as well
 
@@ -62,7 +63,9 @@ def change_test(
     for block in blocks(filter_model(flown, actuation, recorded)):
         outputs = tuple(flown.outputs[i] for i in block.outputs)
         effects = Effects(recorded, flown, actuation, block, (delays or {}).get(outputs, actuation.delay))
-        inputs, gain, dead = effects.names.inputs, 0.0, ""
+        inputs = effects.names.inputs
+        gain = 0.0
+        dead = ""
         lost = effects.most_probable()
         if lost.theta[: len(inputs)].min() < -LOSS:
             # what another wind explains is no change
@@ -95,7 +98,8 @@ class Effects(Search):
         self._flown = super().with_errors(np.zeros((1, len(self.prior))))
         self._angles = np.flatnonzero(~model.C[np.ix_(block.outputs, block.states)].any(axis=0))
         self.believe(np.ones(self.count))
-        entries, self.count = self.count, len(block.inputs)
+        entries = self.count
+        self.count = len(block.inputs)
         self.prior, self._lower, self._upper = (
             np.concatenate([np.full(self.count, of_inputs), values[entries:]])
             for of_inputs, values in ((FACTOR, self.prior), (DEAD, self._lower), (MOST, self._upper))
@@ -134,11 +138,13 @@ class Effects(Search):
         levels: NDArray[np.int64] | None = None,
     ) -> Least:
         """The least J, from theta, (p,), or 0 on, in winds by theta or of `levels`: kappa >= `lower`, or with an input dead."""
-        self._lower[: self.count], self._upper[: self.count] = lower, MOST
+        self._lower[: self.count] = lower
+        self._upper[: self.count] = MOST
         if dead is not None:
             self._upper[dead] = DEAD + NONE
         theta = np.clip(np.zeros(len(self.prior)) if theta is None else theta, self._lower, self._upper)
-        used, free = self.known(), np.ones(len(theta), dtype=bool)
+        used = self.known()
+        free = np.ones(len(theta), dtype=bool)
         for _ in range(STEPS):
             winds = self.levels(theta) if levels is None else levels
             theta, _, progressed = self._step(theta, winds, used, free)

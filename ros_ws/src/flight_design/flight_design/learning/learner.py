@@ -96,8 +96,11 @@ class Learner:
         settings = controller.learn
         require(settings is not None, "controller.learn", "no such section", "one: a window and times of identifications")
         assert settings is not None  # noqa: S101 - for the type checker
-        self._controller, self._rough, self._design = controller, airframe, design
-        self._period, self._believed = 1.0 / controller.rate, rough
+        self._controller = controller
+        self._rough = airframe
+        self._design = design
+        self._period = 1.0 / controller.rate
+        self._believed = rough
         self._has_speeds = controller.schedule is not None and bool(controller.schedule.models)
         self._thrust = controller.inputs[controller.outputs.index("V")] if self._has_speeds else ""
         lag = dict(zip(controller.inputs, controller.lag, strict=True))
@@ -106,7 +109,9 @@ class Learner:
         self._window_ns = nanoseconds(settings.window)
         self._planned = deque(map(nanoseconds, settings.updates))
         self._first_ns: int | None = None
-        self._prior, self._model = airframe, airframe  # of the next identification; what flies
+        # of the next identification; what flies
+        self._prior = airframe
+        self._model = airframe
         self._known: dict[tuple[str, ...], Known] = {}  # by the outputs of a part
         # Parts that fly the law of the start for good: their inputs without effect, "" for outputs of `learn.without`
         self._dead: dict[tuple[str, ...], str] = {}
@@ -144,7 +149,8 @@ class Learner:
         whole = np.full((len(t), y.shape[1]), np.nan)
         whole[place] = y
         held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
-        of_y, of_u = self._controller.outputs, self._controller.inputs
+        of_y = self._controller.outputs
+        of_u = self._controller.inputs
         y, u = (
             np.stack([values[:, own.index(name)] for name in names], axis=1)
             for values, own, names in ((whole, of_y, self._rough.outputs), (held, of_u, tuple(self._rough.inputs)))
@@ -249,7 +255,8 @@ class Learner:
             if fallen.digest() == flown:
                 self._give_up(fallen)
                 if model is self._last:  # else it does not fly: the controller refused it
-                    self._last, self._proposed = fallen, flown
+                    self._last = fallen
+                    self._proposed = flown
                 return
 
     def _give_up(self, flown: RiseDiConfig) -> None:
@@ -264,7 +271,8 @@ class Learner:
         assert self._first_ns is not None  # noqa: S101 - there is a record
         due = False
         while end_ns - self._first_ns > self._planned[0] - nanoseconds(self._period):
-            due, last = True, self._planned.popleft()
+            due = True
+            last = self._planned.popleft()
             if not self._planned:
                 self._planned.append(last + self._window_ns)
         return due
@@ -287,9 +295,11 @@ class Learner:
         channels = ChannelPairing(self._controller.outputs, self._controller.inputs)
         unknown = self._believed._replace(delay=DELAY_DEVIATION, angle=ANGLE)
         identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
-        prior, model = self._prior, self.model
+        prior = self._prior
+        model = self.model
         if without:
-            prior, model = without_effect(prior, without), model and without_effect(model, without)
+            prior = without_effect(prior, without)
+            model = model and without_effect(model, without)
         if not self._has_speeds:
             return identified(self.recording(), prior, flown=model)
         found, ratio = self._steady(self.recording())
@@ -314,8 +324,10 @@ class Learner:
 
     def _at_trim(self, entries: tuple[Entry, ...], ratio: float) -> tuple[Entry, ...]:
         """Entries reduced to the trim speed: relative errors and deviations stay."""
-        powers, states = exponents(self._rough, self._thrust), list(self._rough.states)
-        columns, of = {"A": states, "B": list(self._rough.inputs)}, {"A": powers.A, "B": powers.B}
+        powers = exponents(self._rough, self._thrust)
+        states = list(self._rough.states)
+        columns = {"A": states, "B": list(self._rough.inputs)}
+        of = {"A": powers.A, "B": powers.B}
         each = [ratio ** of[e.matrix][states.index(e.row), columns[e.matrix].index(e.column)].item() for e in entries]
         return tuple(
             entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)

@@ -65,7 +65,9 @@ class LearnerNode(FlightNode[LearnerConfig]):
         )
         self._publish, self._publish_learned = self.advertise(PROPOSAL), self.advertise(LEARNED)
         self._search: threading.Thread | None = None
-        self._proposal, self._end_ns, self._flown = LearnerResult(None, ""), 0, 0
+        self._proposal = LearnerResult(None, "")
+        self._end_ns = 0
+        self._flown = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -132,7 +134,8 @@ class LearnerNode(FlightNode[LearnerConfig]):
         if mode == Mode.ENGAGED:
             self._learner.take(sample.stamp_ns, y, u, int(flown))
         self._has_record = True
-        self._end_ns, self._flown = sample.stamp_ns + round(age * NANOSECONDS), int(flown)
+        self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
+        self._flown = int(flown)
         self._is_due = self._updates.due(self._end_ns) or self._is_due
 
     def _propose(self) -> None:

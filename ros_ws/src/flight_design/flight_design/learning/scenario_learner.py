@@ -31,26 +31,31 @@ def learner(scenario: Scenario, *, real_time: bool = False) -> Learn | None:
     controller's feedforward. In real time the loop has the delay of the controller's section; in one process and in lockstep u
     acts at once. Raises ParameterError.
     """
-    controller, aircraft = scenario.controller, scenario.aircraft
+    controller = scenario.controller
+    aircraft = scenario.aircraft
     if not isinstance(controller, RiseDiConfig) or controller.learn is None:
         return None
     if aircraft.is_jsbsim:
         condition = aircraft.flight_condition()
-        airframe, rough = sketched(Path(condition.name).stem, controller, condition.speed), ROUGH
+        airframe = sketched(Path(condition.name).stem, controller, condition.speed)
+        rough = ROUGH
     else:
-        airframe, rough = load_airframe(aircraft.airframe), KNOWN
+        airframe = load_airframe(aircraft.airframe)
+        rough = KNOWN
     if controller.learn.prior is not None:
         airframe = _prior(controller.learn.prior, airframe)
 
     speeds = None
     if controller.schedule is not None:
         slow, fast = (there.ratio for there in controller.schedule.models)
-        speeds, V0 = (slow, fast), controller.schedule.speed
+        speeds = (slow, fast)
+        V0 = controller.schedule.speed
         require(airframe.speed == V0, "controller.schedule.speed", f"{V0:g} m/s", f"{airframe.speed:g} m/s, that of the model")
 
     def design(start: RiseDiConfig, model: Airframe) -> RiseDiConfig:
         assert start.observer is not None  # noqa: S101 - a controller that learns has one
-        margin, sketch = start.observer.margin, aircraft.is_jsbsim
+        margin = start.observer.margin
+        sketch = aircraft.is_jsbsim
         return observed(start, scenario, model, margin, uncertain=False, sketched=sketch, speeds=speeds)[0]
 
     return lambda parameters: Learner(parameters, airframe, design, parameters.delay if real_time else 0.0, rough)
@@ -87,7 +92,9 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     A deactivated law ends a record, as in flight. Where the log has other settings of the learner than the scenario, or none,
     each proposal is taken as flown.
     """
-    make, controller = learner(scenario, real_time=tape.start_ns > 0), scenario.rise_di()  # simulated time begins at 0
+    # simulated time begins at 0
+    make = learner(scenario, real_time=tape.start_ns > 0)
+    controller = scenario.rise_di()
     require(make is not None, "controller.learn", "no section", "one")
     assert make is not None  # noqa: S101 - for the type checker
     settings = controller.learn
@@ -100,10 +107,14 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
 
     flew = "internals" in tape and len(tape["internals"].stamp_ns) > 0
     require(flew, "the log", "no sample of internals", "a flight with a controller that engaged")
-    ticks, steps = tape["internals"], list[LearnStep]()
-    y, u, mode = ticks.group("y").values, ticks.group("u").values, ticks["mode"]
+    ticks = tape["internals"]
+    steps = list[LearnStep]()
+    y = ticks.group("y").values
+    u = ticks.group("u").values
+    mode = ticks["mode"]
     instants_ns = ticks.stamp_ns + np.round(ticks["age"] * NANOSECONDS).astype(np.int64)
-    flown, start = ticks["parameters"], controller.digest()
+    flown = ticks["parameters"]
+    start = controller.digest()
     is_of_log = bool(np.any(flown == start))
     (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
     for k, (stamp_ns, now_ns) in enumerate(zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)):
