@@ -5,7 +5,7 @@
 .venv/bin/python -m benchmarks.jsbsim_fleet               the aircraft of FLEET, some ten seconds each
 .venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft
 .venv/bin/python -m benchmarks.jsbsim_fleet --all         every aircraft of JSBSim, with the reason where one does not fly
-.venv/bin/python -m benchmarks.jsbsim_fleet --learn       the table of docs/learning.md, of LEARNERS, a minute each
+.venv/bin/python -m benchmarks.jsbsim_fleet --learn       the table learning-jsbsim, of LEARNERS, a minute each
 """
 
 import sys
