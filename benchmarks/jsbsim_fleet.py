@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/experiments.md.
+"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/evidence/tables.
 
 .venv/bin/python -m benchmarks.jsbsim_fleet               the aircraft of FLEET, some ten seconds each
 .venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft

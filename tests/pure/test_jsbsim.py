@@ -375,6 +375,6 @@ def test_channels_match_the_tables() -> None:
 
 
 def test_sideslip_of_f15_grows_while_rates_held() -> None:
-    # In flight with p and r held (docs/experiments.md), sideslip grows from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
+    # In flight with p and r held, sideslip grows from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
     assert sideslip_zero(FlightCondition("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
     assert sideslip_zero(CESSNA) < 0.0

@@ -15,7 +15,7 @@ from flight_design.learning.scenario_learner import learner
 pytestmark = pytest.mark.package("flight_design")
 
 OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "throttle", "aileron", "rudder")
-STEPS = {  # Omega_ii of the steps of docs/experiments.md, and true airspeed, m/s: a light aircraft, a fighter, an airliner
+STEPS = {  # Omega_ii of docs/evidence/tables/experiments-jsbsim_omega.csv, true airspeed, m/s: light, fighter, airliner
     "c172p": ((-8.47, 3.31, 6.37, -0.901), 46.3),
     "f16": ((-3.42, 11.1, 12.2, -0.627), 154.3),
     "B747": ((-0.315, 2.23, 0.341, -0.155), 180.1),
