@@ -161,7 +161,7 @@ def test_linear_law_has_a_column_a_vane() -> None:
 def test_vanes_lower_errors_in_turbulence_and_flight_replays() -> None:
     tape = simulate(SHORT)
     alone = rms(simulate(SHORT.vary(controller=SHORT.controller.without_vanes().model_dump())))
-    # measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in docs/laws.md
+    # measured 0.79 in q in 12 s of moderate turbulence; 200 aircraft in docs/evidence/tables/laws-vanes.csv
     assert rms(tape)[0] < 0.9 * alone[0]
     replayed = replay(tape)
     assert replayed.equal()
