@@ -35,12 +35,13 @@ BASELINE = " x baseline"  # end of a goal on a ratio
 HEAD = """\
 # Evidence
 
-A program writes this page from `docs/evidence/`. Each link leads to the figures of a measurement, with the command, the host
-and the date. `make evidence ARGS="--again NAME"` measures again: NAME is that of the file. The programs of learning, guidance
-and real autopilots write their files themselves. The table has the figures that are closest to their goals, in bold those that
-miss. Limits of all measurements: one host, the loopback interface, simulated aircraft. In turbulence a figure is the worst of
-the seeds. A baseline is the least program that does the same on this host: the ratio carries over to other hosts. Flights of
-real autopilots before 2026-11-23 take the times of their commands some seconds early: their rms is to be measured again.
+For you if you want to check a figure. A program writes this page from `docs/evidence/`. Each link leads to the figures of a
+measurement, with their goals, the command, the host and the date; `docs/evidence/tables/` has tables of other pages.
+`make evidence ARGS="--again NAME"` measures again: NAME is that of the file. The programs of learning, guidance and real
+autopilots write their files themselves. Limits of all measurements: one host, the loopback interface, simulated aircraft. In
+turbulence a figure is the worst of the seeds. A baseline is the least program that does the same on this host: the ratio
+carries over to other hosts. Flights of real autopilots before 2026-11-23 take the times of their commands some seconds
+early: their rms is to be measured again.
 """
 
 
@@ -134,7 +135,7 @@ def write_page() -> None:
     """Write the page from the files."""
     lines = [HEAD]
     for section, titles in SECTIONS.items():
-        lines += [f"## {section}", "", "| measurement | goals met | closest to the limits | revision |", "|" + " --- |" * 4]
+        lines += [f"## {section}", "", "| measurement | goals met | missed | revision |", "|" + " --- |" * 4]
         lines += [_line(FOLDER / f"{name}.csv", title) for name, title in titles.items()] + [""]
     PAGE.write_text("\n".join(lines), encoding="utf-8")
 
@@ -148,16 +149,15 @@ def _line(path: Path, title: str) -> str:
     origin = Origin(*lines[0][5:])
     judged = sorted(((used(figure, figures), figure) for figure in figures.values() if figure.goal), reverse=True)
     met = sum(share <= 1.0 for share, _ in judged)
-    closest: dict[str, str] = {}  # of figures that differ by the subject alone the worst
-    for share, figure in judged:
+    missed: dict[str, str] = {}  # of figures that differ by the subject alone the worst
+    for _, figure in judged[: len(judged) - met]:
         value = compared(figure, figures)
-        bold = "" if share <= 1.0 else "**"
         text = figure.value if math.isnan(value) else f"{value:.3g}{'' if figure.baseline else ' ' + figure.unit}".strip()
-        closest.setdefault(figure.name.rpartition(": ")[2] + figure.goal, f"{figure.name} {bold}{text}{bold} ({figure.goal})")
+        missed.setdefault(figure.name.rpartition(": ")[2] + figure.goal, f"{figure.name} **{text}** ({figure.goal})")
     passed = f"{met} of {len(judged)}" if judged else "-"
     busy = ", busy host" if BUSY in origin.host else ""
     measured = f"{origin.revision or 'not recorded'}, {origin.date[:10]}{busy}"
-    return f"| [{title}](evidence/{path.name}) | {passed} | {'; '.join([*closest.values()][:3]) or 'no goal'} | {measured} |"
+    return f"| [{title}](evidence/{path.name}) | {passed} | {'; '.join(missed.values()) or '-'} | {measured} |"
 
 
 def origin(command: str) -> Origin:
