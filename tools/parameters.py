@@ -11,7 +11,7 @@ from aircraft_sim.params import AircraftConfig
 from autopilot_bridge.params import BridgeConfig
 from flight_analysis.closed_loop.scenario import FlightConfig
 from flight_core.fields import REQUIRED
-from flight_core.parameters import Config, ParameterError
+from flight_core.parameters import SMALLEST, Config, ParameterError
 from flight_guidance.params import GuidanceConfig
 from flight_recorder.params import RecorderConfig
 from reference_model.params import ReferenceModelConfig
@@ -21,10 +21,43 @@ from rise_di_controller.params import ControllerConfig
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "parameters.md"
 LEAD = """# Parameters
 
-Every parameter of a scenario file, by section, and of the node `bridge`, which has no section: `-p` sets its parameters.
-SI and radians, if nothing else is said. A key that is not here is refused. The page is made from the classes that validate a
-scenario: `python -m tools.parameters`.
+For you who write or change a scenario file: every key, by section. A key that is not here is refused. Two sections of a file:
+
+```yaml
+/**/flight: {ros__parameters: {duration: 60.0}}
+/**/aircraft: {ros__parameters: {airframe: osprey, rate: 500.0, step: 0.002, sensors: {noise: [0.0017, 0.03, 0.0017, 0.0017]}}}
+```
+
+SI and radians, if nothing else is said. Without a type a value is a number. `= 0.2` is a default. A key without a default and
+without *optional* is required. A list has an entry a channel. No number is above 1e9 in size, no time limit above 1e6 s. The
+node `bridge` has no section: `-p` sets its keys. The classes that validate a scenario make this page:
+`python -m tools.parameters`.
 """
+MET = (
+    "flight.duration",
+    "aircraft.airframe",
+    "aircraft.gusts",
+    "aircraft.turbulence",
+    "aircraft.actuators",
+    "aircraft.sensors",
+    "reference_model.second_order",
+    "reference_model.pulses",
+    "guidance.route",
+    "controller.law",
+    "controller.D",
+    "controller.input_scale",
+    "controller.k_g",
+    "controller.Lambda",
+    "controller.beta",
+)
+"""The keys that a first scenario of a user changes; `rise-di gains` writes those of the controller."""
+SHARED = {
+    "lockstep": "run in lockstep with the other nodes",
+    "start_time": "system time of t = 0, s; 0: at once; -1: by the topic `start`",
+}
+"""Keys of several nodes, which `rise-di fly` and the launch files set."""
+UNBOUNDED = 1e6
+"""A bound from here on is said once for all keys."""
 SECTIONS: Mapping[str, type[Config]] = {
     "flight": FlightConfig,
     "aircraft": AircraftConfig,
@@ -34,12 +67,20 @@ SECTIONS: Mapping[str, type[Config]] = {
     "bridge": BridgeConfig,
     "recorder": RecorderConfig,
 }
-TYPES = {float: "number", int: "integer", str: "string", bool: "boolean", dict: "object", object: "any"}
+TYPES = {float: "number", int: "integer", str: "string", bool: "boolean", dict: "numbers by channel", object: "any"}
+HEAD = ("| parameter | value | meaning |", "|---|---|---|")
 
 
 def page() -> str:
     """The text of the page."""
-    parts = [LEAD, *(_section(f"`{name}`", schema) for name, schema in SECTIONS.items())]
+    parts = [LEAD, "## The keys that you meet first", "", *HEAD]
+    known = {f"{section}.{row[0]}": row for section, schema in SECTIONS.items() for row in _rows(schema)}
+    known |= {f"controller.{row[0]}": row for row in _rows(laws.schema("rise_di"))}
+    parts += [f"| `{key}` | {known[key][1]} | {known[key][2]} |" for key in MET]
+    parts += ["", "## Keys of several sections", "", *HEAD]
+    parts += [f"| `{key}` | {known[f'aircraft.{key}'][1]} | {text} |" for key, text in SHARED.items()]
+    parts += [""]
+    parts += [_section(f"`{name}`", schema) for name, schema in SECTIONS.items()]
     for name in laws.names():
         try:
             schema = laws.schema(name)
@@ -51,29 +92,29 @@ def page() -> str:
 
 def _section(title: str, schema: type[Config], known: Set[str] = frozenset()) -> str:
     rows = [
-        f"| `{key}` | {kind} | {default} | {bounds} | {text} |"
-        for key, kind, default, bounds, text in _rows(schema)
-        if key.split(".")[0] not in known
+        f"| `{key}` | {value} | {text} |" for key, value, text in _rows(schema) if key.split(".")[0] not in {*known, *SHARED}
     ]
-    head = ["| parameter | type | default | bounds | meaning |", "|---|---|---|---|---|"]
-    return "\n".join([f"## {title}", "", *head, *rows, ""])
+    return "\n".join([f"## {title}", "", *((*HEAD, *rows) if rows else ("No further keys.",)), ""])
 
 
-def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, ...]]:
-    """Key, type, default, bounds and meaning of each parameter of a set; those of a group under a dotted key."""
+def _rows(schema: type[Config], prefix: str = "") -> Iterator[tuple[str, str, str]]:
+    """Key, permitted value and meaning of each parameter of a set; those of a group under a dotted key, once for each class."""
+    shown: dict[type[Config], str] = {}
     for name, field in schema.model_fields.items():
-        one, rules = _resolved(field.annotation, field.rules)
-        named = get_origin(one) is dict
-        group = _resolved(get_args(one)[1])[0] if named else one
+        annotation, rules = _resolved(field.annotation, field.rules)
+        named = get_origin(annotation) is dict
+        group = _resolved(get_args(annotation)[1])[0] if named else annotation
         key = f"{prefix}{name}"
         if isinstance(group, type) and issubclass(group, Config):
-            meaning = field.description or ("" if named else group.__doc__ or "")
-            yield key, "group", "none" if named else "", "", _text(meaning)
-            yield from _rows(group, f"{key}.NAME." if named else f"{key}.")
+            meaning = _text(field.description or ("" if named else group.__doc__ or ""))
+            like = shown.setdefault(group, key)
+            yield key, "groups by name" if named else "group", meaning if like == key else f"{meaning}; keys as in `{like}`"
+            if like == key:
+                yield from _rows(group, f"{key}.NAME." if named else f"{key}.")
         else:
-            default = "required" if field.default is REQUIRED else _value(field.default)
-            item_rules = _resolved(get_args(one)[0])[1] if get_origin(one) is tuple else rules
-            yield key, _type(one), default, _bounds(item_rules), _text(field.description)
+            item_rules = _resolved(get_args(annotation)[0])[1] if get_origin(annotation) is tuple else rules
+            parts = [part for part in (_type(annotation), _bounds(item_rules), _value(field.default)) if part]
+            yield key, " ".join(parts[1:] if parts[0] == TYPES[float] and parts[1:] else parts), _text(field.description)
 
 
 def _resolved(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) -> tuple[Any, Mapping[str, Any]]:
@@ -90,26 +131,38 @@ def _type(annotation: Any) -> str:
     if get_origin(annotation) is Literal:
         return ", ".join(f"`{choice}`" for choice in get_args(annotation))
     if get_origin(annotation) is tuple:
-        return f"list of {_type(_resolved(get_args(annotation)[0])[0])}"
+        item = _type(_resolved(get_args(annotation)[0])[0])
+        return f"list of {item}" if item.startswith("`") else f"{item}s"
     return TYPES[get_origin(annotation) or annotation]
 
 
 def _bounds(rules: Mapping[str, Any]) -> str:
+    """The bounds of a number, without those of every number; a smallest size says that the number is positive."""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    shown = signs if "ge" not in rules else {name: sign for name, sign in signs.items() if name != "gt"}
-    return ", ".join(f"{sign} {rules[name]:g}" for name, sign in shown.items() if name in rules)
+    limits = {rule: rules[rule] for rule in signs if rule in rules and abs(rules[rule]) < UNBOUNDED}
+    if 0.0 < limits.get("ge", 0.0) <= SMALLEST:
+        limits["gt"] = 0.0
+    if "gt" in limits:
+        limits.pop("ge", None)
+    return ", ".join(f"{signs[rule]} {limit:g}" for rule, limit in sorted(limits.items()))
 
 
 def _value(default: object) -> str:
+    if default is REQUIRED:
+        return ""
     if default in (None, "", (), {}):
-        return "none"
-    return (
-        f"`{list(default) if isinstance(default, tuple) else str(default).lower() if isinstance(default, bool) else default}`"
-    )
+        return "*optional*"
+    if isinstance(default, bool):
+        return f"= `{str(default).lower()}`"
+    items = [
+        f"{item:g}" if isinstance(item, float) else str(item)
+        for item in (default if isinstance(default, tuple) else (default,))
+    ]
+    return f"= `[{', '.join(items)}]`" if isinstance(default, tuple) else f"= `{items[0]}`"
 
 
 def _text(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    return " ".join(text.split()).removeprefix("the ").replace("|", "\\|")
 
 
 if __name__ == "__main__":

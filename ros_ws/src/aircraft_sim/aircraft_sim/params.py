@@ -58,18 +58,18 @@ class Gust(Config):
     speed: Number = Field(description="the peak speed U_ds, m/s")
     length: Positive = Field(description="the distance H from entry to peak, m")
     every: Annotated[float, Field(gt=0, allow_inf_nan=True)] = Field(
-        default=math.inf, description="after how long it comes again, s; .inf is never"
+        default=math.inf, description="period of further gusts, s; .inf is never"
     )
 
 
 class TurbulenceConfig(Config):
     """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high altitude."""
 
-    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m; from 10 ft (3.048 m) on")
+    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m; 10 ft at least")
     wind: NonNegative | None = Field(
         default=None, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
     )
-    sigma: NonNegative | None = Field(default=None, description="the intensity at high altitude: standard deviation, m/s")
+    sigma: NonNegative | None = Field(default=None, description="the standard deviation at high altitude, m/s")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the turbulence")
 
     def _check(self) -> None:
@@ -87,7 +87,7 @@ class BiasConfig(Config):
 
     start: NonNegative = Field(description="the instant at which it begins, s")
     value: Number = Field(description="the final value, SI unit of the state per s")
-    rise: NonNegative = Field(description="the rise time, s; 0 is a step, which lies outside the theorem")
+    rise: NonNegative = Field(description="the rise time, s; 0 is a step, outside the theorem")
 
 
 class SineConfig(Config):
@@ -103,7 +103,7 @@ class UncertaintyConfig(Config):
 
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
-    entries: tuple[str, ...] = Field(default=(), description="entries with a largest d of their own, as A[q,alpha]")
+    entries: tuple[str, ...] = Field(default=(), description="entries with their own largest d, as A[q,alpha]")
     parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(default=(), description="the largest d of these entries")
     distribution: Distribution = Field(
         default="uniform", description="of d: uniform, normal with its limit at three standard deviations, or its two limits"
@@ -128,9 +128,7 @@ class DriftConfig(Config):
     """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and independent."""
 
     start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(description="when it begins, s; .inf is never")
-    duration: NonNegative = Field(
-        default=60.0, description="how long the entries then change, at a constant rate, s; 0 is at once"
-    )
+    duration: NonNegative = Field(default=60.0, description="how long the entries change, s; 0 is at once")
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
@@ -152,17 +150,13 @@ Times = Upper  # from 0 on, .inf for never
 class ActuatorConfig(Config):
     """The actuators, a value per input in the airframe's order. A missing list means ideal actuators."""
 
-    lag: NonNegativesOrNone = Field(
-        default=(), description="time constants of the first-order response, s, 0 where there is none"
-    )
+    lag: NonNegativesOrNone = Field(default=(), description="time constants of first order, s; 0: none")
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
     dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
     stuck_at: Times = Field(default=(), description="from when on each keeps its position, s; .inf is never")
-    lost_at: Times = Field(
-        default=(), description="from when on each gives no thrust, or floats at trim as a surface, s; .inf is never"
-    )
+    lost_at: Times = Field(default=(), description="from when on each gives no thrust or floats at trim, s; .inf is never")
     weak_at: Times = Field(default=(), description="from when on each has `weak_effect` of its effect, s; .inf is never")
     weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
         default=(), description="factors of the effect from `weak_at` on, below 0 reversed; none: 0.5 each"
@@ -174,7 +168,7 @@ class ActuatorConfig(Config):
         default=(), description="half-widths of the backlash from `loose_at` on, SI; none: 0.01 each"
     )
     delay: float = Field(
-        default=0.0, ge=0, le=10, description="transport delay of u before the actuators, s; whole periods of the aircraft"
+        default=0.0, ge=0, le=10, description="delay of u before the actuators, s; whole periods of the aircraft"
     )
 
 
@@ -191,14 +185,10 @@ class SensorConfig(Config):
 
     bias: NumbersOrNone = Field(default=(), description="constant errors, one an output, SI")
     drift: NonNegativesOrNone = Field(default=(), description="random walks, one an output: standard deviation, SI per sqrt(s)")
-    noise: NonNegativesOrNone = Field(default=(), description="standard deviation of the noise per sample, one an output, SI")
-    quantisation: NonNegativesOrNone = Field(
-        default=(), description="steps of the measured values, one an output, SI, 0 for none"
-    )
-    delay: float = Field(
-        default=0.0, ge=0, le=10, description="transport delay from measurement to arrival, s; whole periods of `rate`"
-    )
-    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is dropped")
+    noise: NonNegativesOrNone = Field(default=(), description="noise, one an output: standard deviation per sample, SI")
+    quantisation: NonNegativesOrNone = Field(default=(), description="steps of the values, one an output, SI; 0: none")
+    delay: float = Field(default=0.0, ge=0, le=10, description="delay from measurement to arrival, s; whole periods of `rate`")
+    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
 
 
@@ -207,9 +197,7 @@ class VaneSensorsConfig(Config):
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(default=(), description="the angles that have a vane; none if empty")
     frozen_at: Times = Field(default=(), description="from when on each keeps its angle, as in ice, s; .inf is never")
-    dropout: float = Field(
-        default=0.0, ge=0, lt=1, description="the probability that a reading is lost; it repeats the one before"
-    )
+    dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before")
 
     def _check(self) -> None:
         require(len(set(self.channels)) == len(self.channels), "channels", ", ".join(self.channels), "different ones")
@@ -223,15 +211,13 @@ PerPose = dict[str, Number]
 class PoseConfig(Config):
     """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to 50 Hz."""
 
-    rate: Positive | None = Field(
-        default=None, description="the rate of pose, Hz, a whole fraction of the aircraft's; none: 50 Hz"
-    )
+    rate: Positive | None = Field(default=None, description="the rate, Hz, a whole fraction of the aircraft's; none: 50 Hz")
     delay: float = Field(
         default=0.0, ge=0, le=10, description="from measurement to arrival, s; whole periods of the aircraft. A stamp stays"
     )
     bias: PerPose = Field(default={}, description="constant errors by channel of `pose`, SI")
     drift: dict[str, NonNegative] = Field(default={}, description="random walks by channel: standard deviation, SI per sqrt(s)")
-    noise: dict[str, NonNegative] = Field(default={}, description="standard deviation of the noise per sample by channel, SI")
+    noise: dict[str, NonNegative] = Field(default={}, description="noise by channel: standard deviation, SI")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
 
 
@@ -246,14 +232,10 @@ class StartConfig(Config):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(
-        description="the name of an airframe of the library, the path of its file, or of JSBSim jsbsim:NAME or jsbsim:PATH"
-    )
-    speed: Positive | None = Field(default=None, description="of an aircraft of JSBSim: the true airspeed of its trim, m/s")
-    altitude: NonNegative | None = Field(
-        default=None, description="of an aircraft of JSBSim: the altitude above sea level of its trim, m"
-    )
-    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate at which y is published and u taken, Hz")
+    airframe: str = Field(description="the name of the library, path of a file, jsbsim:NAME or jsbsim:PATH")
+    speed: Positive | None = Field(default=None, description="of JSBSim: true airspeed of the trim, m/s")
+    altitude: NonNegative | None = Field(default=None, description="of JSBSim: altitude of the trim above sea level, m")
+    rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
         description="the integration step, s; a whole fraction of 1 / rate"
     )
@@ -265,9 +247,7 @@ class AircraftConfig(NodeConfig):
     turbulence: TurbulenceConfig | None = Field(default=None, description="turbulence along all axes of the airframe's gusts")
     bias: dict[str, BiasConfig] = Field(default={}, description="biases on x_dot by state")
     sines: dict[str, SineConfig] = Field(default={}, description="sines on x_dot by state")
-    inertial_coupling: float = Field(
-        default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling, 0 to 1"
-    )
+    inertial_coupling: float = Field(default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling")
     kinematics: Literal["linear", "euler"] = Field(
         default="linear",
         description="of an airframe: the attitude by the linear rows of A, or by Euler's equations, with the loss of lift in a"
@@ -285,20 +265,18 @@ class AircraftConfig(NodeConfig):
         description="of an airframe: its input that is a thrust. A, B and the trim then follow the airspeed in flight; where"
         " absent they are those of the trim speed",
     )
-    actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators, ideal where left out")
+    actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators; ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")
     vanes: VaneSensorsConfig = Field(default=VaneSensorsConfig(), description="vanes beside the outputs, none where left out")
     pose: PoseConfig = Field(default=PoseConfig(), description="how pose is measured, ideal where left out")
 
-    control_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, at whose instants u is waited for, Hz"
-    )
-    duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: the flight time to stop at, s; 0 never stops")
-    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder too, so that the log is complete")
+    control_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the controller's rate, Hz")
+    duration: float = Field(default=0.0, ge=0, le=1e6, description="in lockstep: flight time to stop at, s; 0: never")
+    recorded: bool = Field(default=False, description="in lockstep: wait for the recorder")
 
-    max_age: float = Field(default=0.2, gt=0, le=1e6, description="watchdog: the age of u at which it times out, s")
-    hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long the last u is then held, s")
-    ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim then takes, s")
+    max_age: float = Field(default=0.2, gt=0, le=1e6, description="age at which u times out, s")
+    hold: float = Field(default=0.5, ge=0, le=1e6, description="failsafe: how long u is held, s")
+    ramp: float = Field(default=2.0, ge=0, le=1e6, description="failsafe: how long the ramp to trim takes, s")
 
     @classmethod
     def tunable(cls) -> frozenset[str]:

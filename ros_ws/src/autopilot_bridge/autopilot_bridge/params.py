@@ -479,13 +479,9 @@ def load_map(name: str) -> ChannelMap:
 class BridgeConfig(NodeConfig):
     """All parameters of the bridge node."""
 
-    map: str = Field(description="the name of a channel map of the library, or the path of a file ending in .yaml")
-    dry_run: bool | None = Field(
-        default=None, description="replaces dry_run of the map: publish what would be sent and send nothing"
-    )
-    first_y: NonNegative = Field(
-        default=0.0, description="how long the node waits for its first y before it ends with the reason, s; 0: without end"
-    )
+    map: str = Field(description="the name of the library, or path of a file ending in .yaml")
+    dry_run: bool | None = Field(default=None, description="replaces dry_run of the map")
+    first_y: NonNegative = Field(default=0.0, description="wait for the first y, s; 0: without end")
 
     def _check(self) -> None:
         require(not self.lockstep, "lockstep", "true", "false: a real autopilot does not wait")

@@ -70,14 +70,12 @@ class RouteConfig(Config):
     north: Numbers = Field(description="m")
     east: Numbers = Field(description="m")
     altitude: Numbers = Field(description="m, as `pose` counts it")
-    V: tuple[Positive, ...] = Field(
-        default=(), description="airspeed on the way to each waypoint, m/s; the trim speed where left out"
-    )
-    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint before the aircraft flies on, 1")
+    V: tuple[Positive, ...] = Field(default=(), description="airspeed to each waypoint, m/s; none: trim speed")
+    turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
     wait: tuple[NonNegative, ...] = Field(default=(), description="time on a circle round each waypoint, s")
     leave: tuple[Number, ...] = Field(
         default=(),
-        description="altitude at which the aircraft leaves a circle round each waypoint, m; `altitude` where left out",
+        description="altitude at which a circle is left, m; none: `altitude`",
     )
 
     def _check(self) -> None:
@@ -101,7 +99,7 @@ class ZoneConfig(Config):
     north: Numbers = Field(description="of the corners, or of the centre, m")
     east: Numbers = Field(description="m")
     radius: Positive | None = Field(default=None, description="of a circle, m; none: a polygon")
-    exclude: bool = Field(default=False, description="whether the aircraft keeps out of the zone; else the aircraft stays in")
+    exclude: bool = Field(default=False, description="keep out of the zone, not in")
     group: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
         description="of zones to stay in: the aircraft stays inside every zone of at least one group; none: a group of its own",
@@ -128,9 +126,9 @@ class HomeConfig(Config):
     north: Number = Field(default=0.0, description="m")
     east: Number = Field(default=0.0, description="m")
     altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
-    after_loss: bool = Field(default=False, description="fly home when pose returns after a loss; else level the wings")
+    after_loss: bool = Field(default=False, description="fly home when pose returns; else level the wings")
     link_timeout: Positive | None = Field(
-        default=None, description="time without a command or a `target` from an operator before the way home, s; none: no limit"
+        default=None, description="time without an operator before the way home, s; none: no limit"
     )
 
 
@@ -142,19 +140,15 @@ class GuidanceConfig(NodeConfig):
         default=0.0, ge=-1, le=1e10, description="system time of t = 0, s since the epoch; 0: at once; -1: by the topic `start`"
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
-    authority_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: the rate of `authority`, Hz, of a controller that learns; 0: none"
-    )
+    authority_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: rate of `authority`, Hz; 0: none")
     outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")
-    natural_frequency: Positives = Field(
-        description="those of the reference model, one per output, rad/s; `parameters.yaml` of a run has them"
-    )
+    natural_frequency: Positives = Field(description="those of the reference model, rad/s; `parameters.yaml` of a run has them")
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
-        default=(), description="deceleration and acceleration of full throttle down and up from trim, m/s^2"
+        default=(), description="deceleration and acceleration by throttle from trim, m/s^2"
     )
     roll_authority: Positive | None = Field(
-        default=None, description="roll acceleration of full aileron from trim, rad/s^2; none: not known"
+        default=None, description="roll acceleration of full aileron, rad/s^2; none: not known"
     )
     stall_speed: Positive | None = Field(
         default=None, description="V_s, m/s, true airspeed; none: the speed floor 1.15 V_s is 0.8 V0"
@@ -194,16 +188,14 @@ class GuidanceConfig(NodeConfig):
         default=math.radians(30.0), description="largest angle at which a path is approached, rad"
     )
     radius: Positive | None = Field(default=None, description="radius of fillets and of the last orbit, m; none: by rule")
-    profile: Literal["slope", "step"] = Field(
-        default="slope", description="altitude of a leg: changes along the leg, or from the begin of the leg on"
-    )
+    profile: Literal["slope", "step"] = Field(default="slope", description="altitude changes along a leg, or at its begin")
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which y and pose are stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=10.0, description="how long the attitude is known by dead reckoning when pose is stale, s"
+        default=10.0, description="how long dead reckoning replaces a stale pose, s"
     )
     origin: Annotated[Numbers, Field(min_length=3, max_length=3)] | None = Field(
         default=None,
-        description="latitude, longitude, deg, and height above WGS84, m, of north = east = altitude = 0: for `guidance/fix`",
+        description="latitude, longitude (deg) and height above WGS84 (m) of north = east = altitude = 0",
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")

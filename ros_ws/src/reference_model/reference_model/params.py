@@ -61,13 +61,11 @@ class LiveCommands(Config):
     """Live commands on the topic u_m in place of the profile, and their ending when their publisher is lost."""
 
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(default=0.2, description="the age at which u_m times out, s")
-    speed: Positive | None = Field(
-        default=None, description="the trim speed V0, m/s, for the turn while the wings are levelled; none: zero at once"
-    )
+    speed: Positive | None = Field(default=None, description="the trim speed V0, m/s, to level the wings; none: zero at once")
     levelling: Annotated[float, Field(ge=0, le=1e6)] = Field(
-        default=10.0, description="how long the wings are levelled after a timeout, s; then all commands are zero"
+        default=10.0, description="how long the wings are levelled after a timeout, s"
     )
-    roll_rate: Positive = Field(default=0.35, description="the largest roll rate while the wings are levelled, rad/s")
+    roll_rate: Positive = Field(default=0.35, description="the largest roll rate to level the wings, rad/s")
     bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands by channel, none where left out")
 
 
@@ -96,14 +94,12 @@ class ReferenceModelConfig(NodeConfig):
     outputs: Names = Field(description="the names of the outputs y_m")
     second_order: SecondOrder | None = Field(default=None, description="the model, one filter per channel")
     linear: Linear | None = Field(default=None, description="the model, as matrices")
-    rise: Positive = Field(description="the duration of a pulse's edge, s; bounds u_m_dot as equation (2) requires")
+    rise: Positive = Field(description="the duration of a pulse's edge, s: bounds u_m_dot")
     pulses: dict[str, Pulses] = Field(default={}, description="pulses by channel")
     sines: dict[str, Sine] = Field(default={}, description="sines by channel")
     coordinated_turn: CoordinatedTurn | None = Field(default=None, description="turn coordination")
     live: LiveCommands = Field(default=LiveCommands(), description="live commands u_m")
-    u_m_rate: float = Field(
-        default=0.0, ge=0, le=1000, description="in lockstep: the rate of u_m, at whose instants it is waited for, Hz; 0: none"
-    )
+    u_m_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: rate of u_m, Hz; 0: none")
 
     def _check(self) -> None:
         period = period_ns(self.rate, "rate")

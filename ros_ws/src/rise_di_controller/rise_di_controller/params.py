@@ -61,14 +61,14 @@ MAX_STABLE_STEP = 2.5
 class FeedforwardConfig(Config):
     """The nominal model of the feedforward, an extension of the paper. SI units, matrices row by row."""
 
-    states: Names = Field(description="the states of the nominal model, the outputs among them")
+    states: Names = Field(description="the states of the model, the outputs among them")
     A: Numbers = Field(description="A, a row a state")
-    B: Numbers = Field(description="B, a row a state, the columns in the order of controller.inputs")
+    B: Numbers = Field(description="B, a row a state, the columns as controller.inputs")
     gravity: Numbers | None = Field(default=None, description="sine terms, x_dot += gravity sin(x), a row a state")
-    lead: NonNegatives = Field(description="time from a tick until its input acts, s: half a period, delay and lag")
+    lead: NonNegatives = Field(description="from a tick until its input acts, s: half a period, delay, lag")
     inputs: Names | None = Field(default=None, description="the inputs with a feedforward; all where absent")
     deviation: NonNegatives | None = Field(
-        default=None, description="standard deviations of B, as B, for the limits of guidance; 0 where absent"
+        default=None, description="standard deviations of B, for the limits of guidance; none: 0"
     )
 
     def nominal(self, outputs: Sequence[str], inputs: Sequence[str], D: Sequence[int]) -> Nominal:
@@ -101,11 +101,9 @@ class VanesConfig(Config):
     """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by row."""
 
     channels: Names = Field(description="the channels of y, which are states of the feedforward too, as alpha and beta")
-    H: Numbers = Field(description="a reading less that of the reference motion is H z: a row a vane, a column an estimate")
-    L: Numbers = Field(
-        description="what a vane adds to L: vane by vane a row an estimate, a column an output and one of the vane itself"
-    )
-    least: NonNegatives = Field(description="rms motion of a reading below which the vane counts as frozen and is left out")
+    H: Numbers = Field(description="reading less that of the reference = H z: a row a vane, a column an estimate")
+    L: Numbers = Field(description="what a vane adds to L: by vane a row an estimate, a column an output and the vane")
+    least: NonNegatives = Field(description="rms motion of a reading below which the vane counts as frozen")
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
     def params(self, outputs: Sequence[str], states: Sequence[str], estimates: int) -> VaneParams:
@@ -135,14 +133,14 @@ class ObserverConfig(Config):
     L: Numbers = Field(description="correction by the errors of the outputs, a row an estimate")
     F: Numbers = Field(description="u_o = -F z, a row an input, a column an estimate")
     part: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.6, description="bound of u_o as a part of the limits of u; 0: the law alone, without u_o and u_ff"
+        default=0.6, description="bound of u_o, part of the limits of u; 0: without u_o and u_ff"
     )
     within: Positive = Field(default=0.1, description="least time in which u_o goes from 0 to its bound, s")
     fade: Annotated[float, Field(ge=0, le=1e6)] = Field(
         default=1.0, description="time in which u_o fades in after engagement, s"
     )
     margin: Annotated[float, Field(ge=0, le=0.5)] = Field(
-        default=0.03, description="least delay margin, `delay` included, of a nominal linear loop that the controller loads, s"
+        default=0.03, description="least delay margin of the nominal loop, `delay` included, s"
     )
     vanes: VanesConfig | None = Field(default=None, description="vanes beside y; none where absent")
 
@@ -167,9 +165,9 @@ class AllocationConfig(Config):
     effect: Numbers = Field(description="v = effect u: a row an input of the law, a column an effector; effect T = I")
     lower: Numbers = Field(description="lower end stops of the effectors from trim, units of u")
     upper: Numbers = Field(description="upper end stops of the effectors from trim, units of u")
-    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
+    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
-        default=None, description="the inputs of the law, the one that keeps its effect the longest first; absent: their order"
+        default=None, description="the inputs of the law, the one that keeps its effect the longest first; none: their order"
     )
 
     def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
@@ -212,43 +210,39 @@ class ControllerConfig(NodeConfig):
     """What the law needs beside y and y_m, as words; the controller refuses a law that needs anything."""
 
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of the law, Hz")
-    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(
-        default=0.0, description="in lockstep: the rate of y, Hz; the node derives the time from the number of samples"
-    )
-    law: str = Field(default="rise_di", description="the control law, by the name under which a package registers it")
-    outputs: Names = Field(
-        description="the channels of y in the order of the law; in RISE-DI the last has the smallest gain (22)"
-    )
-    inputs: Names = Field(description="the channels of u, paired with the outputs; with an allocation the inputs v of the law")
+    y_rate: Annotated[float, Field(ge=0, le=1000)] = Field(default=0.0, description="in lockstep: rate of y, Hz")
+    law: str = Field(default="rise_di", description="the law, by its registered name")
+    outputs: Names = Field(description="the channels of y; in RISE-DI the last has the smallest gain (22)")
+    inputs: Names = Field(description="the channels of u, paired with the outputs; with an allocation those of v")
     D: Signs = Field(description="the diagonal of D (11), +1 or -1")
-    input_scale: Positives = Field(description="the change of u that changes y_dot by one, diagonal: 1 / abs(Omega_ii)")
-    lag: NonNegatives = Field(description="time constants of the actuators, s, one per channel; 0 for an actuator without lag")
-    delay: NonNegative = Field(description="pure delay from y to the actuators in addition to sampling, s")
+    input_scale: Positives = Field(description="the change of u that changes y_dot by one: 1 / abs(Omega_ii)")
+    lag: NonNegatives = Field(description="time constants of the actuators, s; 0: none")
+    delay: NonNegative = Field(description="delay from y to the actuators beside sampling, s")
     y_max: Positives | None = Field(
         default=None,
-        description="the largest abs(y) and abs(y_m): a sample beyond is lost; absent: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
+        description="the largest abs(y), abs(y_m); none: p, q, r 2000 deg/s, V 340 m/s, else 1e6",
     )
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
-    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held when y or y_m is stale, s")
-    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u then takes to ramp to trim, s")
-    lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u; none where absent")
-    upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u; none where absent")
-    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s; none where absent")
+    hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held, s")
+    ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long the ramp to trim takes, s")
+    lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u")
+    upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u")
+    slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="u after deactivation: ramped to trim or held")
-    autostart: bool = Field(default=True, description="whether the node configures itself at start, and activates as below")
+    autostart: bool = Field(default=True, description="configure the node at start")
     start_active: bool = Field(
         default=True,
-        description="whether autostart also activates it; if not, u is at trim until another node does, as a bridge",
+        description="activate it too; else u is at trim until another node does",
     )
     allocation: AllocationConfig | None = Field(
-        default=None, description="an extension of the paper: distributes the inputs of the law to effectors; off where absent"
+        default=None, description="extension: distributes the inputs of the law to effectors"
     )
     feedforward: FeedforwardConfig | None = Field(
-        default=None, description="an extension of the paper: adds the input of a nominal model along y_m; off where absent"
+        default=None, description="extension: adds the input of a nominal model along y_m"
     )
     observer: ObserverConfig | None = Field(
         default=None,
-        description="an extension of the paper: corrects the trim by estimates of wind and model error; off where absent",
+        description="extension: corrects the trim by estimates of wind and model error",
     )
 
     @classmethod

@@ -47,10 +47,10 @@ class SpeedConfig(Config):
 class ScheduleConfig(Config):
     """The schedule of input_scale over dynamic pressure, an extension of the paper."""
 
-    speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s: airspeed is speed + V of y")
+    speed: Positive = Field(description="the trim speed V0 at which input_scale holds, m/s")
     time: Positive = Field(default=1.0, description="time constant at which input_scale follows, s")
     slow: SpeedConfig | None = Field(
-        default=None, description="beside an observer: models below the trim speed; between the speeds they are interpolated"
+        default=None, description="beside an observer: models below the trim speed, interpolated between"
     )
     fast: SpeedConfig | None = Field(default=None, description="beside an observer: models above the trim speed")
 
@@ -66,21 +66,21 @@ class LearnConfig(Config):
     window: Annotated[float, Field(ge=6, le=600)] = Field(default=30.0, description="length of the record of y and u, s")
     updates: Positives = Field(
         default=(10.0, 15.0, 20.0, 30.0, 60.0),
-        description="when the first identifications begin, from the first tick of the law, s; then one a window",
+        description="when identifications begin, from the first tick, s; then one a window",
     )
     check: Annotated[float, Field(ge=1, le=600)] = Field(
-        default=10.0, description="after the last of these times: how often it is tested whether the aircraft has changed, s"
+        default=10.0, description="after these times: period of the test for a changed aircraft, s"
     )
     prior: str | None = Field(
-        default=None, description="the airframe file of the rough model, as `rise-di learn` writes it; none: the airframe's own"
+        default=None, description="the airframe file of the rough model, by `rise-di learn`; none: the airframe"
     )
     without: tuple[str, ...] | None = Field(
         default=None,
-        description="outputs that learn no model; the controller adds those of a part that oscillates, until it is deactivated",
+        description="outputs without a learned model; the controller adds parts that oscillate",
     )
     latency: Annotated[float, Field(ge=0, le=60)] = Field(
         default=4.0,
-        description="in lockstep and in one process: from the end of a window until the controller takes the model, s",
+        description="in lockstep: from the end of a window to its model, s",
     )
 
     def spacing(self) -> float:
@@ -98,19 +98,15 @@ class RiseDiConfig(ControllerConfig):
     beta: Positives = Field(description="the diagonal of beta (21) in scaled inputs, units of y / s^2")
     omega: Positives = Field(description="abs(Omega_ii) in scaled inputs, or an over-estimate (implicit sign)")
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
-        description="how the sign of (21) is sampled; auto: implicit where lag and delay are below half a period, else soft"
+        description="how the sign of (21) is sampled; auto: implicit with lag and delay below half a period, else soft"
     )
     softening: Positive | Positives = Field(
         description="width of the softened sign in total lags, one or one per channel; stable above 1, 3 is usual"
     )
 
-    schedule: ScheduleConfig | None = Field(
-        default=None, description="an extension of the paper: input_scale follows the dynamic pressure; off where absent"
-    )
+    schedule: ScheduleConfig | None = Field(default=None, description="extension: input_scale follows the dynamic pressure")
 
-    learn: LearnConfig | None = Field(
-        default=None, description="an extension of the paper: A and B are identified in flight; off where absent"
-    )
+    learn: LearnConfig | None = Field(default=None, description="extension: A and B are identified in flight")
 
     @classmethod
     def tunable(cls) -> frozenset[str]:
