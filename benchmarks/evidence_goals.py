@@ -96,7 +96,6 @@ SECTIONS = {
         "speed-import": "processor time of `import rise_di` and of `rise-di --help`",
         "speed-lockstep": "lockstep flights",
         "speed-recorder": "the recorder at 1 kHz on six topics",
-        "fleets": "several aircraft on a host, and an aircraft on two hosts",
     },
     "Security": {
         "security": "who can receive y and command u",
@@ -139,7 +138,5 @@ SECTIONS = {
         "autopilots-pose": "rates and pose over the autopilot's own log",
         "autopilots-own_log": "ArduPlane 15 % faster, over DDS and MAVLink, calm and in wind, by its own logs",
         "autopilots-releases": "tests, and the times of a release",
-        "autopilots-trouble": "ArduPlane over MAVLink: trouble, lost links and releases",
-        "autopilots-examples": "the examples as they ship, the quadrotor, and logs of autopilots",
     },
 }
