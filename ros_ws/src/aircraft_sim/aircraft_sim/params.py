@@ -58,14 +58,14 @@ class Gust(Config):
     speed: Number = Field(description="the peak speed U_ds, m/s")
     length: Positive = Field(description="the distance H from entry to peak, m")
     every: Annotated[float, Field(gt=0, allow_inf_nan=True)] = Field(
-        default=math.inf, description="period of further gusts, s; .inf is never"
+        default=math.inf, description="the period of further gusts, s"
     )
 
 
 class TurbulenceConfig(Config):
     """Dryden turbulence by MIL-F-8785C; `wind` gives the intensity at low altitude, `sigma` at high altitude."""
 
-    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m; 10 ft at least")
+    altitude: Number = Field(ge=LOWEST, description="the altitude above the ground, m")
     wind: NonNegative | None = Field(
         default=None, description="the wind at 20 ft above the ground, m/s: 7.7 light, 15.4 moderate, 23.1 severe"
     )
@@ -87,7 +87,7 @@ class BiasConfig(Config):
 
     start: NonNegative = Field(description="the instant at which it begins, s")
     value: Number = Field(description="the final value, SI unit of the state per s")
-    rise: NonNegative = Field(description="the rise time, s; 0 is a step, outside the theorem")
+    rise: NonNegative = Field(description="the rise time, s; 0: a step, outside the theorem")
 
 
 class SineConfig(Config):
@@ -106,11 +106,11 @@ class UncertaintyConfig(Config):
     entries: tuple[str, ...] = Field(default=(), description="entries with their own largest d, as A[q,alpha]")
     parts: tuple[Annotated[float, Field(ge=0, lt=1)], ...] = Field(default=(), description="the largest d of these entries")
     distribution: Distribution = Field(
-        default="uniform", description="of d: uniform, normal with its limit at three standard deviations, or its two limits"
+        default="uniform", description="of d: uniform, normal (limit at three standard deviations), its limits"
     )
     wind: WindEffect = Field(
         default=AIR_RELATIVE,
-        description="effect of wind on x_dot: by the aircraft's own A, alpha, beta and V relative to the air, or published",
+        description="effect of wind on x_dot: by the aircraft's own A, or as published",
     )
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of the draw")
     number: int = Field(default=0, ge=0, lt=2**32, description="the number of the seed's aircraft, from 0 on")
@@ -127,7 +127,7 @@ class UncertaintyConfig(Config):
 class DriftConfig(Config):
     """A and B change in flight, as by ice or by damage: every entry times 1 + d, d uniform and independent."""
 
-    start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(description="when it begins, s; .inf is never")
+    start: Annotated[float, Field(ge=0, allow_inf_nan=True)] = Field(description="when it begins, s")
     duration: NonNegative = Field(default=60.0, description="how long the entries change, s; 0 is at once")
     A: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of A")
     B: float = Field(default=0.0, ge=0, lt=1, description="the largest d of an entry of B")
@@ -154,19 +154,17 @@ class ActuatorConfig(Config):
     lower: Lower = Field(default=(), description="lower end stops, deviations from trim, SI")
     upper: Upper = Field(default=(), description="upper end stops, deviations from trim, SI")
     rate: Rates = Field(default=(), description="rate limits, SI per s")
-    dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones of the commands, SI")
-    stuck_at: Times = Field(default=(), description="from when on each keeps its position, s; .inf is never")
-    lost_at: Times = Field(default=(), description="from when on each gives no thrust or floats at trim, s; .inf is never")
-    weak_at: Times = Field(default=(), description="from when on each has `weak_effect` of its effect, s; .inf is never")
+    dead_zone: NonNegativesOrNone = Field(default=(), description="half-widths of the dead zones")
+    stuck_at: Times = Field(default=(), description="from when on each keeps its position, s")
+    lost_at: Times = Field(default=(), description="from when on each gives no thrust or floats at trim, s")
+    weak_at: Times = Field(default=(), description="from when on each has `weak_effect`, s")
     weak_effect: tuple[Annotated[float, Field(ge=-2, le=2)], ...] = Field(
-        default=(), description="factors of the effect from `weak_at` on, below 0 reversed; none: 0.5 each"
+        default=(), description="factors of the effect, below 0 reversed; none: 0.5"
     )
-    slow_at: Times = Field(default=(), description="from when on each has the lag `slow_lag` at least, s; .inf is never")
-    slow_lag: NonNegativesOrNone = Field(default=(), description="lags from `slow_at` on, s; none: 0.2 s each")
-    loose_at: Times = Field(default=(), description="from when on each has the backlash `loose_play`, s; .inf is never")
-    loose_play: NonNegativesOrNone = Field(
-        default=(), description="half-widths of the backlash from `loose_at` on, SI; none: 0.01 each"
-    )
+    slow_at: Times = Field(default=(), description="from when on each has `slow_lag`, s")
+    slow_lag: NonNegativesOrNone = Field(default=(), description="least lags, s; none: 0.2 s")
+    loose_at: Times = Field(default=(), description="from when on each has `loose_play`, s")
+    loose_play: NonNegativesOrNone = Field(default=(), description="half-widths of the backlash, SI; none: 0.01")
     delay: float = Field(
         default=0.0, ge=0, le=10, description="delay of u before the actuators, s; whole periods of the aircraft"
     )
@@ -183,10 +181,10 @@ SEVERITIES = {"weak_effect": 0.5, "slow_lag": 0.2, "loose_play": 0.01}
 class SensorConfig(Config):
     """The sensors. The defaults are ideal sensors."""
 
-    bias: NumbersOrNone = Field(default=(), description="constant errors, one an output, SI")
-    drift: NonNegativesOrNone = Field(default=(), description="random walks, one an output: standard deviation, SI per sqrt(s)")
-    noise: NonNegativesOrNone = Field(default=(), description="noise, one an output: standard deviation per sample, SI")
-    quantisation: NonNegativesOrNone = Field(default=(), description="steps of the values, one an output, SI; 0: none")
+    bias: NumbersOrNone = Field(default=(), description="constant errors")
+    drift: NonNegativesOrNone = Field(default=(), description="random walks: standard deviation, SI per sqrt(s)")
+    noise: NonNegativesOrNone = Field(default=(), description="noise: standard deviation per sample")
+    quantisation: NonNegativesOrNone = Field(default=(), description="steps of the values; 0: none")
     delay: float = Field(default=0.0, ge=0, le=10, description="delay from measurement to arrival, s; whole periods of `rate`")
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a sample is lost")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise, drift and losses")
@@ -196,7 +194,7 @@ class VaneSensorsConfig(Config):
     """Vanes: further channels of y, alpha and beta relative to the air, with errors of `sensors` too."""
 
     channels: tuple[Literal["alpha", "beta"], ...] = Field(default=(), description="the angles that have a vane; none if empty")
-    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, as in ice, s; .inf is never")
+    frozen_at: Times = Field(default=(), description="from when on each keeps its angle, s")
     dropout: float = Field(default=0.0, ge=0, lt=1, description="the probability that a reading repeats the one before")
 
     def _check(self) -> None:
@@ -212,12 +210,10 @@ class PoseConfig(Config):
     """How `pose` is measured. The defaults are an ideal estimator: the true pose at once, at up to 50 Hz."""
 
     rate: Positive | None = Field(default=None, description="the rate, Hz, a whole fraction of the aircraft's; none: 50 Hz")
-    delay: float = Field(
-        default=0.0, ge=0, le=10, description="from measurement to arrival, s; whole periods of the aircraft. A stamp stays"
-    )
-    bias: PerPose = Field(default={}, description="constant errors by channel of `pose`, SI")
-    drift: dict[str, NonNegative] = Field(default={}, description="random walks by channel: standard deviation, SI per sqrt(s)")
-    noise: dict[str, NonNegative] = Field(default={}, description="noise by channel: standard deviation, SI")
+    delay: float = Field(default=0.0, ge=0, le=10, description="from measurement to arrival, s; whole periods of the aircraft")
+    bias: PerPose = Field(default={}, description="constant errors")
+    drift: dict[str, NonNegative] = Field(default={}, description="random walks: standard deviation, SI per sqrt(s)")
+    noise: dict[str, NonNegative] = Field(default={}, description="noise: standard deviation per sample")
     seed: int = Field(default=1, ge=0, lt=2**63, description="the seed of noise and drift")
 
 
@@ -232,7 +228,7 @@ class StartConfig(Config):
 class AircraftConfig(NodeConfig):
     """Parameters of the aircraft's node."""
 
-    airframe: str = Field(description="the name of the library, path of a file, jsbsim:NAME or jsbsim:PATH")
+    airframe: str = Field(description="a name of the library, the path of a file, jsbsim:NAME or jsbsim:PATH")
     speed: Positive | None = Field(default=None, description="of JSBSim: true airspeed of the trim, m/s")
     altitude: NonNegative | None = Field(default=None, description="of JSBSim: altitude of the trim above sea level, m")
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
@@ -250,8 +246,7 @@ class AircraftConfig(NodeConfig):
     inertial_coupling: float = Field(default=0.0, ge=0, le=1, description="the factor on the airframe's inertial coupling")
     kinematics: Literal["linear", "euler"] = Field(
         default="linear",
-        description="of an airframe: the attitude by the linear rows of A, or by Euler's equations, with the loss of lift in a"
-        " bank; guidance needs euler",
+        description="the attitude by A, or by Euler's equations with the loss of lift in a bank, for guidance",
     )
     wind: Annotated[Numbers, Field(min_length=2, max_length=2)] = Field(
         default=(0.0, 0.0), description="the steady wind, m/s, where the air moves to: north, east"
@@ -262,8 +257,7 @@ class AircraftConfig(NodeConfig):
     drift: DriftConfig | None = Field(default=None, description="how A and B change in flight, as by ice")
     over_airspeed: str | None = Field(
         default=None,
-        description="of an airframe: its input that is a thrust. A, B and the trim then follow the airspeed in flight; where"
-        " absent they are those of the trim speed",
+        description="the input that is a thrust: A, B and the trim follow the airspeed; none: of the trim speed",
     )
     actuators: ActuatorConfig = Field(default=ActuatorConfig(), description="the actuators; ideal where left out")
     sensors: SensorConfig = Field(default=SensorConfig(), description="the sensors, ideal where left out")

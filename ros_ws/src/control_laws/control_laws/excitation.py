@@ -95,9 +95,9 @@ EXCITATION = ControlLaw(ExcitationState, _engage, without_limits(_limited), _lim
 class ExcitationConfig(ControllerConfig):
     """A controller to excite the inputs in turn, in the order of `inputs`, without control."""
 
-    amplitude: NonNegatives = Field(description="largest deviation of each input from trim, units of u; 0 for none")
+    amplitude: NonNegatives = Field(description="largest deviation of each input from trim")
     width: Positives = Field(description="half the first doublet of each input, s")
-    period: Positives = Field(description="period of the multisine of each input, which lasts for one, s")
+    period: Positives = Field(description="period of the multisine of each input, s")
     lowest: Positives = Field(description="lowest frequency of each multisine, Hz")
     highest: Positives = Field(description="highest frequency of each multisine, Hz")
     pause: NonNegative = Field(description="time before each input's excitation, and after the last one, s")

@@ -95,7 +95,7 @@ class L1Config(ControllerConfig):
 
     K: Positives = Field(description="proportional gain, 1/s")
     bandwidth: Positives = Field(description="bandwidths of the low-pass filter of the estimate, rad/s")
-    Omega: Numbers = Field(description="nominal Omega = C B, a row an output, the columns in the order of inputs")
+    Omega: Numbers = Field(description="nominal Omega = C B, a row an output")
 
     def check_law(self) -> None:
         """A value per channel, and an Omega with the controller's D."""

@@ -69,7 +69,7 @@ class RouteConfig(Config):
 
     north: Numbers = Field(description="m")
     east: Numbers = Field(description="m")
-    altitude: Numbers = Field(description="m, as `pose` counts it")
+    altitude: Numbers = Field(description="m, as `pose`")
     V: tuple[Positive, ...] = Field(default=(), description="airspeed to each waypoint, m/s; none: trim speed")
     turns: tuple[NonNegative, ...] = Field(default=(), description="turns round each waypoint")
     wait: tuple[NonNegative, ...] = Field(default=(), description="time on a circle round each waypoint, s")
@@ -102,7 +102,7 @@ class ZoneConfig(Config):
     exclude: bool = Field(default=False, description="keep out of the zone, not in")
     group: Annotated[int, Field(ge=0, le=255)] | None = Field(
         default=None,
-        description="of zones to stay in: the aircraft stays inside every zone of at least one group; none: a group of its own",
+        description="of zones to stay in: inside every zone of one group at least; none: its own",
     )
 
     def _check(self) -> None:
@@ -127,9 +127,7 @@ class HomeConfig(Config):
     east: Number = Field(default=0.0, description="m")
     altitude: Number | None = Field(default=None, description="m; none: the altitude of then")
     after_loss: bool = Field(default=False, description="fly home when pose returns; else level the wings")
-    link_timeout: Positive | None = Field(
-        default=None, description="time without an operator before the way home, s; none: no limit"
-    )
+    link_timeout: Positive | None = Field(default=None, description="time without an operator before the way home, s")
 
 
 class GuidanceConfig(NodeConfig):
@@ -141,23 +139,17 @@ class GuidanceConfig(NodeConfig):
     )
     y_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: the rate of y, Hz")
     authority_rate: float = Field(default=0.0, ge=0, le=1000, description="in lockstep: rate of `authority`, Hz; 0: none")
-    outputs: Names = Field(default=RATES_AND_SPEED, description="the names of the commands u_m: q, V, p, r in any order")
+    outputs: Names = Field(default=RATES_AND_SPEED, description="the commands u_m in any order")
     natural_frequency: Positives = Field(description="those of the reference model, rad/s; `parameters.yaml` of a run has them")
     speed: Positive = Field(description="the trim speed V0, m/s: airspeed is speed + V")
     throttle_authority: tuple[Positive, ...] = Field(
         default=(), description="deceleration and acceleration by throttle from trim, m/s^2"
     )
-    roll_authority: Positive | None = Field(
-        default=None, description="roll acceleration of full aileron, rad/s^2; none: not known"
-    )
-    stall_speed: Positive | None = Field(
-        default=None, description="V_s, m/s, true airspeed; none: the speed floor 1.15 V_s is 0.8 V0"
-    )
-    speed_limit: Positive | None = Field(
-        default=None, description="largest airspeed, m/s, such as V_ne as a true airspeed; none: 1.4 V0"
-    )
-    ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose` counts it; none: no bound")
-    altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose` counts it; none: no bound")
+    roll_authority: Positive | None = Field(default=None, description="roll acceleration of full aileron, rad/s^2")
+    stall_speed: Positive | None = Field(default=None, description="V_s, true airspeed, m/s; none: 1.15 V_s is 0.8 V0")
+    speed_limit: Positive | None = Field(default=None, description="largest true airspeed, m/s; none: 1.4 V0")
+    ceiling: Number | None = Field(default=None, description="largest altitude, m, as `pose`")
+    altitude_floor: Number | None = Field(default=None, description="least altitude, m, as `pose`")
     wind: NonNegative = Field(default=0.0, description="the largest wind to be met, m/s")
 
     bank: Annotated[float, Field(gt=0, le=math.radians(60.0))] = Field(
@@ -173,16 +165,12 @@ class GuidanceConfig(NodeConfig):
     climb: Positive | None = Field(default=None, description="largest climb rate, m/s; none: by the throttle's authority")
     sink: Positive | None = Field(default=None, description="largest sink rate, m/s; none: by the throttle's authority")
     acceleration: Positive = Field(default=1.0, description="permitted vertical acceleration, m/s^2")
-    altitude_gain: Positive | None = Field(
-        default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule, at most 0.2"
-    )
+    altitude_gain: Positive | None = Field(default=None, description="k_h, climb rate per altitude error, 1/s; none: by rule")
     alpha_time: Positive | None = Field(
-        default=None, description="time constant of the estimated angle of attack, s; none: by rule, at least 2"
+        default=None, description="time constant of the estimated angle of attack, s; none: by rule"
     )
-    sideslip_gain: NonNegative | None = Field(
-        default=None, description="k_beta, 1/s, used where `pose` has beta; none: by rule, at most 0.5"
-    )
-    period: Positive | None = Field(default=None, description="period of path following, s; none: the least one by rule")
+    sideslip_gain: NonNegative | None = Field(default=None, description="k_beta, 1/s, with beta in `pose`; none: by rule")
+    period: Positive | None = Field(default=None, description="period of path following, s; none: by rule")
     damping: Annotated[float, Field(ge=0.5, le=1.0)] = Field(default=0.75, description="damping of path following, 1")
     capture: Annotated[float, Field(gt=0, le=math.pi / 4.0)] = Field(
         default=math.radians(30.0), description="largest angle at which a path is approached, rad"
@@ -199,7 +187,7 @@ class GuidanceConfig(NodeConfig):
     )
     program: dict[str, Steps] = Field(default={}, description="targets over flight time by channel")
     route: RouteConfig | None = Field(default=None, description="the route, flown from the start on")
-    fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in, or to keep out of, by a name of yours")
+    fence: dict[str, ZoneConfig] = Field(default={}, description="zones to stay in or to keep out of")
     home: HomeConfig = Field(default=HomeConfig(), description="where the aircraft goes at a fence and by `guidance/home`")
 
     def _check(self) -> None:

@@ -66,7 +66,7 @@ class LiveCommands(Config):
         default=10.0, description="how long the wings are levelled after a timeout, s"
     )
     roll_rate: Positive = Field(default=0.35, description="the largest roll rate to level the wings, rad/s")
-    bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands by channel, none where left out")
+    bounds: dict[str, Positive] = Field(default={}, description="largest absolute commands")
 
 
 class SecondOrder(Config):

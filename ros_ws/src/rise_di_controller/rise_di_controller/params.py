@@ -100,9 +100,9 @@ class FeedforwardConfig(Config):
 class VanesConfig(Config):
     """Vanes of an observer: channels of y beside the outputs, for the observer alone; SI, row by row."""
 
-    channels: Names = Field(description="the channels of y, which are states of the feedforward too, as alpha and beta")
-    H: Numbers = Field(description="reading less that of the reference = H z: a row a vane, a column an estimate")
-    L: Numbers = Field(description="what a vane adds to L: by vane a row an estimate, a column an output and the vane")
+    channels: Names = Field(description="the channels of y, also states of the feedforward, as alpha")
+    H: Numbers = Field(description="reading less that of the reference = H z, a row a vane")
+    L: Numbers = Field(description="added to L: by vane a row an estimate, a column an output and the vane")
     least: NonNegatives = Field(description="rms motion of a reading below which the vane counts as frozen")
     time: Positive = Field(default=1.0, description="time over which the motion is averaged, s")
 
@@ -128,9 +128,9 @@ class ObserverConfig(Config):
 
     rate: Positive = Field(description="the rate of the law for which the matrices hold, Hz")
     states: Names = Field(description="names of the estimates: those of the feedforward's states first, as x.alpha")
-    Phi: Numbers = Field(description="estimates one period later without input, a row an estimate")
-    Gamma: Numbers = Field(description="effect of u, held over the period, a row an estimate, the columns as controller.inputs")
-    L: Numbers = Field(description="correction by the errors of the outputs, a row an estimate")
+    Phi: Numbers = Field(description="estimates one period later without input")
+    Gamma: Numbers = Field(description="effect of u, held over the period")
+    L: Numbers = Field(description="correction by the errors of the outputs")
     F: Numbers = Field(description="u_o = -F z, a row an input, a column an estimate")
     part: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.6, description="bound of u_o, part of the limits of u; 0: without u_o and u_ff"
@@ -161,13 +161,13 @@ class AllocationConfig(Config):
     """An allocation of the inputs of the law to as many effectors or more, an extension of the paper. SI, row by row."""
 
     effectors: Names = Field(description="the channels of u that are published")
-    T: Numbers = Field(description="u = T v: a row an effector, a column an input of the law")
-    effect: Numbers = Field(description="v = effect u: a row an input of the law, a column an effector; effect T = I")
-    lower: Numbers = Field(description="lower end stops of the effectors from trim, units of u")
-    upper: Numbers = Field(description="upper end stops of the effectors from trim, units of u")
+    T: Numbers = Field(description="u = T v: a row an effector, a column an input")
+    effect: Numbers = Field(description="v = effect u: a row an input, a column an effector; effect T = I")
+    lower: Numbers = Field(description="lower end stops of the effectors from trim")
+    upper: Numbers = Field(description="upper end stops of the effectors from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     priority: Names | None = Field(
-        default=None, description="the inputs of the law, the one that keeps its effect the longest first; none: their order"
+        default=None, description="the inputs, the one that keeps its effect the longest first; none: in order"
     )
 
     def ordered(self, inputs: Sequence[str], wanted: Sequence[str]) -> "AllocationConfig":
@@ -225,8 +225,8 @@ class ControllerConfig(NodeConfig):
     max_age: Annotated[float, Field(gt=0, le=1e6)] = Field(description="the age above which y or y_m is stale, s")
     hold: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long u is held, s")
     ramp: Annotated[float, Field(ge=0, le=1e6)] = Field(description="failsafe: how long the ramp to trim takes, s")
-    lower: Numbers | None = Field(default=None, description="lower limits of u from trim, units of u")
-    upper: Numbers | None = Field(default=None, description="upper limits of u from trim, units of u")
+    lower: Numbers | None = Field(default=None, description="lower limits of u from trim")
+    upper: Numbers | None = Field(default=None, description="upper limits of u from trim")
     slew: Positives | None = Field(default=None, description="limits of abs(u_dot), units of u / s")
     on_deactivate: Literal["trim", "hold"] = Field(default="trim", description="u after deactivation: ramped to trim or held")
     autostart: bool = Field(default=True, description="configure the node at start")

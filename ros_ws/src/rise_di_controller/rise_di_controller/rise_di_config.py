@@ -100,9 +100,7 @@ class RiseDiConfig(ControllerConfig):
     sign: Literal["auto", "literal", "implicit", "soft"] = Field(
         description="how the sign of (21) is sampled; auto: implicit with lag and delay below half a period, else soft"
     )
-    softening: Positive | Positives = Field(
-        description="width of the softened sign in total lags, one or one per channel; stable above 1, 3 is usual"
-    )
+    softening: Positive | Positives = Field(description="width of the softened sign in total lags; stable above 1, 3 is usual")
 
     schedule: ScheduleConfig | None = Field(default=None, description="extension: input_scale follows the dynamic pressure")
 
