@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from benchmarks.servo_world import PROTOTYPE_GAINS
 
 from aircraft_sim import dynamics, plant
 from aircraft_sim.actuators import Actuators
@@ -22,6 +21,9 @@ from reference_model import model
 from reference_model.command import Profile, command
 from rise_di_controller import law as rise
 from rise_di_controller.law import LawParams, Sign
+
+PROTOTYPE_GAINS = {"k_g": 1.0, "k_d": [16.0, 16.0, 7.0], "Lambda": [5.0, 5.0, 3.0, 0.5], "softening": 2.75}
+"""Gains of the prototype of the law, 32 deg of phase margin in r, 26 in V. Tests and pages quote its figures."""
 
 PROTOTYPE_SERVO = find_scenario("osprey_servo").vary(controller=PROTOTYPE_GAINS)
 
