@@ -79,51 +79,28 @@ def states(**units: str) -> Callable[[Mapping[str, Any]], dict[str, Any]]:
 
 WRONG: dict[str, tuple[dict[str, Any], Callable[[Mapping[str, Any]], dict[str, Any]], tuple[str, ...]]] = {
     "transposed": (NAVION, lambda v: {"A": np.transpose(v["A"]).tolist()}, ("A is transposed",)),
-    "rows of A": (NAVION, exchanged("A", 1, 2), ("rows of A", "V, q, w, theta")),
-    "columns of A": (NAVION, exchanged("A", 0, 3, 1), ("columns of A", "theta, w, q, V")),
     "rows of B": (NAVION, exchanged("B", 2, 3), ("rows of B", "A and B need one order")),
-    "columns of B": (NAVION, exchanged("B", 0, 1, 1), ("columns of B", "thrust, elevator")),
-    "order of states": (NAVION, lambda v: {"states": dict([*v["states"].items()][::-1])}, ("name the states so", "V, w, q")),
     "no kinematics": (NAVION, scaled("A", 3, 2, 0.0), ("theta_dot = 0 q", "expected 1")),
     "sign of gravity": (NAVION, scaled("A", 0, 3, -1.0), ("V_dot = 9.81 theta", "sign is reversed")),
     "g in ft/s^2": (NAVION, scaled("A", 0, 3, 3.28084), ("expected -g = -9.81", "feet and metres")),
-    "no gravity": (NAVION, scaled("A", 0, 3, 0.0), ("V_dot = 0 theta", "missing")),
     "speed in ft/s": (NAVION, lambda _: {"speed": 176.0}, ("speed", "A fits 53.64 m/s")),
-    "speed in kt": (NAVION, lambda _: {"speed": 104.3}, ("speed", "A fits 53.64 m/s")),
     "SI declared ft/s": (NAVION, states(V="ft/s", w="ft/s"), ("feet and metres",)),
-    "SI declared kt": (NAVION, states(V="kt", w="kt"), ("knots and m/s",)),
-    "theta in deg": (NAVION, states(theta="deg"), ("degrees and radians",)),
-    "angles in deg": (NAVION, states(theta="deg", q="deg/s"), ("degrees and radians",)),
     "alpha as w": (NAVION, states(w="rad"), ("states.w: found rad, expected a speed", "alpha perhaps")),
-    "a rate as an angle": (NAVION, states(q="rad"), ("states.q: found rad, expected an angular rate",)),
     "elevator per rad declared deg": (
         NAVION,
         lambda v: {"inputs": v["inputs"] | {"elevator": {"unit": "deg", "positive": "nose down"}}},
         ("inputs.elevator.unit", "B is per rad, and the unit deg?"),
     ),
-    "elevator per deg declared rad": (
-        NAVION,
-        lambda v: {"B": (np.array(v["B"]) * [np.pi / 180.0, 1.0]).tolist()},
-        ("inputs.elevator.unit", "B is per deg, and the unit rad?"),
-    ),
     "sign of the elevator": (NAVION, lambda v: {"B": (np.array(v["B"]) * [-1.0, 1.0]).tolist()}, ("q_dot = 11.04",)),
-    "sign of thrust": (NAVION, scaled("B", 0, 1, -1.0), ("V_dot = -9.81 thrust", "more than 0")),
     "input that turns an angle": (NAVION, lambda v: {"B": [*v["B"][:3], [0.1, 0.0]]}, ("no input moves theta at once",)),
     "pitch driven by its rate": (NAVION, scaled("A", 2, 2, -1.0), ("q_dot = 2.948 q", "air damps")),
     "sign of v and r": (F4C, scaled("A", 0, 2, -1.0), ("v_dot = 175.6 r", "-V0 = -178", "sign is reversed")),
-    "sign of v and phi": (F4C, scaled("A", 0, 3, -1.0), ("v_dot = -9.678 phi", "g = 9.81")),
     "heading in deg": (F4C, states(psi="deg"), ("psi_dot = 0.01769 r", "degrees and radians")),
-    "beta as v": (F4C, states(v="deg"), ("states.v: found deg", "beta perhaps")),
-    "sign of the rudder": (F4C, lambda v: {"B": (np.array(v["B"]) * [1.0, -1.0]).tolist()}, ("inputs.rudder", "r_dot = 1.357")),
-    "p and r exchanged": (F4C, exchanged("A", 1, 2), ("A:",)),
     "a state missing": (F4C, lambda v: {"states": {name: v["states"][name] for name in "vpr"}}, ("expected 3 rows of 3",)),
-    "not finite": (F4C, scaled("A", 0, 0, np.nan), ("finite number",)),
-    "B of another shape": (F4C, lambda v: {"B": v["B"][:4]}, ("expected 5 rows of 2",)),
     "unknown unit": (F4C, states(v="furlong/h"), ("states.v: found 'furlong/h'", "ft/s^2")),
     "feedthrough": (F4C, lambda _: {"D": [[0.0, 0.0], [0.1, 0.0]]}, ("D: found a feedthrough of 0.1", "take an output")),
     "output without a unit": (NAVION, lambda _: {"outputs": ["q", "n"], "C": [[0, 0, 1, 0]] * 2}, ("output_units.n",)),
     "rows of C exchanged": (NAVION, lambda _: {"C": [[1, 0, 0, 0], [0, 0, 1, 0]]}, ("a row of q with V", "the state q alone")),
-    "C of another shape": (NAVION, lambda _: {"C": [[0, 0, 1, 0]]}, ("C: found rows of [4]", "2 rows of 4")),
 }  # fmt: skip
 
 
@@ -199,7 +176,15 @@ def test_factors_are_the_published_ones(unit: str, factor: float) -> None:
     assert si_per_unit(unit) == pytest.approx(factor, rel=2e-6)
 
 
-@pytest.mark.parametrize("unit", ["knots", "ft/sec", "m2", "", "m/", "ft//s", "feet", "m^x", "rad/s/"])
+@pytest.mark.parametrize(
+    "unit",
+    [
+        "knots",
+        "",
+        "ft//s",
+        "m^x",
+    ],
+)
 def test_unknown_unit_is_refused(unit: str) -> None:
     with pytest.raises(ParameterError, match="or a product such as ft/s"):
         quantity(unit, "states.V")

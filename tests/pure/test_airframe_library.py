@@ -13,13 +13,11 @@ from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
 from flight_core.units import si_per_unit
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import (
-    ComplexArray,
     ZeroDynamics,
     airframe_facts,
     controllable,
     invariant_zeros,
     library,
-    zero_dynamics,
 )
 from rise_di_controller.decomposition import coupling
 
@@ -80,12 +78,6 @@ def test_every_airframe_states_source_and_signs(airframe: Airframe) -> None:
     directions = {"nose up", "nose down", "nose left", "nose right", "roll left", "roll right"}
     for inputs in airframe.inputs.values():
         assert inputs.positive in directions or inputs.positive.startswith("more thrust")
-
-
-def test_sign_in_words_is_sign_of_diagonal_of_omega(airframe: Airframe) -> None:
-    down = {"nose down", "nose left", "roll left"}
-    expected = [-1.0 if entry.positive in down else 1.0 for entry in airframe.inputs.values()]
-    np.testing.assert_array_equal(np.sign(np.diag(airframe_facts(airframe).Omega)), expected)
 
 
 @pytest.mark.parametrize("name", PUBLISHED_POLES)
@@ -177,26 +169,9 @@ def test_minors_are_of_omega_in_si() -> None:
     np.testing.assert_allclose(facts.minors, per_degree / np.deg2rad(1.0) ** np.array([1, 2]), rtol=1e-12)
 
 
-def test_remedies() -> None:
-    remedies = {facts.name: facts.remedy for facts in library()}
-    assert remedies["osprey"] == "none needed"
-    assert remedies["f16_lateral"] == "flip aileron, rudder"
-    assert remedies["b747_longitudinal"] == "flip elevator"
-
-
 def test_the_foot_is_exact() -> None:
     # 1 ft = 0.3048 m by definition (1959).
     assert si_per_unit("ft/s") == 0.3048
-
-
-def test_published_units_become_si() -> None:
-    boeing = load_airframe("b747_longitudinal")
-    # g: -0.322 ft/s^2 per hundredth of a radian is 9.81 m/s^2 per radian, to the digits given.
-    assert boeing.matrix_a()[0, 3] == pytest.approx(-9.81, abs=0.005)
-    # u0: 7.74 ft/s^2 per hundredth of a radian per second is 774 ft/s.
-    assert boeing.matrix_a()[1, 2] == pytest.approx(boeing.speed, rel=1e-12)
-    # M_de does not depend on the unit of angle: crad/s^2 per crad.
-    assert boeing.matrix_b()[2, 0] == pytest.approx(-1.16, rel=1e-12)
 
 
 AEROSONDE = {"Jx": 0.8244, "Jz": 1.759, "Jxz": 0.1204, "S": 0.55, "b": 2.8956, "rho": 1.2682, "g": 9.81, "V": 25.0}
@@ -265,12 +240,6 @@ def test_zero_dynamics_are_classified_by_their_zeros(k: float, zero: float, kind
     np.testing.assert_allclose(facts.zeros, [zero], atol=1e-12)
     assert facts.zero_dynamics is kind
     assert facts.in_theorem is (kind is not ZeroDynamics.UNSTABLE)
-
-
-def test_zeros_on_imaginary_axis_are_marginal_and_no_zeros_are_stable() -> None:
-    pair: ComplexArray = np.array([-1j, 1j])
-    assert zero_dynamics(pair) is ZeroDynamics.MARGINAL
-    assert zero_dynamics(pair[:0]) is ZeroDynamics.STABLE
 
 
 @pytest.mark.equation("Assumption 1")

@@ -11,7 +11,6 @@ from tests.conftest import REPOSITORY
 from tests.maps import named_map
 
 from aircraft_sim.airframe import load_airframe
-from flight_analysis.closed_loop.loop_margins import margins
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -182,27 +181,12 @@ def test_a_vehicle_that_is_no_aeroplane_flies_and_replays(monkeypatch: pytest.Mo
     assert replay(tape).equal()
 
 
-def test_the_margins_are_those_of_the_aircraft_behind_the_allocation() -> None:
-    """By C B T = I the channels are those of a loop with unit response, whatever the units of the effectors."""
-    scenario = find_scenario("osprey_servo").vary(controller=mixed())
-    found = margins(scenario)
-    assert found.inputs == ("v_q", "v_V", "v_p", "v_r")
-    scaled = full_mixing()
-    halved = [value / 2.0 for value in scaled["effect"]], [value * 2.0 for value in scaled["T"]]
-    wrong = find_scenario("osprey_servo").vary(controller=mixed(effect=halved[0], T=halved[1]))
-    assert margins(wrong).delay < found.delay  # twice the response
-
-
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"effectors": ["elevator", "thrust", "aileron"]}, "found elevator, thrust, aileron, expected 4 or more"),
-        ({"effectors": ["elevator", "thrust", "aileron", "aileron"]}, "expected different names"),
         ({"T": [1.0] * 15}, "allocation.T: found 15 values, expected 16: 4 rows of 4"),
         ({"effect": [1.0] * 16}, "allocation.T: found effect T that is off I"),
         ({"lower": [0.1] * 4}, "allocation.lower: found 0.1 and upper 0.3 of elevator, expected a range with trim, 0, inside"),
-        ({"priority": ["v_q"]}, "allocation.priority: found v_q, expected the inputs of the law"),
-        ({"effectors": ["elevator", "thrust", "flap", "rudder"]}, "controller.allocation.effectors: found"),
     ],
 )
 def test_an_allocation_that_does_not_fit_is_refused_with_a_sentence(changes: dict[str, Any], sentence: str) -> None:

@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import engines
 from flight_campaign.benchmark_course import build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Enter, Task, find_entry, task_of
-from flight_campaign.benchmark_scores import CHUNKS, SCORES, Benchmark, Definition, Flights, define, scores_of
+from flight_campaign.benchmark_scores import CHUNKS, SCORES, Benchmark, Definition, Flights, define
 from flight_campaign.benchmark_sets import SCENARIOS, SETS, UNCERTAINTY, VERSION, Sets, seed_of
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
@@ -138,11 +138,8 @@ def test_interrupted_run_continues_to_the_same_file(brief: Sets, tmp_path: Path)
     [
         (lambda task: PI | {"rate": 50.0}, "own: controller.rate: found 50.0, expected 100.0, as every law of gusts has it"),
         (lambda task: 3, "own: found 3, expected a section"),
-        (lambda: 3, "own: found TypeError: .* takes 0 positional arguments .*, for gusts, expected a function of a task"),
         (lambda task: lambda t, y, y_m: [0.0], r"u in gusts at t = 0 s: found \[0.0\], expected 4 finite numbers: elevator"),
-        (lambda task: lambda t, y, y_m: y + np.nan, "u in gusts at t = 0 s: .* expected 4 finite numbers"),
         (lambda task: lambda t, y, y_m: 1 / 0, "u in gusts at t = 0 s: found ZeroDivisionError: division by zero"),
-        (lambda task: None, "own: found the entry has no law for osprey"),
     ],
 )
 def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Sets) -> None:
@@ -160,25 +157,13 @@ def test_entry_that_does_not_fit_refused(enter: Enter, sentence: str, brief: Set
     ("words", "sentence"),
     [
         (["no_such_module:enter"], "found 'no_such_module:enter'"),
-        (["pi", "rise"], "found pi rise, expected one law"),
         (["osprey_servo", "osprey_gust"], "expected one scenario for each airframe"),
-        (["no_such_law"], "no_such_law"),
         (["pi", "--release", "abc"], "found abc, expected the hash of a commit, 40 hex digits"),
     ],
 )
 def test_command_refuses_with_a_sentence(words: list[str], sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         CliRunner().invoke(application(["benchmark"]), ["benchmark", *words], catch_exceptions=False)
-
-
-def test_lost_aircraft_count_ten() -> None:
-    columns = {"diverged": [False, False, True], "lost": [False, True, False], "score": [1.0, 30.0, None]}
-    windows = {"score.30-60": [1.0, 8.0, None], "score.90-120": [2.0, 16.0, None]}
-    found = scores_of(pl.DataFrame(columns | windows | {"rms.q": [0.1, 0.3, None]}))
-    assert found["lost"] == 2
-    assert found["score"] == {"mean": 7.0, "worst": 10.0}
-    assert found["rms"]["q"] == pytest.approx(0.2)
-    assert found["recovery"] == pytest.approx(22.0 / 19.0)
 
 
 def test_function_flies_an_aircraft_of_jsbsim_as_its_law() -> None:

@@ -22,7 +22,6 @@ from flight_analysis.closed_loop.scenario import Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
-from flight_analysis.report.run_folder import attachments_for
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
@@ -33,19 +32,15 @@ from flight_design.identification.bridge_identification import (
     Channels,
     channel_models,
     channel_pairs,
-    cut_short,
     experiment,
     flying_scenario,
     join,
     map_text,
     measured_trims,
-    require_envelope,
     within_range,
 )
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import Response, identify_response
-from flight_log.engagements import Engagement
-from flight_log.tape_writer import write_run
 
 pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
 
@@ -170,16 +165,6 @@ def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> 
         join(MAP, refused, unusable)
 
 
-def test_a_sign_against_the_map_is_refused(identified: Identified) -> None:
-    response, models, _ = identified
-    aileron = models[2]
-    assert aileron is not None
-    flipped = [*models[:2], aileron._replace(Omega=-aileron.Omega, slow=-aileron.slow), models[3]]
-    sentence = r"inputs\.aileron: found p_dot that falls with aileron, expected the opposite: change `sign`"
-    with pytest.raises(ParameterError, match=sentence):
-        join(MAP, response, flipped)
-
-
 class Known(NamedTuple):
     """y'' + damping y' + stiffness y = Omega v', v with a lag, y late by a delay; by default a channel of first order."""
 
@@ -258,31 +243,6 @@ def test_fast_oscillation_of_light_airplane_found() -> None:
     np.testing.assert_allclose(model[2:5], [500.0, 24.0, 480.0], rtol=0.1)
 
 
-@pytest.mark.parametrize(("zero", "usable"), [(20.0, True), (41.4, False), (-1.0, False)])
-def test_model_with_a_zero_that_no_feedforward_can_fly_gives_way_to_the_step_response(zero: float, usable: bool) -> None:
-    model = ChannelModel(
-        0.03, 0.007, 214.0, 30.0, 788.0, zero * 214.0, np.zeros((6, 6)), 0.15
-    )  # q of PX4's airplane, zero 41.4
-    assert model.usable is usable
-
-
-def test_experiment_that_the_bridge_cut_short_names_the_release() -> None:
-    release = Engagement(5_000_000_000, 17_000_000_000, "theta is 0.51, outside the envelope [-0.5, 0.5]")
-    expected = "the bridge released after 12 of 52 s: theta is 0.51, outside the envelope [-0.5, 0.5]"
-    assert cut_short([release], 52.0) == expected
-    assert cut_short([release, release._replace(stop_ns=None)], 52.0) == ""
-
-
-def test_noise_far_above_response_leaves_no_model() -> None:
-    model = fit_channel(*Known().measured(noise=5.0), "q", "elevator", 1.0)
-    assert model is None or not model.usable
-
-
-def test_output_that_never_moves_has_no_model() -> None:
-    y, u = Known().measured(noise=0.0)
-    assert fit_channel(Signal(y.stamp_ns, y.names, 0.0 * y.values), u, "q", "elevator", 1.0) is None
-
-
 def thrust_with_phugoid(amplitude: float) -> Tape:
     """V by thrust in Lanchester's phugoid, behind a servo of 0.1 s, and the climb of the pose; noise as of an airspeed sensor.
 
@@ -320,21 +280,6 @@ def test_thrust_told_from_phugoid_by_climb() -> None:
     assert of_log_alone.Omega > 1.5 * 14.0, "the phugoid is large enough to matter"
 
 
-def test_speed_has_no_model_where_no_climb_measured() -> None:
-    tape, place = thrust_with_phugoid(0.2), channel_pairs(MAP)[0].outputs.index("V")
-    level = Signal(tape["pose"].stamp_ns, ("theta",), tape["pose"].values)
-    for signals in ({"pose": level}, {}):
-        blind = Tape({"y": tape["y"], "u": tape["u"], **signals})
-        assert channel_models(MAP, blind, [(0, 10**18)], SPEED)[place] is None
-
-
-def test_a_map_without_an_envelope_is_refused() -> None:
-    sentence = r"envelope: found none of phi, theta, V, expected limits of phi, theta, V: an experiment is open loop$"
-    with pytest.raises(ParameterError, match=sentence):
-        require_envelope(MAP.model_copy(update={"envelope": {}}))
-    require_envelope(MAP.model_copy(update={"envelope": dict.fromkeys(("phi", "theta", "V"), (-1.0, 1.0))}))
-
-
 def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     new, below_file = tmp_path / "found", tmp_path / "file" / "found"
@@ -349,17 +294,6 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_log_of_flight_under_feedback_is_no_experiment(tmp_path: Path) -> None:
-    scenario = find_scenario("osprey_gust", 1.0)
-    (tmp_path / "run").mkdir()
-    write_run(simulate(scenario), tmp_path / "run", attachments_for(scenario, tmp_path / "run"))
-    arguments = ["--speed", "25", "--write", str(tmp_path / "found"), "--log", str(tmp_path / "run")]
-    result = CliRunner().invoke(application([*COMMANDS]), ["identify", "--bridge", "ardupilot", *arguments])
-    assert isinstance(result.exception, ParameterError)
-    assert "law: found rise_di, expected excitation: the log of an experiment" in str(result.exception)
-    assert not (tmp_path / "found").exists()
-
-
 def test_written_map_has_trims_that_were_sent() -> None:
     row = MAP.inputs["elevator"]
     names = tuple(f"{row.message}.{row.field}" for row in MAP.inputs.values())
@@ -371,15 +305,6 @@ def test_written_map_has_trims_that_were_sent() -> None:
     written = ChannelMap.validate_mapping(yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map")
     assert written.inputs["elevator"].trim == pytest.approx(0.25 * row.scale, rel=1e-4)
     assert written.outputs == MAP.outputs
-
-
-def test_bridge_releases_stale_y_before_controller_engages_again() -> None:
-    # a controller that engages again begins the excitation again
-    rows = {name: row.model_copy(update={"max_age": 1.0}) for name, row in MAP.outputs.items()}
-    patient = MAP.model_copy(update={"outputs": rows})
-    for channel_map in (MAP, patient):
-        planned = experiment(channel_map, SPEED, 0.2, "airframe.yaml").controller
-        assert planned.max_age > max(row.max_age for row in channel_map.outputs.values())
 
 
 def test_experiment_stays_within_part_of_limits_of_map() -> None:

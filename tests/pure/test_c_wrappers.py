@@ -3,7 +3,6 @@
 """Wrappers of the exported code: the library that replays logs, a caller of a library at 250 Hz, the unit of FMI 2.0."""
 
 import importlib.util
-import math
 import shutil
 import subprocess
 import sys
@@ -16,18 +15,16 @@ import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
 
-import rise_di
 from c_export.constants import exportable
 from c_export.events import run_recording
 from c_export.library import CController, build_fmu, build_library
 from c_export.proof import FLAGS, build, write_code
-from flight_analysis.closed_loop.scenario import scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
-from flight_core.vectors import ChannelError, FloatArray, StampedVector
+from flight_core.vectors import FloatArray, StampedVector
 from flight_log.tape_reader import read_run
 from rise_di_controller.controller import Controller
 from rise_di_controller.rise_di_config import RiseDiConfig
@@ -101,29 +98,6 @@ def test_caller_at_250_hz(name: str, c_controller: Callable[[RiseDiConfig], CCon
         moved = np.maximum(moved, np.abs(u))
     assert modes >= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
     assert (moved > 0.0).all()
-
-
-def test_samples_are_refused_as_by_controller(c_controller: Callable[[RiseDiConfig], CController]) -> None:
-    config = exportable(find_scenario("osprey_servo").controller)
-    python, c = Controller(config), c_controller(config)
-    age_ns = config.guard().max_age_ns
-    for stamp_ns, expected in (
-        (0, TAKEN),
-        (0, ORDER),
-        (-1, ORDER),
-        (age_ns, TAKEN),
-        (age_ns + 1, FUTURE),
-        (10 * age_ns, FUTURE),
-    ):
-        assert c.take_y(stamp_ns, np.zeros(4), 0) == expected
-        reason = ""
-        try:
-            python.take_y(StampedVector(stamp_ns, np.zeros(4)), 0)
-        except ChannelError as error:
-            reason = error.reason
-        assert reason == {TAKEN: "", ORDER: "order", FUTURE: "future"}[expected]
-    for value in (math.nan, math.inf, -math.inf):
-        assert c.take_y(2 * age_ns, np.array([0.0, value, 0.0, 0.0]), 2 * age_ns) == NOT_FINITE
 
 
 def test_fmu_flies_to_the_bit(tmp_path: Path) -> None:
@@ -240,21 +214,6 @@ def test_clang_does_not_fly_under_flags_that_change_bits(flags: str, code: Path)
             assert started(code, compiler, flags.split()) == 1
 
 
-PX4_WARNINGS = (
-    "-Werror -Warray-bounds -Wcast-align -Wdisabled-optimization -Wdouble-promotion -Wfatal-errors -Wfloat-equal -Wformat=1 "
-    "-Winit-self -Wlogical-op -Wpointer-arith -Wshadow -Wuninitialized -Wunknown-pragmas -Wunused-variable "
-    "-Wunused-but-set-variable -Wbad-function-cast -Wstrict-prototypes -Wmissing-prototypes -Wnested-externs"
-)
-"""Of PX4: cmake/px4_add_common_flags.cmake, for all languages and for C."""
-
-
-@pytest.mark.parametrize("name", ["osprey_servo", "osprey_observer", "osprey_vtail"])
-@pytest.mark.parametrize("float32", [False, True], ids=["double", "float"])
-def test_code_has_no_warning_of_px4(name: str, float32: bool, tmp_path: Path) -> None:
-    write_code(exportable(find_scenario(name).controller), name, tmp_path, float32=float32)
-    build(["gcc", *FLAGS, *PX4_WARNINGS.split(), "-c", "rise_di.c"], tmp_path)
-
-
 def test_calls_before_the_start_are_refused(code: Path) -> None:
     """In memory of zeros, as of a static controller."""
     (code / "early.c").write_text(STARTER.replace("rise_di_start(&controller, &parameters)", "(int)parameters.sign < 0"))
@@ -283,12 +242,3 @@ def test_wrong_samples_are_lost_as_by_controller(c_controller: Callable[[RiseDiC
         assert mode == (-1 if output is None else python.mode)
         assert u.tobytes() == python.state.u.tobytes()
     assert lost > 10  # 5 spikes, 2 at each end of the jump, 1 of y_m, some of the noise
-
-
-def test_name_of_the_scenario_is_printable_in_the_code(tmp_path: Path) -> None:
-    """A name of a file may hold an escape sequence, which a terminal would obey."""
-    named = tmp_path / "a\x1b]0;title\x07\nb.yaml"
-    named.write_text(scenario_yaml(find_scenario("osprey_servo")), encoding="utf-8")
-    rise_di.export(named, tmp_path / "c", proof=False)
-    text = (tmp_path / "c" / "rise_di_parameters.h").read_text(encoding="utf-8")
-    assert r"the controller of a\x1b]0;title\x07\nb, written" in text

@@ -4,7 +4,6 @@
 
 import io
 import json
-import os
 import shlex
 import signal
 import subprocess
@@ -17,19 +16,15 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
-import dask
 import numpy as np
 import polars as pl
 import psutil
 import pytest
-from distributed import LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from polars.testing import assert_frame_equal
 from scipy.stats import spearmanr
 from tests.closed_loop import error
-from tests.other_laws import SECTIONS
 from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
@@ -43,15 +38,14 @@ from flight_analysis.report.guided import control_errors
 from flight_analysis.report.run_folder import REPORT, SUMMARY
 from flight_campaign import engines, equipment
 from flight_campaign.campaign import CHUNKS, Campaign, Definition, Sweep, define, fly_chunk, fly_chunk_figures
-from flight_campaign.campaign_report import figure_rows, overview, write_page
-from flight_campaign.influence import chance_level, rank_correlations
+from flight_campaign.campaign_report import figure_rows, overview
+from flight_campaign.influence import rank_correlations
 from flight_campaign.rows import Chunk, encode, entry_names, tally_of
 from flight_campaign.statistics import WORST_KEPT, Figure, Tally, score, score_units
 from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di import CampaignResult
-from rise_di_controller.laws import AnyLaw
 from rise_di_controller.margins import loop_margins
 
 pytestmark = [pytest.mark.package("flight_campaign"), pytest.mark.slow]
@@ -88,12 +82,6 @@ def test_quantile_is_accurate_to_width_of_bin(values: FloatArray, share: float) 
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
     assert Figure.of(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
-
-
-def test_size_of_figure_does_not_grow_with_flights() -> None:
-    rng = np.random.default_rng(1)
-    sizes = [len(Figure.of(np.exp(rng.normal(size=count))).model_dump_json()) for count in (10_000, 1_000_000)]
-    assert sizes[1] < 2 * sizes[0]  # more bins at the tails, a digit or two more a bin
 
 
 def test_worst_flights_kept_with_diverged_ones_first() -> None:
@@ -170,11 +158,8 @@ def test_aircraft_with_entries_of_its_own_flies_again_with_same_score(tmp_path: 
     [
         ({"spread": Spread({"A[q,gamma]": 0.5})}, r"entry A\[q,gamma\], expected an entry of the airframe"),
         ({"spread": Spread({"A[q,q]": 1.5})}, "expected a part of each entry"),
-        ({"spread": Spread({"lagg": 0.5})}, r"entry lagg, expected a lag or a noise above 0: .*; delay, or an entry of A or B"),
-        ({"spread": Spread({"lag[flap]": 0.5})}, r"entry lag\[flap\], expected a lag or a noise above 0: lag\[elevator\]"),
         ({"spread": Spread({"delay": 0.004})}, "delay 0.004 s, expected at least a period of the controller, 0.01 s"),
         ({"units": {"theta": 0.1}}, "expected an output of the controller"),
-        ({"units": {"V": 0.0}}, r"^score\.V: found 0, expected a unit"),
     ],
 )
 def test_unknown_entry_and_unit_refused(options: dict[str, Any], sentence: str) -> None:
@@ -193,12 +178,6 @@ MISSIONS = {
     "turbulence and wind": CORNER,
     "late and lost y": CORNER.vary(aircraft={"rate": 100.0, "sensors": {"delay": 0.02, "dropout": 0.2, "seed": 3}}),
 }
-
-
-@pytest.fixture(scope="module")
-def mission() -> Definition:
-    """Two aircraft on the first seconds of a route."""
-    return define(CORNER, 2, 0.3, 7, 2)
 
 
 @pytest.mark.parametrize("name", MISSIONS)
@@ -225,28 +204,10 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
     assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
 
 
-def test_report_of_missions_says_what_score_counts(mission: Definition, tmp_path: Path) -> None:
-    campaign = Campaign.begin(tmp_path, mission)
-    chunk = fly_chunk_figures(mission.model_dump_json(), (0, 0))
-    tally = Tally.of(chunk.first, chunk.diverged, chunk.figures)
-    case = tally.summary() | {"factor": 1.0, "fly_again": [], "influence": {"entries": []}}
-    write_page(tmp_path / "page.html", campaign.definition, [tally], [case], [None])
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "the largest cross-track error on the route in 12.5 m" in page
-    assert "max xtrack (m)" in page
-    assert "max phi (deg)" in page
-
-
 REFUSED_MISSIONS: dict[str, dict[str, Any]] = {
     r"controller.rate: found .* a period of guidance": {"controller": {"rate": 125.0}},
     r"guidance.program: found heading, expected a route alone": {
         "guidance": {"program": {"heading": {"start": [1.0], "value": [1.0]}}}
-    },
-    r"reference_model.live.bounds: found bounds, expected none": {
-        "reference_model": {"live": {"speed": 25.0, "bounds": {"p": 1.0}}}
-    },
-    r"reference_model: found a profile of commands, expected none": {
-        "reference_model": {"pulses": {"q": {"start": [1.0], "stop": [2.0], "value": [0.1]}}}
     },
 }
 
@@ -255,19 +216,6 @@ REFUSED_MISSIONS: dict[str, dict[str, Any]] = {
 def test_mission_that_fleet_cannot_fly_refused(sentence: str) -> None:
     with pytest.raises(ParameterError, match=sentence):
         define(CORNER.vary(**REFUSED_MISSIONS[sentence]), 2, 0.3, 7, 2)
-
-
-def test_score_of_missions_has_no_units() -> None:
-    with pytest.raises(ParameterError, match=r"^score: found a unit, expected none: the score of a mission"):
-        define(CORNER, 2, 0.3, 7, 2, units={"q": 0.02})
-
-
-def test_missions_need_route_and_airframe_with_matrices() -> None:
-    program = ROUTE.vary(guidance={"route": None, "program": {"heading": {"start": [1.0], "value": [1.0]}}})
-    with pytest.raises(ParameterError, match=r"guidance.route: found none, expected a route"):
-        define(program, 2, 0.3, 7, 2)
-    with pytest.raises(ParameterError, match=r"airframe: found jsbsim:c172p, expected an airframe with matrices"):
-        define(find_scenario("jsbsim_c172p_route"), 2, 0.3, 7, 2)
 
 
 @pytest.mark.parametrize(
@@ -330,14 +278,6 @@ def test_campaign_flies_effect_of_wind_that_definition_names(tmp_path: Path) -> 
         assert of[name].aircraft_scenario(3).aircraft.uncertainty.wind == wind
 
 
-def test_campaign_of_version_without_effects_of_wind_is_not_continued(tmp_path: Path) -> None:
-    old = json.loads(definition().model_dump_json())
-    del old["wind"]
-    (tmp_path / "campaign.json").write_text(json.dumps(old), encoding="utf-8")
-    with pytest.raises(ParameterError, match=r"found no campaign \(.*wind: missing, expected"):
-        Campaign.resume(tmp_path)
-
-
 def test_same_seed_gives_same_figures_in_any_order_and_engine(tmp_path: Path) -> None:
     first, second = (fly_campaign(tmp_path / name, definition()) for name in ("first", "second"))
     assert first.tally(0).model_dump_json() == second.tally(0).model_dump_json()
@@ -381,14 +321,6 @@ def test_row_of_aircraft_has_its_figures_outcome_and_drawn_entries(tmp_path: Pat
     assert np.ptp(spread, axis=0).min() > 0.0
 
 
-def test_rows_do_not_depend_on_size_of_chunks(tmp_path: Path) -> None:
-    tables = [fly_campaign(tmp_path / f"{chunk}", definition(20, chunk)).rows().collect() for chunk in (10, 20)]
-    entries = entry_names(tables[0])
-    assert tables[0].select(entries).equals(tables[1].select(entries))
-    # another size of chunk may sum in another order: rounding alone
-    assert_frame_equal(*tables, rel_tol=1e-9)
-
-
 def test_figures_of_diverged_aircraft_are_null() -> None:
     score = np.array([1.0, np.inf, 11.0])
     chunk = Chunk(4, np.array([0.0, 1.0, 0.0]), {"score": score}, {"A[q,q]": np.ones(3)})
@@ -413,40 +345,11 @@ def test_rank_correlations_are_those_of_scipy() -> None:
     assert rank_correlations(table.head(5), {}) == {}
 
 
-def test_entries_without_effect_stay_within_level_of_chance() -> None:
-    rng, names = np.random.default_rng(1), [f"A[q,{k}]" for k in range(20)]
-    exceeded = 0
-    for _ in range(300):
-        table = pl.DataFrame({"score": rng.normal(size=60), **dict(zip(names, rng.normal(size=(20, 60)), strict=True))})
-        strongest = next(iter(rank_correlations(table, dict.fromkeys(names, 1.0)).values()))
-        exceeded += abs(strongest) > chance_level(60, 20)
-    assert exceeded / 300 < 0.05 + 3.0 * np.sqrt(0.05 * 0.95 / 300)  # three standard deviations of 300 draws
-
-
 def test_sweep_flies_every_aircraft_with_each_factor(tmp_path: Path) -> None:
     campaign = fly_campaign(tmp_path / "sweep", definition(20, 20, Sweep(parameter="beta", factors=(0.05, 1.0))))
     weak, strong = (campaign.tally(case).figures["score"].mean for case in (0, 1))
     assert weak > 1.05 * strong  # beta far below the slew of the ideal control follows worse
     assert fly_campaign(tmp_path / "plain", definition(20, 20)).tally(0) == campaign.tally(1)
-
-
-@pytest.mark.parametrize(
-    ("parameter", "sentence"),
-    [
-        ("gain", "sweep: found gain, expected a parameter of the controller: k_g"),
-        ("beta[h]", r"sweep: found beta\[h\], expected beta\[CHANNEL\], CHANNEL one of q, "),
-        ("k_d[V]", r"sweep: found k_d\[V\], expected k_d\[CHANNEL\], CHANNEL one of q, p, r, el"),
-        ("k_g[V]", r"sweep: found k_g\[V\], expected k_g: it does not have a value a channel"),
-    ],
-)
-def test_sweep_of_unknown_parameter_or_channel_refused(parameter: str, sentence: str) -> None:
-    with pytest.raises(ParameterError, match=f"^{sentence}"):
-        definition(20, 20, Sweep(parameter=parameter, factors=(1.0,)))
-
-
-def test_sweep_by_zero_refused() -> None:
-    with pytest.raises(ParameterError, match=r"factors\[0\]: found 0.0, expected greater than 0"):
-        Sweep(parameter="beta", factors=(0.0,))
 
 
 @pytest.mark.parametrize(("channel", "place"), [("V", -1), ("thrust", -1), ("q", 0)])
@@ -458,13 +361,6 @@ def test_sweep_of_channel_multiplies_that_value_alone(channel: str, place: int) 
     expected[SHORT.controller.outputs.index("V") if place else 0] *= 2.0
     assert double == tuple(expected)
     assert swept.label(1) == f"beta[{channel}] x 2"
-
-
-def test_sweep_of_registered_law() -> None:
-    l1 = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["l1"], "controller"))
-    swept = define(l1, 3, 0.3, 77, 3, sweep=Sweep(parameter="bandwidth", factors=(0.5, 1.0)))
-    half, own = (swept.scenario(case).controller.model_dump()["bandwidth"] for case in range(2))
-    assert half == pytest.approx([0.5 * value for value in own])
 
 
 def test_results_have_margins_beside_score(tmp_path: Path) -> None:
@@ -482,22 +378,6 @@ def test_results_have_margins_beside_score(tmp_path: Path) -> None:
     assert found[1] is not None
     assert found[1].worst is not None
     assert found[1].worst.phase.min() == pytest.approx(min(phases), rel=1e-6)
-
-
-def test_sweep_of_law_without_that_parameter_refused() -> None:
-    pi = replace(SHORT, controller=AnyLaw.validate_mapping(SECTIONS["pi"], "controller"))
-    with pytest.raises(ParameterError, match=r"^sweep: found beta, expected a parameter .*: K, Lambda, input_scale$"):
-        define(pi, 20, 0.3, 77, 20, sweep=Sweep(parameter="beta", factors=(1.0,)))
-
-
-@pytest.mark.parametrize("text", ["beta=inf", "beta=1,nan", "beta="])
-def test_the_factors_of_a_sweep_are_finite(text: str, tmp_path: Path) -> None:
-    assert refusal("osprey_servo", "--sweep", text, "--runs", str(tmp_path)).startswith(f"--sweep: found '{text}', expected a")
-
-
-def test_an_address_without_a_port_is_refused() -> None:
-    with pytest.raises(ParameterError, match="--scheduler: found host, expected a reachable dask scheduler"):
-        next(engines.dask(1, "host")(square, [(1,)]))
 
 
 @pytest.fixture
@@ -527,18 +407,6 @@ def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, conte
     assert refusal("--resume", str(flown.folder)).startswith(
         f"{path}: found {'9' if content == made_up(np.ones(9)) else 'none'}, expected the figures"
     )
-
-
-def test_results_that_cannot_be_written_are_sentence(flown: Campaign) -> None:
-    (flown.folder / REPORT).mkdir()
-    assert refusal("--resume", str(flown.folder)).startswith(f"{flown.folder} cannot be written (Is a directory)")
-
-
-def test_printed_command_quotes_path_with_spaces(flown: Campaign) -> None:
-    folder = flown.folder.rename(flown.folder.with_name("my runs"))
-    result = CliRunner().invoke(application(["campaign"]), ["campaign", "--resume", str(folder), "--json"])
-    words = shlex.split(json.loads(result.stdout)["cases"][0]["fly_again"][0]["command"])
-    assert words == ["rise-di", "fly", str(folder / "osprey_servo_19.yaml"), "--in-process"]
 
 
 def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campaign) -> None:
@@ -577,11 +445,6 @@ def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> Non
 def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
     sentence = refusal("--resume", str(flown.folder), "--aircraft", "1000")
     assert sentence == "--aircraft: found it beside --resume, expected none: the folder of a campaign holds its definition"
-
-
-def test_a_folder_without_a_campaign_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=r"found no campaign .*, expected the folder of one"):
-        Campaign.resume(tmp_path)
 
 
 def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
@@ -635,43 +498,12 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
     assert f"continue with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + errors
 
 
-def square(job: engines.Job) -> int:
-    time.sleep(0.02)  # so that some are underway when the scheduler is lost
-    return job[0] ** 2
-
-
-def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
-    def cluster(port: int) -> LocalCluster:
-        where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": ":0"}
-        return LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **where)
-
-    with cluster(0) as first:
-        address = first.scheduler_address
-        flown = engines.dask(2, address)(square, [(k,) for k in range(20)])
-        results = [next(flown) for _ in range(3)]
-    with cluster(int(address.rsplit(":", 1)[1])):
-        results += list(flown)
-    assert sorted(results) == [((k,), k**2) for k in range(20)]
-
-
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")])
 def test_chunk_beyond_memory_is_one_sentence(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second is the text of an error of JAX."""
     monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=error))
     with pytest.raises(ParameterError, match=r"--chunk: found 20 aircraft at once, which need more memory .* expected fewer"):
         fly_chunk(definition().model_dump_json(), (0, 0))
-
-
-def test_other_error_of_a_chunk_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=RuntimeError("INTERNAL")))
-    with pytest.raises(RuntimeError, match="INTERNAL"):
-        fly_chunk(definition().model_dump_json(), (0, 0))
-
-
-def test_chunk_that_ends_workers_is_one_sentence() -> None:
-    sentence = "--engine dask: found a chunk that ended 2 workers, as one .* expected a smaller --chunk"
-    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), pytest.raises(ParameterError, match=sentence):
-        next(engines.dask(1)(lambda _: os._exit(1), [(0,)]))
 
 
 def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:

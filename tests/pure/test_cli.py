@@ -3,7 +3,6 @@
 """The command line: exit status, sentences, files."""
 
 import json
-import os
 import subprocess
 import sys
 from importlib.metadata import version
@@ -67,14 +66,6 @@ def test_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.
     assert page.index("Tracking error") < page.index("Output y over the reference y_m")
 
 
-def test_a_report_can_be_written_again(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
-    run = flown[0] / "runs" / "latest"
-    (run / "report.html").unlink()
-    shown = rise_di("report", cwd=flown[0])  # of runs/latest
-    assert shown.returncode == 0, shown.stderr
-    assert (run / "report.html").is_file()
-
-
 def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
     shown = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
     assert json.loads(shown.stdout)["duration"] == 1.0
@@ -86,12 +77,6 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
     [
         (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
         (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
-        (["fly", "--in-process", "--runs", "/proc/none"], "error: runs: /proc/none cannot be written"),
-        (
-            ["fly", "--in-process", "--lockstep"],
-            "error: --in-process: found a flight over topics, in lockstep, expected one of",
-        ),
-        (["flightgear", "--origin", "47,8", "--to", "no.invalid:5500"], "error: --to: found 'no.invalid:5500' ("),  # RFC 6761
         (["report", "nowhere"], "error: nowhere: found no such file or folder"),
     ],
 )
@@ -135,16 +120,6 @@ def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
         assert f"Usage: rise-di {name}" in shown.stdout
     listed = rise_di("--help", cwd=tmp_path).stdout
     assert all(name in listed for name in COMMANDS)
-
-
-def test_shell_completes_commands_and_options_of_command() -> None:
-    def complete(words: str, place: int) -> list[str]:
-        environment = os.environ | {"_RISE_DI_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(place)}
-        command = [sys.executable, "-m", "flight_cli.cli"]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False).stdout.split()
-
-    assert complete("rise-di re", 1) == ["report", "replay", "repair"]
-    assert "--parquet" in complete("rise-di report --", 2)
 
 
 def test_interrupt_inside_destructor_ends_command_without_traceback() -> None:

@@ -127,15 +127,6 @@ def test_units_do_not_change_d(Omega: FloatArray, data: st.DataObject) -> None:
     np.testing.assert_array_equal(signs(data.draw(units)[:, None] * Omega * data.draw(units)), D)
 
 
-@given(matrices(), st.data())
-def test_coupling_is_independent_of_inputs(Omega: FloatArray, data: st.DataObject) -> None:
-    """Neither the units nor the signs of the inputs change the coupling."""
-    decomposed(Omega)
-    assume(all(abs(minor) > 1e-6 for minor in leading_minors(Omega)))
-    units = data.draw(arrays(np.float64, len(Omega), elements=st.sampled_from([-57.3, -1.0, 0.01, 1.0, 8.0])))
-    assert coupling(Omega * units) == pytest.approx(coupling(Omega), rel=1e-6, abs=1e-9)
-
-
 @given(matrices())
 @settings(max_examples=30)  # up to 14 400 orders of five channels
 def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None:
@@ -146,22 +137,6 @@ def test_search_returns_pairing_with_identity_d_and_u(Omega: FloatArray) -> None
     rearranged = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
     np.testing.assert_array_equal(signs(rearranged), np.ones(len(Omega)))
     np.testing.assert_allclose(decompose(unit_diagonal(rearranged)).U, U, atol=1e-9 * float(np.max(np.abs(U))))
-
-
-@given(matrices())
-def test_search_changes_only_input_signs(Omega: FloatArray) -> None:
-    """An Omega with S D U keeps the order of inputs and outputs."""
-    D = decomposed(Omega).D
-    pairing = pairing_of(Omega)
-    assert pairing.outputs == pairing.inputs == tuple(range(len(Omega)))
-    assert pairing.signs == tuple(D)
-
-
-def test_a_diagonal_omega_is_its_own_s() -> None:
-    S, D, U = decompose(np.diag([2.0, -3.0]))
-    np.testing.assert_array_equal(S, np.diag([2.0, 3.0]))
-    np.testing.assert_array_equal(D, [1.0, -1.0])
-    np.testing.assert_array_equal(U, np.eye(2))
 
 
 @pytest.mark.equation(10, 11)
@@ -201,34 +176,17 @@ def test_minor_zero_by_rounding_refused(Omega: list[list[float]], minor: int, un
     assert caught.value.minor == minor
 
 
-def test_minor_that_is_small_only_in_units_accepted() -> None:
-    np.testing.assert_array_equal(signs(np.diag([1e-200, 1e200])), [1.0, 1.0])
-
-
-def test_minor_of_1e_6_has_sign() -> None:
-    """A leading minor of a millionth of its entries is not taken as zero."""
-    # Published derivatives have two to five digits: a difference in the sixth digit must be accepted.
-    np.testing.assert_array_equal(signs(np.array([[1.0, 1.0], [1.0, 1.0 - 1e-6]])), [1.0, -1.0])
-
-
 @pytest.mark.parametrize(
     ("Omega", "sentence"),
     [
         (np.ones((1, 3)), r"Omega: found shape \(1, 3\), expected as many outputs as inputs"),
-        (np.ones(3), r"Omega: found shape \(3,\), expected as many outputs as inputs"),
-        (np.ones((0, 0)), r"Omega: found shape \(0, 0\), expected as many outputs as inputs"),
         (np.array([[math.nan]]), r"Omega: found \[\[nan\]\], expected finite values"),
-        (np.array([[1.0, 0.0], [0.0, math.inf]]), r"Omega: found .*inf.*, expected finite values"),
     ],
 )
 def test_matrix_not_square_or_finite_refused(Omega: FloatArray, sentence: str) -> None:
     for function in (decompose, signs, leading_minors, unit_diagonal, coupling, search):
         with pytest.raises(DecompositionError, match=sentence):
             function(Omega)
-
-
-def test_leading_minors_may_be_zero() -> None:
-    np.testing.assert_array_equal(leading_minors(EXCHANGE), [0.0, -1.0])
 
 
 def test_osprey_has_identity_d_and_little_coupling() -> None:
@@ -241,14 +199,6 @@ def test_textbook_elevator_sign_flips_the_first_d() -> None:
     trailing_edge_down = OSPREY * np.array([-1.0, 1.0, 1.0, 1.0])
     np.testing.assert_array_equal(signs(trailing_edge_down), [-1.0, 1.0, 1.0, 1.0])
     assert pairing_of(trailing_edge_down).signs == (-1, 1, 1, 1)
-
-
-def test_rudder_paired_with_roll_flips_d() -> None:
-    """The rudder paired with the roll rate flips D and makes an entry of U large."""
-    _, D, U = decompose(SWAPPED)
-    np.testing.assert_array_equal(D, [1.0, 1.0, -1.0, 1.0])
-    # By hand, on the block [[-0.02, 1.5], [0.17, -0.09]]: W_12 = -75, L_21 = -8.5, U_12 = W_12 + L_21.
-    assert U[2, 3] == pytest.approx(-83.5, abs=1e-9)
 
 
 def test_search_keeps_bad_pairing_unless_u_limited() -> None:
@@ -286,28 +236,8 @@ def test_search_pairs_many_channels(m: int) -> None:
     assert all(np.linalg.det(ordered[:k, :k]) > 0.0 for k in range(1, m + 1))
 
 
-def test_search_of_many_channels_pivots() -> None:
-    """Twice a block whose largest responses, 2 2 2 in either order, leave a second minor of zero."""
-    Omega: FloatArray = np.kron(np.eye(2), np.array([[2.0, 2.0, 1.0], [2.0, 2.0, 0.0], [1.0, 0.0, 2.0]])).astype(np.float64)
-    outputs, inputs, input_signs, _ = pairing_of(Omega)
-    ordered = Omega[np.ix_(outputs, inputs)] * np.array(input_signs)
-    np.testing.assert_array_equal(signs(ordered), np.ones(6))
-
-
-def test_search_finds_nothing_for_a_singular_omega() -> None:
-    assert search(np.ones((6, 6))) is None
-    assert search(np.array([[1.0, 2.0], [2.0, 4.0]])) is None
-
-
 def test_coupling_without_own_response_is_infinite() -> None:
     """The coupling is infinite where an output does not respond to the paired input."""
     assert coupling(np.array([[1.0, 1.0], [1.0, 0.0]])) == math.inf
     with pytest.raises(DecompositionError, match="found Omega_22 = 0"):
         unit_diagonal(np.array([[1.0, 1.0], [1.0, 0.0]]))
-
-
-def test_uncertainty_keeps_d_of_osprey() -> None:
-    """Changes of 50 % in the entries of Omega leave D of the osprey unchanged."""
-    generator = np.random.default_rng(20101)
-    for _ in range(1000):  # also none in 5000; with 90 % 2 to 4 in 10 000
-        np.testing.assert_array_equal(signs(OSPREY * generator.uniform(0.5, 1.5, (4, 4))), np.ones(4))

@@ -74,17 +74,6 @@ def test_bias_rises_along_half_cosine_and_stays() -> None:
     assert at == pytest.approx([0.0, 0.0, 0.15 - 0.15 / math.sqrt(2), 0.15, 0.15 + 0.15 / math.sqrt(2), 0.3, 0.3], abs=1e-15)
 
 
-def test_bias_without_rise_is_step() -> None:
-    params = single(Bias, 2.0, 0.3, 0.0)
-    assert [float(bias(np.array(t), params)[0]) for t in (0.0, 2.0, 2.0 + 1e-9, 9.0)] == [0.0, 0.0, 0.3, 0.3]
-
-
-def test_a_sine_follows_its_formula() -> None:
-    params = single(Sines, 0.2, 3.0, 0.5)
-    values = [float(sines(np.array(t), params)[0]) for t in (0.0, 1.7)]
-    assert values == pytest.approx([0.2 * math.sin(0.5), 0.2 * math.sin(5.6)])
-
-
 def test_biases_and_sines_act_on_state_they_name() -> None:
     params = aircraft(
         bias={"q": {"start": 1.0, "value": 0.3, "rise": 0.0}, "V": {"start": 0.0, "value": -2.0, "rise": 1.0}},
@@ -225,16 +214,9 @@ SECTIONS: dict[str, tuple[str, Any, Any]] = {  # section, off, on
     "inertial_coupling": ("inertial_coupling", 0.0, 1.0),
     "uncertainty": ("uncertainty", {"A": 0.0, "B": 0.0, "seed": 5}, {"A": 0.0, "B": 0.1, "seed": 5}),
     "dead_zone": ("actuators", {"dead_zone": NONE}, {"dead_zone": [1e-4, 0.0, 0.0, 0.0]}),
-    "stuck_at": ("actuators", {"stuck_at": [NEVER] * 4}, {"stuck_at": [NEVER, NEVER, NEVER, 0.6]}),
-    "lost_at": ("actuators", {"lost_at": [NEVER] * 4}, {"lost_at": [0.6, NEVER, NEVER, NEVER]}),
-    "weak_at": ("actuators", {"weak_at": [NEVER] * 4}, {"weak_at": [0.6, NEVER, NEVER, NEVER]}),
-    "slow_at": ("actuators", {"slow_at": [NEVER] * 4}, {"slow_at": [0.6, NEVER, NEVER, NEVER]}),
     "loose_at": ("actuators", {"loose_at": [NEVER] * 4}, {"loose_at": [0.6, NEVER, NEVER, NEVER], "loose_play": [1e-4] * 4}),
     "drift of A and B": ("drift", {"start": NEVER, "B": 0.1}, {"start": 0.6, "duration": 0.0, "B": 0.1}),
-    "limits": ("actuators", {"lower": [-NEVER] * 4, "upper": [NEVER] * 4}, {"upper": [1e-3] * 4}),
     "sensor bias": ("sensors", {"bias": NONE}, {"bias": [0.0, 1e-3, 0.0, 0.0]}),
-    "drift": ("sensors", {"drift": NONE}, {"drift": [1e-4, 0.0, 0.0, 0.0]}),
-    "quantisation": ("sensors", {"quantisation": NONE}, {"quantisation": [1e-4, 0.0, 0.0, 0.0]}),
 }
 
 

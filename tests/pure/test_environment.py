@@ -20,7 +20,6 @@ from flight_core.parameters import ParameterError
 
 pytestmark = pytest.mark.package("flight_core")
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 BAD_INPUT = 2
 RISE_DI = [sys.executable, "-m", "flight_cli.cli"]
 STARTS = {
@@ -49,14 +48,8 @@ def test_right_environment_passes_in_a_millisecond() -> None:
     [
         ({"HOME": ""}, r"ROS_LOG_DIR: found none and no HOME, expected .* ROS_LOG_DIR=FOLDER"),
         ({"ROS_LOG_DIR": "/proc/nope"}, r"/proc/nope: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER"),
-        ({"ROS_LOG_DIR": "/dev/null"}, r"/dev/null: cannot be written \(.*\), expected .* ROS_LOG_DIR=FOLDER"),
-        ({"ROS_HOME": "/dev/null"}, r"/dev/null/log: cannot be written"),
         ({"ROS_DOMAIN_ID": "233"}, r"ROS_DOMAIN_ID: found '233', expected a number from 0 to 232"),
-        ({"ROS_DOMAIN_ID": "abc"}, r"ROS_DOMAIN_ID: found 'abc'"),
-        ({"ROS_DOMAIN_ID": "-1"}, r"ROS_DOMAIN_ID: found '-1'"),
-        ({"ROS_DOMAIN_ID": "1.5"}, r"ROS_DOMAIN_ID: found '1.5'"),
         ({"RCUTILS_LOGGING_USE_STDOUT": "5"}, r"^RCUTILS_LOGGING_USE_STDOUT: found '5', expected 0, 1, or none$"),
-        ({"RCUTILS_COLORIZED_OUTPUT": "on"}, r"^RCUTILS_COLORIZED_OUTPUT: found 'on'"),
         ({"RMW_IMPLEMENTATION": "rmw_nope"}, r"RMW_IMPLEMENTATION: found 'rmw_nope', expected one of .*rmw_fastrtps_cpp"),
     ],
 )
@@ -65,12 +58,6 @@ def test_variable_without_use_is_named(variables: dict[str, str], sentence: str,
         monkeypatch.setenv(name, value)
     with pytest.raises(ParameterError, match=sentence):
         require_ros_environment()
-
-
-@pytest.mark.parametrize("value", ["0", "232", ""])
-def test_right_domain_passes(value: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", value)
-    require_ros_environment()
 
 
 @pytest.mark.parametrize("date", ["1969-12-31T23:59:59", "2038-01-18T03:14:08", "2038-01-20T00:00:00", "2107-01-01T00:00:00"])
@@ -82,12 +69,6 @@ def test_clock_beyond_the_stamps_of_ros_is_named(date: str, monkeypatch: pytest.
         require_ros_environment()
 
 
-@pytest.mark.parametrize("date", ["1970-01-01T00:00:00", "2038-01-18T03:14:07"])
-def test_clock_within_the_stamps_of_ros_passes(date: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(time, "time", lambda: datetime.fromisoformat(f"{date}+00:00").timestamp())
-    require_ros_environment()
-
-
 def test_limit_of_open_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (12, 4096))
     with pytest.raises(ParameterError, match=r"^ulimit -n: found 12 open files, expected 128 or more: ulimit -n 1024$"):
@@ -97,12 +78,6 @@ def test_limit_of_open_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:
     require_ros_environment()
     assert not list((tmp_path / ".ros" / "log").iterdir())
-
-
-def test_absent_shared_memory_passes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A process without /dev/shm flies: the profile has UDP alone."""
-    monkeypatch.setattr(environment, "SHARED_MEMORY", tmp_path / "nowhere")
-    require_ros_environment()
 
 
 @pytest.mark.parametrize("start", STARTS)
@@ -140,21 +115,3 @@ def test_host_that_cannot_fly_is_told(options: list[str], before: str, sentence:
         assert result.returncode == BAD_INPUT, result.stderr
         assert result.stderr.startswith(sentence)
         assert result.stderr.count("\n") == 1
-
-
-def test_moved_checkout_is_made_again(tmp_path: Path) -> None:
-    """By the path in pyvenv.cfg, which venv writes."""
-    (tmp_path / "Makefile").write_bytes((REPOSITORY / "Makefile").read_bytes())
-    venv = tmp_path / ".venv"
-    venv.mkdir()
-    for name in (".uv", ".fly", ".all", ".messages", ".workspace"):
-        (venv / name).touch()
-    (tmp_path / "requirements.lock").touch()
-    os.utime(tmp_path / "requirements.lock", (0, 0))
-    for place, again in ((tmp_path, False), (tmp_path.parent / "of old", True)):
-        made_by = f"/usr/bin/python3 -m venv --clear {place}/.venv"
-        (venv / "pyvenv.cfg").write_text(f"version = 3.11.7\ncommand = {made_by}\n", encoding="utf-8")
-        for target in ("setup", "setup-all"):
-            command = [shutil.which("make") or "make", "-n", target]
-            made = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-            assert ("-m venv --clear .venv" in made and "colcon build" in made) is again

@@ -59,12 +59,6 @@ def test_radius_too_small_for_wind_refused() -> None:
     assert flyable(CORNER, 400.0, PERIOD, CAN._replace(wind=0.0))  # 40^2 / (g tan(24 deg)) = 366
 
 
-def test_stall_limits_bank_and_radius() -> None:
-    """At low speed the stall limits the bank, and the bank the radius."""
-    # V = 29: acos((27.5 / 29)^2) = 25.95 deg, below the 30 of the parameters, so 39^2 / (g tan(20.76 deg)) = 409.1.
-    assert number(refusal(CORNER, radius=300.0, speed=29.0)) == 410.0
-
-
 def test_a_period_below_the_rule_is_refused() -> None:
     sentence = refusal(CORNER, roll_rate=0.15)  # 11 * 30 deg / 0.15 = 38.40
     assert sentence == "guidance.period: found 14 s, expected at least 38.4 s at this speed, bank and roll rate"
@@ -114,14 +108,6 @@ def test_waypoint_of_short_leg_left_out_where_route_passes_near() -> None:
     assert "route[2]: found 600 m from the waypoint before" in refusal(far)
 
 
-def test_waypoint_within_last_orbit_left_out() -> None:
-    """The last point of an approach, too near to the end for a fillet: the orbit passes at a tenth of the radius."""
-    near = (Waypoint(0, 0, 300), Waypoint(9000, 0, 300), Waypoint(9000, 0.9 * RADIUS, 0))
-    cut, descent = flyable(near, RADIUS, PERIOD, CAN._replace(lowest=0.0, sink=1.0)).notes
-    assert cut.startswith(f"route[1]: corner cut, {0.1 * RADIUS:.0f} m from the waypoint")
-    assert descent.startswith("route[2]: 300 m below the waypoint before")  # the number in the list given
-
-
 def test_routes_of_tutorial_are_as_shown(tmp_path: Path) -> None:
     """The triangle of the tutorial is planned, the short route refused with the sentence on the page."""
     page = (REPOSITORY / "docs" / "fly-a-route.md").read_text(encoding="utf-8")
@@ -143,31 +129,6 @@ def test_route_file_replaces_program_of_targets() -> None:
     assert flown is not None
     assert flown.program == {}
     assert [waypoint.speed for waypoint in flown.waypoints()] == [25.0, 26.0]
-
-
-def test_too_short_routes_refused() -> None:
-    """A leg too short for the fillets is refused, and a route of one waypoint."""
-    short = (*CORNER[:2], Waypoint(3000, 700, 1000), Waypoint(-3000, 700, 1000))
-    assert refusal(short).startswith("route[2]: found 700 m from the waypoint before, expected more than ")
-    assert refusal(CORNER[:1]) == "route: found 1 waypoints, expected two or more"
-    assert refusal(()) == "route: found 0 waypoints, expected two or more"
-
-
-@pytest.mark.parametrize(
-    ("waypoints", "sentence"),
-    [
-        ((), "route: found 0 waypoints, expected two or more"),
-        ((Waypoint(math.inf, 0, 0), Waypoint(900, 0, 0)), "route[0]: found north inf, east 0, altitude 0 m, expected finite"),
-        ((Waypoint(0, 0, 0), Waypoint(0, math.nan, 0)), "route[1]: found north 0, east nan, altitude 0 m, expected finite"),
-        ((Waypoint(-1e308, 0, 0), Waypoint(1e308, 0, 0)), "route[0]: found north -1e+308, east 0, altitude 0 m, expected"),
-    ],
-)
-def test_what_any_message_may_hold_refused_as_route(waypoints: tuple[Waypoint, ...], sentence: str) -> None:
-    guidance = find_scenario("osprey_route").guidance
-    assert guidance is not None
-    with pytest.raises(ParameterError) as refused:
-        guidance.plan(waypoints)
-    assert str(refused.value).startswith(sentence)
 
 
 def test_route_of_scenario_not_checked_where_file_replaces_it(tmp_path: Path) -> None:

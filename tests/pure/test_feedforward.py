@@ -3,28 +3,22 @@
 """Feedforward: its numbers, its effect on the error, that it is off by default, and bumpless transfer."""
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from benchmarks.feedforward import both
 from tests.closed_loop import PROTOTYPE_SERVO
-from typer.testing import CliRunner
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign.campaign import define, fly_chunk_figures
-from flight_cli.cli import COMMANDS, application
 from flight_core.integrators import rk4
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.gain_selection import manoeuvre, study_airframe, with_feedforward
+from flight_design.gains.gain_selection import manoeuvre, study_airframe
 from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal, nominal_model
@@ -34,7 +28,6 @@ from rise_di_controller.params import ControllerConfig
 
 pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
 
-app = application([*COMMANDS])
 MS = 1_000_000
 SERVO = PROTOTYPE_SERVO
 BY_HAND = nominal_model(
@@ -145,13 +138,6 @@ def test_on_nominal_plant_feedforward_alone_leaves_sampling_error() -> None:
     assert largest_error(small_aircraft().model_copy(update={"feedforward": None})) > 0.5
 
 
-def test_the_feedforward_is_off_by_default() -> None:
-    for name in ("osprey_gust", "osprey_servo"):
-        controller = find_scenario(name).controller
-        assert controller.feedforward is None
-        assert controller.guard().nominal is None
-
-
 def short(**changes: Any) -> Scenario:
     """The manoeuvre and gusts of osprey_servo within 12 s."""
     pulses = {
@@ -249,12 +235,7 @@ def test_new_gains_change_neither_feedforward_nor_input() -> None:
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"states": ("a", "c", "d", "e")}, r"^controller\.feedforward\.states: found a, c, d, e, expected the output b once$"),
         ({"A": (1.0,) * 15}, r"^controller\.feedforward\.A: found 15 values, expected 16: 4 rows of 4$"),
-        ({"B": (1.0,) * 4}, r"^controller\.feedforward\.B: found 4 values, expected 8: 4 rows of 2$"),
-        ({"gravity": (1.0,)}, r"^controller\.feedforward\.gravity: found 1 values, expected 16: 4 rows of 4$"),
-        ({"lead": (0.0,)}, r"^controller\.feedforward\.lead: found 1 values, expected 2, one for each of u, v$"),
-        ({"B": (1.0, 2.0, 2.0, 4.0) + (0.0,) * 4}, r"^controller\.feedforward\.B: found a C B without a D .*leading minor 2"),
         (
             {"B": (2.0, 0.4, 0.3, 1.0) + (0.0,) * 4},
             r"^controller\.feedforward\.B: found a C B with D = \[1, 1\], expected D = \[1, -1\], that of the controller$",
@@ -274,35 +255,6 @@ def test_an_unusable_nominal_model_is_refused(change: Mapping[str, Any], sentenc
         small_aircraft(**change)
 
 
-def test_model_without_hidden_states_or_gravity_accepted() -> None:
-    square: dict[str, Any] = {"states": ("b", "a"), "A": (0.0,) * 4, "B": (0.3, -1.0, 2.0, 0.4), "gravity": None}
-    nominal = nominal_of(small_aircraft(**square))
-    assert len(feedforward.zero_dynamics(nominal)) == 0
-    assert nominal.inverse @ [[2.0, 0.4], [0.3, -1.0]] == pytest.approx(np.eye(2))
-
-
-def test_gains_command_writes_nominal_model(tmp_path: Path) -> None:
-    """The command writes the section on request only, and the section reads back."""
-    path, scenario = tmp_path / "gains.yaml", tmp_path / "short.yaml"
-    scenario.write_text(SERVO.path.read_text(encoding="utf-8").replace("duration: 60.0", "duration: 3.0"), encoding="utf-8")
-    arguments = ["gains", "osprey", "--scenario", str(scenario), "--samples", "1", "--write", str(path)]
-    assert CliRunner().invoke(app, arguments).exit_code == 0
-    assert "feedforward" not in path.read_text(encoding="utf-8")
-    assert CliRunner().invoke(app, [*arguments, "--feedforward"]).exit_code == 0
-    section = yaml.safe_load(path.read_text(encoding="utf-8"))["/**/controller"]["ros__parameters"]
-    written = AnyLaw.validate_mapping(section, "controller")
-    nominal, expected = nominal_of(written), nominal_of(with_feedforward(written, load_airframe("osprey")))
-    for actual, desired in zip(nominal, expected, strict=True):
-        if desired is not None:  # the inputs, of which all have a feedforward
-            np.testing.assert_allclose(actual, desired, rtol=1e-5, atol=1e-12)  # six digits
-    # half a period, 3 ms of transport delay, and the lags: servos of 20 ms, an engine of 0.1 s
-    assert nominal.lead.tolist() == [0.028, 0.028, 0.028, 0.108]
-    # a scenario with another order of the inputs does not match these columns
-    other = written.model_copy(update={"inputs": tuple(reversed(written.inputs)), "feedforward": None})
-    with pytest.raises(ParameterError, match=r"feedforward\.B"):
-        with_feedforward(other, load_airframe("osprey"))
-
-
 def test_feedforward_lowers_needed_beta() -> None:
     """The gain beta has to exceed only the slew of the ideal input left over by the feedforward."""
     # N_d is -D U times the slew of the ideal control less the slew of u_ff. For 20 aircraft at +-30 % in calm air the mean
@@ -312,42 +264,3 @@ def test_feedforward_lowers_needed_beta() -> None:
     whole = np.abs(study.u_dot[:, 1:]).max(axis=0)
     left = np.abs(study.u_dot[:, 1:] - study.u_dot[:, :1]).max(axis=0)
     assert (left.mean(axis=0) < 0.5 * whole.mean(axis=0)).all()
-
-
-def test_the_gains_command_refuses_feedforward_beside_check() -> None:
-    refused = CliRunner().invoke(app, ["gains", "osprey", "--check", "--feedforward"])
-    assert isinstance(refused.exception, ParameterError)
-    assert str(refused.exception).startswith("--feedforward: found it beside --check, expected one of them")
-
-
-@pytest.fixture(scope="module")
-def scores() -> dict[str, FloatArray]:
-    """Scores by set of aircraft, shape (aircraft, 2): without and with feedforward, servos and noise, the same gains."""
-    scenario = short()
-    sets: dict[str, tuple[Scenario, float, int]] = {
-        "calm": (scenario.vary(aircraft={"gusts": {}}), 0.0, 1),
-        "nominal": (scenario, 0.0, 1),
-        "+-0.3": (scenario, 0.3, 16),
-        "+-0.5": (scenario, 0.5, 16),
-    }
-
-    def of(one: Scenario, level: float, aircraft: int) -> FloatArray:
-        text = define(one, aircraft, level, 1, aircraft).model_dump_json()
-        return fly_chunk_figures(text, (0, 0)).figures["score"]
-
-    return {name: np.column_stack([of(variant, level, n) for variant in both(base)]) for name, (base, level, n) in sets.items()}
-
-
-def test_feedforward_reduces_error_of_nominal_osprey_with_servos(scores: dict[str, FloatArray]) -> None:
-    # Measured: 1.98 -> 0.22 in calm air, where noise remains, and 5.29 -> 4.52 in 12 s with two gusts, which the model does
-    # not include. The margin is half of each improvement.
-    assert scores["calm"][0, 1] < 0.55 * scores["calm"][0, 0]
-    assert scores["nominal"][0, 1] < 0.93 * scores["nominal"][0, 0]
-
-
-@pytest.mark.parametrize("level", ["+-0.3", "+-0.5"])
-def test_feedforward_reduces_error_of_uncertain_aircraft(scores: dict[str, FloatArray], level: str) -> None:
-    # Measured: all 16 scores fall, by 12 % in the mean at +-30 % and by 9 % at +-50 %. The margin is half of that.
-    without, enabled = scores[level].T
-    assert (enabled < without).all()
-    assert enabled.mean() < 0.95 * without.mean()

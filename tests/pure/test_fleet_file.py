@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
-from xml.etree import ElementTree
 
 import pytest
 from typer.testing import CliRunner
@@ -14,9 +13,7 @@ from typer.testing import CliRunner
 from flight_bringup.fleet import Fleet, Flown, read_fleet
 from flight_cli import fleet
 from flight_cli.cli import application
-from flight_core.environment import MAX_PARTICIPANTS
 from flight_core.parameters import ParameterError
-from flight_ros.transport import LOOPBACK_PROFILE
 
 pytestmark = pytest.mark.package("flight_bringup")
 
@@ -55,23 +52,6 @@ def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Pat
     assert third.scenario.guidance.route.east == (400.0, 400.0)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("aircraft: {}", "fleet.aircraft: found 0 values, expected at least 1 value"),
-        ("aircraft: {1a: {}}", "fleet.aircraft.1a: --namespace: found '1a', expected letters"),
-        ("aircraft: {a/b: {}}", "fleet.aircraft.a/b: name: found 'a/b', expected one word"),
-        ("aircraft: {a: {scenari: x}}", r"fleet.aircraft.a.scenari: unknown key, expected scenario perhaps"),
-        ("lockstep: true\naircraft: {a: {delay: 1.0}}", "fleet.aircraft.a.delay: found 1 s, expected 0 in lockstep"),
-        ("aircraft: {a: {set: {aircraft: {winds: 1}}}}", "fleet.aircraft.a: aircraft.winds: unknown key"),
-        (f"aircraft: {{{', '.join(f'a{k}: {{}}' for k in range(20))}}}", "fleet: found 101 participants .* composed: true"),
-    ],
-)
-def test_bad_fleet_is_one_sentence(text: str, sentence: str, tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match=f"^{sentence}"):
-        read_fleet(fleet_file(tmp_path, text))
-
-
 @pytest.mark.package("flight_cli")
 @pytest.mark.parametrize("node", ["/blue/controller#2", "/stray#2", "/green/stray#2"])
 def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
@@ -81,10 +61,6 @@ def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
     own, blue = "/red/controller#1", of("/blue/controller#2")
     assert fleet.foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
     assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
-
-
-def test_profile_takes_as_many_participants_as_fleet_may_have() -> None:
-    assert ElementTree.parse(LOOPBACK_PROFILE).findtext(".//{*}maxInitialPeersRange") == str(MAX_PARTICIPANTS)
 
 
 @pytest.fixture

@@ -69,11 +69,6 @@ def test_log_that_grows_in_pieces_gives_what_whole_log_holds(piece: int, recorde
     assert "rise_di_host" in [record.name for record in found if isinstance(record, Metadata)]
 
 
-def test_an_iteration_that_is_left_is_continued(recorded: Path) -> None:
-    whole, follower = list(Follower(recorded, all_of).read()), Follower(recorded, all_of)
-    assert [next(iter(follower.read())) for _ in whole] == whole
-
-
 def test_topic_thinned_to_rate_at_even_distances(recorded: Path, tape: Tape) -> None:
     follower = Follower(recorded, lambda topic, _: 100.0 if topic == "/y" else 0.0)  # y is sent at 500 Hz
     stamps, _ = vectors([record for record in follower.read() if isinstance(record, Messages)], "/y")
@@ -166,20 +161,6 @@ def test_index_that_points_outside_messages_counts_as_damage(recorded: Path, tmp
     follower = Follower(path, all_of)
     assert len(list(follower.read())) > 10
     assert (follower.complete, follower.damaged) == (True, 1)  # the rest of that chunk is left out
-
-
-def test_index_with_more_entries_than_chunk_has_messages_counts_as_damage(recorded: Path, tmp_path: Path) -> None:
-    content, place = (recorded / "run_0.mcap").read_bytes(), len(MCAP0_MAGIC)
-    while content[place] != Opcode.MESSAGE_INDEX:
-        place += RECORD.size + RECORD.unpack_from(content, place)[1]
-    start = place + RECORD.size
-    (identity, _), entry = struct.unpack_from("<HI", content, start), content[start + 6 : start + 22]
-    index = struct.pack("<HI", identity, 16 * 100_000) + entry * 100_000
-    path = tmp_path / "run_0.mcap"
-    path.write_bytes(content[:place] + RECORD.pack(Opcode.MESSAGE_INDEX, len(index)) + index)
-    follower = Follower(path, all_of)
-    assert not any(isinstance(record, Messages) for record in follower.read())
-    assert follower.damaged == 1
 
 
 @pytest.mark.parametrize("part", [0.4, 1.0])
