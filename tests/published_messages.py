@@ -15,15 +15,10 @@ import numpy as np
 PACKAGES = {
     "ardupilot_msgs": "ArduPilot/ardupilot, Tools/ros2/ardupilot_msgs, March 2026",
     "px4_msgs": "PX4/px4_msgs v1.16.2, 392e831c",
-    "mavros_msgs": "mavlink/mavros 2.14.0",
-    "rosflight_msgs": "rosflight/rosflight_ros_pkgs v2.0.1, cefdb425",
-    "rosplane_msgs": "rosflight/rosplane v2.0.0, 79702c09",
 }
 
 HEADER = "std_msgs/Header"
 MODES = ("position", "velocity", "acceleration", "attitude", "body_rate", "thrust_and_torque", "direct_actuator")
-
-STATE = ("p", "q", "r", "va", "phi", "theta", "psi", "p_n", "p_e", "p_d")
 
 PUBLISHED: dict[str, dict[str, str]] = {
     "ardupilot_msgs/msg/Airspeed": {"true_airspeed": "geometry_msgs/Vector3"},
@@ -48,15 +43,9 @@ PUBLISHED: dict[str, dict[str, str]] = {
         "source_system": "uint8",
         "from_external": "bool",
     },
-    "mavros_msgs/msg/VfrHud": {"header": HEADER, "airspeed": "float32"},
-    "mavros_msgs/msg/OverrideRCIn": {"channels": "uint16[18]"},
-    "mavros_msgs/msg/RCIn": {"channels": "uint16[]"},
-    "rosflight_msgs/msg/Command": {"header": HEADER, "mode": "uint8", "ignore": "uint16", "u": "float32[10]"},
-    "rosflight_msgs/msg/Status": {"rc_override": "uint16"},
-    "rosplane_msgs/msg/State": {"header": HEADER, **dict.fromkeys(STATE, "float32")},
 }
 
-FOREIGN_MAPS = ("px4", "mavros", "rosflight")
+FOREIGN_MAPS = ("px4",)
 """Maps that use these types."""
 
 

@@ -562,7 +562,7 @@ def serialised(message: Any) -> Any:
     [
         ("ardupilot_2024", TwistStamped(twist=Twist(angular=RATES)), {"q": 0.2, "p": 0.3, "r": 0.1}),
         ("ardupilot_2024", AIRSPEED, {"V": 2.0}),
-        ("mavros", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
+        ("odometry", Imu(angular_velocity=RATES), {"q": 0.2, "p": 0.3, "r": 0.1}),
     ],
     ids=("twist", "airspeed", "imu"),
 )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The maps of PX4, MAVROS and ROSflight with the real message packages, where these are installed.
+"""The map of PX4 with the real message package, where it is installed.
 
 None of them is on PyPI; `make messages` builds each from its sources (docs/autopilots-reference.md). Without them
 tests/pure/test_channel_map.py tests each row with the published fields.
@@ -88,8 +88,7 @@ def test_inputs_are_written_into_real_messages(name: str) -> None:
             set_field(message, field, value)
         set_field(message, row.field, to_raw(row.trim + 0.1, row.line))
         message = deserialize_message(serialize_message(message), type(message))
-        whole = name == "mavros"  # us
-        assert get_field(message, row.field) == pytest.approx(expected, abs=0.5 if whole else 1e-3), path
+        assert get_field(message, row.field) == pytest.approx(expected, abs=1e-3), path
 
 
 class Px4:

@@ -175,16 +175,6 @@ def test_pilot_override_disengages_at_once_and_blocks_engagement() -> None:
     assert bridge.engage(at(0.05)) == ""
 
 
-def test_override_of_bit_field_counts_masked_bits() -> None:
-    """ROSflight's rc_override: 0x01 to 0x20 are switches and sticks, 0x40 to 0x200 flag missing commands."""
-    bridge = new_bridge(named_map("rosflight"))
-    bridge.take_override("transmitter", float(0x40 | 0x80 | 0x100 | 0x200), at(0.0))
-    assert not bridge.refusal(at(0.0)).startswith("pilot override")
-    for bit in (0x01, 0x02, 0x04, 0x08, 0x10, 0x20):
-        bridge.take_override("transmitter", float(0x40 | bit), at(0.0))
-        assert bridge.refusal(at(0.0)) == "pilot override active: transmitter"
-
-
 def test_times_of_zero_skip_neutral_and_release_values() -> None:
     bridge = engaged_bridge(with_silence(neutral=0.0, release=0.0))
     receive_outputs(bridge, 0.3)
@@ -290,7 +280,9 @@ def test_stamps_of_autopilot_bounded_both_ways(name: str) -> None:
 
 
 def test_stamps_of_another_clock_and_samples_out_of_order_refused() -> None:
-    bridge = new_bridge(named_map("mavros"))
+    content = CHANNEL_MAP.model_dump()
+    content["outputs"]["q"]["stamp"] = "header"
+    bridge = new_bridge(ChannelMap.validate_mapping(content, "map"))
     with pytest.raises(ChannelError, match="stamp: arrival") as refused:
         bridge.take_output("q", 0.0, nanoseconds(12.0), at(0.0))  # time since boot
     assert refused.value.reason == "stamp"

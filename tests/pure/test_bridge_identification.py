@@ -284,7 +284,7 @@ def test_a_refused_experiment_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     new, below_file = tmp_path / "found", tmp_path / "file" / "found"
     for name, folder, sentence in (
-        (str(MAP_FILES["rosflight"]), new, "map rosflight: envelope: found none of"),
+        (str(MAP_FILES["ardupilot_2024"]), new, "map ardupilot_2024: envelope: found none of"),
         ("ardupilot", below_file, f"--write: {below_file} cannot be written (Not a directory)"),
     ):
         arguments = ["identify", "--bridge", name, "--speed", "25", "--write", str(folder)]

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Channel maps: each row of each map against hand-worked values, the conversion, and the refusals of invalid maps.
 
-Plain objects with the published fields (tests/published_messages.py) replace the messages, because px4_msgs, mavros_msgs,
-rosflight_msgs and rosplane_msgs may not be installed. Tests with real messages: tests/nodes/test_bridge.py and
-test_published_messages.py.
+Plain objects with the published fields (tests/published_messages.py) replace the messages, because px4_msgs may not be
+installed. Tests with real messages: tests/nodes/test_bridge.py and test_published_messages.py.
 """
 
 import json
@@ -20,7 +19,6 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 from tests.published_messages import FOREIGN_MAPS, PUBLISHED, blank, kind
 from typer.testing import CliRunner
@@ -38,7 +36,7 @@ from autopilot_bridge.channel_map import (
     version_faults,
 )
 from autopilot_bridge.map_check import check_map, definitions_below
-from autopilot_bridge.params import MOVED, BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
+from autopilot_bridge.params import BridgeConfig, ChannelMap, MeasuredRow, OverrideRow, load_map
 from flight_cli.cli import application
 from flight_core import installation
 from flight_core.parameters import ParameterError
@@ -55,27 +53,21 @@ RATES = {
     "ardupilot": Message(angular_velocity=Message(x=0.3, y=0.2, z=0.1)),
     "ardupilot_2024": Message(twist=Message(linear=Message(x=9.0, y=9.0, z=9.0), angular=FLU)),
     "ardupilot_mavlink": Message(rollspeed=0.3, pitchspeed=0.2, yawspeed=0.1),
-    "mavros": Message(angular_velocity=FLU),
     "odometry": Message(angular_velocity=FLU),
     "px4": Message(angular_velocity=FRD),
-    "rosflight": Message(p=0.3, q=0.2, r=0.1, va=27.0),
 }
 AIRSPEED = {  # 27 m/s, 2 m/s above the trim of 25 m/s
     "ardupilot": Message(true_airspeed=Message(x=-18.0, y=18.0, z=-9.0)),  # 9 (2, 2, 1), of length 27
     "ardupilot_2024": Message(vector=Message(x=-18.0, y=18.0, z=-9.0)),
     "ardupilot_mavlink": Message(airspeed=27.0),
-    "mavros": Message(airspeed=27.0),
     "odometry": Message(twist=Message(twist=Message(linear=Message(x=-18.0, y=18.0, z=-9.0)))),
     "px4": Message(true_airspeed_m_s=27.0, calibrated_airspeed_m_s=26.0),
-    "rosflight": RATES["rosflight"],
 }
 SENT = {  # elevator 0.1 rad nose up, thrust 10 % above half, aileron 0.1 rad to the right, rudder 0.1 rad to the right
     "ardupilot": {"axes[1]": 0.1 / 0.523599, "axes[2]": 0.2, "axes[0]": 0.1 / 0.523599, "axes[3]": 0.1 / 0.523599},
     "px4": {"torque.xyz[1]": 0.1 / 0.523599, "thrust.xyz[0]": 0.6, "torque.xyz[0]": 0.1 / 0.523599, "torque.xyz[2]": 0.190986},
     "ardupilot_mavlink": {"chan2_raw": 1595.493, "chan3_raw": 1600.0, "chan1_raw": 1595.493, "chan4_raw": 1595.493},
-    "mavros": {"channels[1]": 1595.493, "channels[2]": 1600.0, "channels[0]": 1595.493, "channels[3]": 1595.493},
     "odometry": {"elevator.data": 0.1, "thrust.data": 12.0, "aileron.data": 0.1, "rudder.data": 0.1},  # 12 of 20 N
-    "rosflight": {"u[4]": -0.1 / 0.523599, "u[0]": 0.6, "u[3]": 0.1 / 0.523599, "u[5]": -0.1 / 0.523599},
 }
 SENT["ardupilot_2024"] = SENT["ardupilot"]
 
@@ -102,7 +94,6 @@ def test_each_field_of_map_published_and_accepts_values_of_map(name: str) -> Non
     channel_map = named_map(name)
     foreign = {key: kind_ for key, _, kind_ in channel_map.used_topics() if kind_ in PUBLISHED}
     messages = {key: blank(kind_) for key, kind_ in foreign.items()}
-    assert {kind_.split("/")[0] for kind_ in foreign.values()} <= {"px4_msgs", "mavros_msgs", "rosflight_msgs", "rosplane_msgs"}
     for key, row in channel_map.messages.items():
         message = messages[f"messages.{key}"]
         for path, value in row.values.items():
@@ -270,7 +261,7 @@ TURN_NED_ENU = Rotation.from_matrix([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0
 TURN_FLU_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 
-@pytest.mark.parametrize("name", ["ardupilot", "mavros", "odometry", "px4"])
+@pytest.mark.parametrize("name", ["ardupilot", "odometry", "px4"])
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
 def test_attitude_of_map_is_that_of_body_frd_in_ned(name: str, phi: float, theta: float, psi: float) -> None:
     """Checked by SciPy's rotations. PX4 publishes body FRD in NED, the others body FLU in ENU (REP 103)."""
@@ -295,19 +286,15 @@ POSES = {  # 40 m north and 30 m east of the origin, 20 m above it; 4 m/s north,
     ),
     "px4": Message(position=[40.0, 30.0, -20.0], velocity=[4.0, 3.0, -2.0]),
 }
-POSES["mavros"] = POSES["ardupilot"]
-POSES["rosflight"] = Message(p_n=40.0, p_e=30.0, p_d=-20.0)
 
 
 @pytest.mark.parametrize("name", POSES)
 def test_position_and_velocity_are_north_east_and_up(name: str) -> None:
     rows = named_map(name).pose
     expected = {"north": 40.0, "east": 30.0, "altitude": 20.0, "v_north": 4.0, "v_east": 3.0, "climb": 2.0}
-    missing = {"v_north", "v_east", "climb"} if name == "rosflight" else set()  # it publishes the velocity in body axes
-    assert expected.keys() - rows.keys() == missing
-    for channel in expected.keys() - missing:
+    for channel, value in expected.items():
         row = rows[channel]
-        assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == expected[channel]
+        assert to_channel(read_raw(POSES[name], row.field, row.function), row.line) == value
 
 
 @given(phi=ANGLE, theta=st.floats(-1.5, 1.5), psi=ANGLE)
@@ -414,15 +401,6 @@ def test_bad_map_is_one_sentence_that_names_row(place: tuple[str, ...], value: o
     with pytest.raises(ParameterError, match=sentence) as refused:
         ChannelMap.validate_mapping(content, "map test")
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("name", MOVED)
-def test_moved_map_named_with_file(name: str) -> None:
-    with pytest.raises(ParameterError) as refused:
-        BridgeConfig.validate_mapping({"map": name}, "bridge")
-    moved = f"examples/maps/{name}.yaml"
-    assert str(refused.value) == f"bridge.map: found {name!r}, expected the path of its file, in the repository {moved}"
-    assert MAP_FILES[name] == REPOSITORY / moved
 
 
 def test_a_missing_map_is_one_sentence() -> None:

@@ -17,7 +17,6 @@ from flight_core.files import find_file, names_in, read_yaml
 from flight_core.parameters import Config, Name, NodeConfig, NonNegative, Number, Numbers, Positive, require
 
 LIBRARY = Path(str(files("autopilot_bridge"))) / "maps"
-MOVED = ("ardupilot_2024", "mavros", "rosflight")  # to examples/maps: these maps have not flown
 
 MAVLINK = "mavlink"  # the package of the types of MAVLink messages, and the begin of their topics
 
@@ -464,7 +463,6 @@ def maps() -> list[str]:
 
 def find_map(name: str) -> Path:
     """The file of a channel map, by its name in the library or by its path, which ends in .yaml. Raises ParameterError."""
-    require(name not in MOVED, "map", f"{name!r}", f"the path of its file, in the repository examples/maps/{name}.yaml")
     return find_file(name, LIBRARY, "map", "a channel map").absolute()
 
 
