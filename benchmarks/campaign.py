@@ -15,12 +15,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import psutil
 import typer
-from benchmarks.sampling import new_table, true_error_of
+from benchmarks.tables import new_table
 from rich.console import Console
 
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import true_error
 from flight_campaign import engines
 from flight_campaign.campaign import Campaign, define, fly_chunk_figures
 from flight_core.vectors import FloatArray
@@ -58,7 +59,8 @@ def alone(scenario: Scenario) -> tuple[float, FloatArray]:
     begin = time.perf_counter()
     tape = simulate(scenario)
     took = time.perf_counter() - begin
-    error = true_error_of(tape)
+    error = true_error(tape)
+    assert error is not None  # noqa: S101 - a simulated flight has the truth
     ticks = error.stamp_ns % round(1e9 / scenario.controller.rate) == 0
     rms = np.array([np.sqrt(np.mean(error[name][ticks] ** 2)) for name in scenario.controller.outputs])
     return scenario.flight.duration / took, rms

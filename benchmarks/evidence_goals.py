@@ -22,7 +22,6 @@ COMMANDS = {
     "campaign": "python -m benchmarks.campaign --json FILE",
     "campaign-fleet": f"{CAMPAIGN} osprey_servo --aircraft 10000",
     "campaign-missions": f"{CAMPAIGN} osprey_route --aircraft 5000",
-    "cluster": "python -m benchmarks.cluster --json FILE",
     "compare": COMPARE,
     "compare-self_tuner": f"{COMPARE} --laws self_tuner",
     "margins": "python -m benchmarks.margins --json FILE",
@@ -62,7 +61,6 @@ GOALS = {
     "long-jsbsim": LOGGED | COUNTED,
     "long-real-time": LOGGED | {"excluding host delays.*": "<= 0"},
     "campaign": {"flown": ">= 150000", "memory_growth": "<= 1.1", "integration: .*": "<= 0.01", "on a GPU": "<= 10"},
-    "cluster": {"differing": "<= 0"},
     "effectors": {"beyond": "<= 0"},
     "view": {
         "live: processor": "<= 0.03",

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from benchmarks.sampling import new_table
+from benchmarks.tables import new_table
 from rich.console import Console
 from rich.table import Table
 

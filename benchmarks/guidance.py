@@ -3,7 +3,6 @@
 """Acceptance of guidance: holds, a rectangle and an orbit, by rule alone, in calm air and in turbulence of 1.5 m/s.
 
     .venv/bin/python -m benchmarks.guidance [--only osprey_servo c172p] [--manoeuvres heading orbit] [--seeds 5]
-    .venv/bin/python -m benchmarks.guidance --grid [--only c172p 737 f16]    # off the design point
     .venv/bin/python -m benchmarks.guidance --route    # another route, on aircraft that guidance was not built with
 
 The figures go to docs/evidence/guidance-*.csv, and docs/evidence.md is written from them. Flights in one process. Each row is
@@ -17,7 +16,6 @@ import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import cache, partial
 from itertools import groupby
 from pathlib import Path
@@ -27,15 +25,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from benchmarks import evidence
 from benchmarks.evidence import row, split
-from benchmarks.guidance_grid import GRIDS, Point, places, point
-from benchmarks.sampling import new_table
+from benchmarks.tables import new_table
 from rich.console import Console
 
 from aircraft_sim.pose import wrapped
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import tracking_error
 from flight_core.channels import POSE
 from flight_core.outcome import COMPLETED
 from flight_core.rates import seconds
@@ -49,7 +45,6 @@ from flight_guidance.params import GuidanceConfig
 from flight_guidance.protection import FLOOR
 
 SIGMA = 1.5  # m/s, of the turbulence
-RATES = ("q", "p", "r")
 START = 5.0  # s, of the command
 BANK, TURN, CLIMB, FASTER = math.radians(20.0), math.pi / 2.0, 100.0, 0.1  # rad, rad, m, of V0
 WIND = 0.2  # of V0
@@ -410,27 +405,6 @@ def turbulence(scenario: Scenario, seed: int) -> dict[str, Any]:
     return low | {"seed": seed}
 
 
-def rate_ratios(name: str, seed: int | None) -> dict[str, float]:
-    """The rms of e of q, p and r under guidance over that of the same scenario without guidance.
-
-    In calm air in a turn of 90 deg, over the commands of the scenario's own; in turbulence in straight flight, over straight
-    flight without commands.
-    """
-    guided = aircraft_of(name)
-    if guided.guidance is None:
-        raise ValueError(f"{guided.name} has no guidance")
-    section, duration = MANOEUVRES["heading"].plan(guided.guidance)
-    aircraft: dict[str, Any] = {"gusts": {}, "turbulence": None if seed is None else turbulence(guided, seed)}
-    flight = {"duration": duration}
-    if seed is None:
-        pair = guided.vary(flight=flight, guidance=section), original_of(name).vary(aircraft=aircraft)
-    else:
-        straight = guided.vary(flight=flight, aircraft=aircraft)
-        pair = straight, replace(straight, guidance=None)
-    errors = [tracking_error(simulate(varied)) for varied in pair]
-    return {rate: rms(errors[0][rate]) / rms(errors[1][rate]) for rate in RATES}
-
-
 def trim_pitch(scenario: Scenario) -> float:
     """Pitch in trim, rad."""
     return float(simulate(scenario.vary(flight={"duration": 0.1}))["guidance"]["pose.theta"][0])
@@ -438,8 +412,6 @@ def trim_pitch(scenario: Scenario) -> float:
 
 EXEMPT = {("f16", "heading", "altitude (m)"): 40.0, ("f16", "orbit", "rms (s)"): 0.05}
 """Limits of an aircraft whose rudder is at its stop in turns: its own yaw damper feeds r back without a washout."""
-AT_STOP = ("f16", "r")
-"""Its rudder is at the stop in turns, so that r misses its limit."""
 LATE = 5.0
 """Limit of the bank beyond its limit with a poor pose, deg. A pose 0.4 s old costs 8 deg at p_max where nothing predicts."""
 
@@ -496,12 +468,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=AIRCRAFT, default=AIRCRAFT, help="aircraft")
     parser.add_argument("--manoeuvres", nargs="*", choices=[*MANOEUVRES], default=[*MANOEUVRES], help="manoeuvres; not stored")
     parser.add_argument("--seeds", type=int, default=5, help="of the turbulence")
-    parser.add_argument("--grid", action="store_true", help="the flights off the design point, in place of the manoeuvres")
-    parser.add_argument("--rates", action="store_true", help="errors of the rates with and without guidance, instead")
     parser.add_argument("--route", action="store_true", help=f"another route, on {', '.join(OTHERS)}, instead")
     options = parser.parse_args()
-    if options.rates:
-        sys.exit(compare_rates(options.only, options.seeds) > 0)
     if options.route:
         begun = origin(f"--route --seeds {options.seeds}")
         flown = [kept for name in OTHERS for kept in fly_manoeuvres(name, OTHER_ROUTE, options.seeds)]
@@ -509,9 +477,6 @@ def main() -> None:
         sys.exit(any(kept.figure.missed for kept in flown))
     failed = 0
     for name in options.only:
-        if options.grid:
-            failed += fly_grid(name) if name in GRIDS else 0
-            continue
         begun = origin(f"--only {name} --seeds {options.seeds}")
         flown = fly_manoeuvres(name, {title: MANOEUVRES[title] for title in options.manoeuvres}, options.seeds)
         if len(options.manoeuvres) == len(MANOEUVRES):
@@ -551,40 +516,6 @@ def fly_manoeuvres(name: str, manoeuvres: Mapping[str, Manoeuvre], seeds: int) -
             kept.append(flown)
     Console().print(table)
     return kept
-
-
-def compare_rates(names: Sequence[str], seeds: int) -> int:
-    """The ratios of `rate_ratios`, the worst over the seeds, stored. Returns how many are beyond their limit."""
-    compared: list[tuple[str, str, str, float, float]] = []
-    begun = origin(f"--rates --only {' '.join(names)} --seeds {seeds}")
-    for name in names:
-        for air, numbers, limit in (("calm", [None], 1.5), (f"turbulence, {seeds} seeds", range(1, seeds + 1), 1.2)):
-            ratios = [rate_ratios(name, seed) for seed in numbers]
-            compared += [(name, air, rate, max(ratio[rate] for ratio in ratios), limit) for rate in RATES]
-            print(*compared[-len(RATES) :], sep="\t", file=sys.stderr, flush=True)
-    store("rates", (row(f"{name}, {air}: {rate}", ratio, at_most=limit) for name, air, rate, ratio, limit in compared), begun)
-    return sum(ratio > limit for name, _, rate, ratio, limit in compared if (name, rate) != AT_STOP)
-
-
-def fly_grid(name: str) -> int:
-    """Fly the grid of an aircraft, a core for each flight at a time, and store it. Returns how many points are lost."""
-    scenario, begun = aircraft_of(name), origin(f"--grid --only {name}")
-    with ProcessPoolExecutor() as pool:
-        flown = list(pool.map(partial(point, name, scenario), places(name)))
-    for place in flown:
-        print(*place, sep="\t", file=sys.stderr)
-    store(f"grid-{name}", grid_rows(flown), begun)
-    return sum(place.result == "lost" for place in flown)
-
-
-def grid_rows(points: Sequence[Point]) -> Iterator[evidence.Row]:
-    """The rows of evidence of the points of a grid."""
-    results = [flown.result for flown in points]
-    yield row("points flown", results.count("ok"))
-    yield row("points lost", results.count("lost"), at_most=0)
-    for flown in points:
-        reason = f": {flown.reason}" if flown.result == "lost" else ""
-        yield row(f"altitude {flown.altitude:g} m, airspeed {flown.speed:g} m/s", flown.result + reason)
 
 
 if __name__ == "__main__":

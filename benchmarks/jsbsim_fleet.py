@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/evidence/tables.
+"""Identify and fly aircraft of JSBSim by the procedure of `rise-di identify`, and print the tables of docs/experiments.md.
 
 .venv/bin/python -m benchmarks.jsbsim_fleet               the aircraft of FLEET, some ten seconds each
 .venv/bin/python -m benchmarks.jsbsim_fleet f16 c172p     the named aircraft
-.venv/bin/python -m benchmarks.jsbsim_fleet --all         every aircraft of JSBSim, with the reason where one does not fly
-.venv/bin/python -m benchmarks.jsbsim_fleet --learn       the table learning-jsbsim, of LEARNERS, a minute each
+.venv/bin/python -m benchmarks.jsbsim_fleet --learn       the table of docs/learning.md, of LEARNERS, a minute each
 """
 
 import sys
@@ -13,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, aircraft_names
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
 from flight_core.outcome import COMPLETED, FlightEnded
@@ -42,16 +41,6 @@ FLEET = {
 }
 """Light and utility aircraft, trainers, fighters, business jet, airliners: a usual true airspeed, kt, and altitude, ft."""
 
-OTHERS = {
-    "787-8": (350, 25000), "A320": (300, 20000), "B17": (130, 5000), "Boeing314": (120, 5000),
-    "C130": (200, 10000), "Camel": (80, 2000), "Concorde": (350, 20000), "F4N": (350, 15000),
-    "L410": (150, 8000), "MD11": (350, 25000), "OV10": (160, 6000), "Short_S23": (120, 4000),
-    "Submarine_Scout": (30, 1000), "X15": (600, 40000), "XB-70": (450, 15000), "ZLT-NT": (30, 1500),
-    "c172r": (90, 4000), "c182": (110, 4000), "c310": (150, 6000), "f104": (350, 15000), "f15": (350, 15000),
-    "f22": (350, 15000), "fokker100": (280, 15000), "fokker50": (200, 10000), "p51d": (200, 8000),
-    "pc7": (150, 6000), "pogo-jsbsim": (120, 3000), "t6texan2": (180, 8000), "wrightFlyer1903": (30, 50),
-    "x24b": (250, 20000),
-}
 # fmt: on
 DEFAULT = (100, 3000)
 LEARNERS = (*FLEET, "c182", "pc7", "t6texan2", "OV10")  # the last four had no part in the factors of the sketch
@@ -66,11 +55,11 @@ def main() -> None:
     if arguments[:1] == ["--learn"]:
         _learn(arguments[1:] or list(LEARNERS))
         return
-    names = list(aircraft_names()) if arguments == ["--all"] else arguments or list(FLEET)
+    names = arguments or list(FLEET)
     rows, reasons = [], []
     for number, name in enumerate(names, 1):
         print(f"{number} of {len(names)}: {name}", file=sys.stderr)
-        speed, altitude = (FLEET | OTHERS).get(name, DEFAULT)
+        speed, altitude = FLEET.get(name, DEFAULT)
         condition = f"{speed} kt, {altitude} ft"
         try:
             aircraft = identify(name, speed * KNOT, altitude * FOOT)
@@ -93,7 +82,7 @@ def _learn(names: list[str]) -> None:
     print("| aircraft | the gains alone | extended-state observer | learner | first model | parts that learned |")
     print("|---|---|---|---|---|---|", flush=True)
     for name in names:
-        speed, altitude = (FLEET | OTHERS).get(name, DEFAULT)
+        speed, altitude = FLEET.get(name, DEFAULT)
         condition = f"{name}, {speed} kt, {altitude} ft"
         try:
             aircraft = identify(name, speed * KNOT, altitude * FOOT, observer_margin=MARGIN, learns=True)

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time of one tick: the law, the law with anti-windup and the whole tick, relative to a NumPy multiply-add of the same size.
 
-python -m benchmarks.law
+python -m benchmarks.speed --only law
 """
 
 import gc
@@ -10,8 +10,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from benchmarks.sampling import new_table
-from rich.console import Console
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.vectors import StampedVector
@@ -79,18 +77,3 @@ def measure_observer() -> tuple[float, float, float]:
         return guard.tick(engaged, stamp_ns, StampedVector(stamp_ns, y[k]), references, limits, tuned)
 
     return percentiles(tick)
-
-
-def main() -> None:
-    """Measure and print."""
-    measured = measure() | {"guard.tick of osprey_observer": measure_observer()}
-    floor = measured[FLOOR][0]
-    title = f"One tick of four channels, {REPEATS} times, us"
-    table = new_table(title, ("", "median", "99.9 %", "max", "median / floor"), texts=1)
-    for name, (median, high, most) in measured.items():
-        table.add_row(name, f"{median:.1f}", f"{high:.1f}", f"{most:.0f}", f"{median / floor:.1f}")
-    Console().print(table)
-
-
-if __name__ == "__main__":
-    main()

@@ -5,20 +5,17 @@
 python -m benchmarks.learning                                     # every cell, 50 aircraft: at most 90 min on two idle cores
 python -m benchmarks.learning --aircraft 6                        # with fewer; run again, it flies what is missing
 python -m benchmarks.learning --aircraft 20 --cell "rough prior"  # of one cell
-python -m benchmarks.learning --aircraft 20 --lockstep 2          # two of each cell also over topics in lockstep
 
 An aircraft learns for 64 s of osprey_learn. The model that flies then is frozen and flies the commands and the two gusts of
 osprey_observer, as the others do, and as the laws of `rise-di compare` do with their gains for the airframe file. A row an
 aircraft goes to build/learning.csv. The figures of the cells that were flown whole go to docs/evidence/learning.csv, and where
 the airs of both uncertainties were, the picture goes to docs/images/learning.png. An aircraft takes 2 to 3 min of a core over
-all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each. With --lockstep
-the other flights that learn are flown again over topics, recorded, and compared with those in one process to the byte.
+all cells. For false alarms at most two aircraft fly 600 s without damage in each air, 2 min of a core each.
 """
 
 import csv
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -46,9 +43,8 @@ from flight_analysis.closed_loop.learning_loop import Learn, Learner, LearnerRes
 from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario, written
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_bringup.fly import fly_over_topics
 from flight_campaign import batch, tuning
 from flight_campaign.batch import Fleet
 from flight_campaign.learning_flights import learned
@@ -60,7 +56,6 @@ from flight_core.vectors import FloatArray
 from flight_design.gains.gain_design import observed
 from flight_design.gains.tuned_gains import load, tuned_file
 from flight_design.learning.scenario_learner import learner
-from flight_log.tape_reader import read_run
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.proposals import Event
@@ -81,7 +76,6 @@ ALARM_FLIGHT = 600.0  # s
 COLOURS = {"alone": "#888888", "file": "#d08020", "learner": "#2060b0", "true": "#208050"}
 LABELS = {"alone": "the law alone", "file": "model of the file", "learner": "learner", "true": "true model"}
 PALETTE = 32  # colours of the picture
-DOMAINS = 100  # domains 1 to 100: below the ephemeral ports on every system
 RIVALS, OBJECTIVE = ("rise", "pi", "l1", "indi", "mrac", "self_tuner", "lqg", "rise_observer"), "gust_turbulence"
 """Laws of the catalogue with the gains that ship, of a search with this cost on the airframe file in the loop of osprey_servo.
 MRAC measures the full state, and INDI the actuators too."""
@@ -147,7 +141,6 @@ class Row(NamedTuple):
     update: float = 0.0  # s of a core, mean: identification, test for a change and design
     longest: float = 0.0  # s of a core, the same
     replayed: int = 0
-    lockstep: float = math.nan  # 1: equal to the byte in lockstep; NaN where not flown
     windows: str = ""  # JSON: the scores over WINDOWS of each, after half of elevator and aileron was lost
     events: str = ""
     revision: str = ""  # of the code that flew
@@ -240,8 +233,8 @@ class Learned(NamedTuple):
     row: Row
 
 
-def fly(name: str, number: int, chosen: Scenario, *, lockstep: bool) -> Learned:
-    """Fly a scenario that learns, and again in `lockstep`."""
+def fly(name: str, number: int, chosen: Scenario) -> Learned:
+    """Fly a scenario that learns."""
     make, events, timed = learner(chosen), list[Event](), list[Timed]()
     assert make is not None  # noqa: S101 - for the type checker
 
@@ -269,26 +262,9 @@ def fly(name: str, number: int, chosen: Scenario, *, lockstep: bool) -> Learned:
         update=float(np.mean(timed[0].steps)),
         longest=max(timed[0].steps),
         replayed=int(replay(tape).equal()),
-        lockstep=float(equals_in_lockstep(tape, chosen)) if lockstep else math.nan,
         events=" | ".join(f"{event.stamp_ns / 1e9:g} s: {event.sentence}" for event in events),
     )
     return Learned(tape, controller.model_copy(update={"learn": None}), summary)
-
-
-def equals_in_lockstep(tape: Tape, chosen: Scenario) -> bool:
-    """Whether a flight over topics in lockstep records the same samples to the byte, and replays to the bit."""
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % DOMAINS)  # the processes of the benchmark fly side by side
-    with TemporaryDirectory() as folder:
-        run = Path(folder, "run")
-        outcome = fly_over_topics(written(chosen, Path(folder, "flown.yaml")), run, lambda *_: None, lockstep=True)
-        recorded = read_run(run).tape
-        same = (
-            name in recorded
-            and signal.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes()
-            and signal.values.tobytes() == recorded[name].values.tobytes()
-            for name, signal in tape.signals.items()
-        )
-        return outcome == COMPLETED and all(same) and replay(run).equal()
 
 
 def start_of(chosen: Scenario) -> RiseDiConfig:
@@ -316,7 +292,7 @@ def frozen(controller: RiseDiConfig | None, flight: Scenario, aircraft: Airframe
     return score(simulate(flight.vary(controller=controller))), is_unstable(controller, aircraft)
 
 
-def learn(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
+def learn(name: str, cell: Cell, number: int) -> Row:
     """A learner beside what does not learn."""
     with TemporaryDirectory() as folder:
         chosen = learning(cell, number, LEARNED)
@@ -329,7 +305,7 @@ def learn(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
             Path(folder, "prior.yaml").write_text(as_yaml(load_airframe("osprey")), encoding="utf-8")
             Path(folder, "coupled.yaml").write_text(as_yaml(coupled(number)), encoding="utf-8")
             chosen = with_prior(learning(cell, number, LEARNED, airframe=str(Path(folder, "coupled.yaml"))), folder)
-        flown = fly(name, number, chosen, lockstep=lockstep)
+        flown = fly(name, number, chosen)
         flight, aircraft, start = evaluation(chosen), chosen.aircraft.sampled_airframe(), start_of(chosen)
         if cell.kind == "rough":
             others = others | {"file": frozen(designed(start, chosen, prior), flight, aircraft)}
@@ -374,7 +350,7 @@ def coupled(number: int) -> Airframe:
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
-def damage(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
+def damage(name: str, cell: Cell, number: int) -> Row:
     """A learner beside the others when elevator and aileron lose half of their effect, or one surface all of it."""
     inputs = tuple(load_airframe("osprey").inputs)
     surfaces = [key for key in inputs if key != "thrust"]
@@ -384,7 +360,7 @@ def damage(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
     actuators = find_scenario("osprey_learn").aircraft.actuators.model_dump()
     actuators[key] = [DAMAGED if channel in hit else math.inf for channel in inputs]
     chosen = learning(cell, number, END, actuators=actuators)
-    flown, start = fly(name, number, chosen, lockstep=lockstep), start_of(chosen)
+    flown, start = fly(name, number, chosen), start_of(chosen)
     aircraft = chosen.aircraft.sampled_airframe()
     B = aircraft.matrix_b() * np.array([WEAK if channel in hit else 1.0 for channel in inputs])
     damaged = aircraft.with_matrices(aircraft.matrix_a(), B, np.ones((len(B), len(aircraft.gusts))))
@@ -411,10 +387,9 @@ def over_windows(tapes: dict[str, Tape], chosen: Scenario, aircraft: Airframe) -
     return found
 
 
-def alarms(name: str, cell: Cell, number: int, *, lockstep: bool) -> Row:
-    """A learner in a long flight without any damage, in one process alone: the other cells fly what it has in lockstep."""
-    del lockstep
-    return fly(name, number, learning(cell, number, ALARM_FLIGHT), lockstep=False).row
+def alarms(name: str, cell: Cell, number: int) -> Row:
+    """A learner in a long flight without any damage."""
+    return fly(name, number, learning(cell, number, ALARM_FLIGHT)).row
 
 
 FLIGHTS = {"learn": learn, "rough": learn, "coupled": learn, "late": learn, "weak": damage, "dead": damage, "alarm": alarms}
@@ -425,9 +400,9 @@ def count(name: str, aircraft: int) -> int:
     return min(math.ceil(CELLS[name].share * aircraft), CELLS[name].most)
 
 
-def flown_rows(names: Sequence[str], number: int, lockstep: int) -> list[Row]:
+def flown_rows(names: Sequence[str], number: int) -> list[Row]:
     """The rows of an aircraft in some cells."""
-    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number, lockstep=number < lockstep) for name in names]
+    return [FLIGHTS[CELLS[name].kind](name, CELLS[name], number) for name in names]
 
 
 def code() -> list[str]:
@@ -469,9 +444,6 @@ def figures(rows: Sequence[Row]) -> Iterator[evidence.Row]:
         if chosen:
             yield row(f"{name}: aircraft", float(len(chosen)))
             yield row(f"{name}: replay equal", float(np.mean([each.replayed for each in chosen])), at_least=1.0)
-            if known := [each.lockstep for each in chosen if not math.isnan(each.lockstep)]:
-                yield row(f"{name}: flights in lockstep", float(len(known)))
-                yield row(f"{name}: lockstep equal to the byte", float(np.mean(known)), at_least=1.0)
             yield row(f"{name}: update, mean", float(np.mean([each.update for each in chosen])), "s", at_most=UPDATE)
             yield row(f"{name}: update, longest", max(each.longest for each in chosen), "s")
             yield from CELL_FIGURES[cell.kind](name, cell, chosen)
@@ -641,7 +613,6 @@ def plot(rows: Sequence[Row]) -> Figure:
 def main(
     aircraft: Annotated[int, typer.Option(min=1, help="Aircraft of a cell; some have a part of it.")] = 50,
     cell: Annotated[list[str], typer.Option(help="Cells; all where absent.")] = list(CELLS),  # noqa: B006 - typer copies it
-    lockstep: Annotated[int, typer.Option(min=0, help="Aircraft of a cell that also fly in lockstep over topics.")] = 0,
     results: Annotated[Path, typer.Option(help="File of results, a row an aircraft.")] = REPOSITORY / "build" / "learning.csv",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
 ) -> None:
@@ -655,12 +626,7 @@ def main(
     begun = evidence.origin(f"python -m benchmarks.learning --aircraft {aircraft}")
     flown_by = evidence.revision(*code())
     rows = [each for each in read(results) if each.revision == flown_by and not flown_by.endswith(evidence.DIRTY)]
-    known = {
-        (each.cell, each.number)
-        for each in rows
-        if each.number >= lockstep or CELLS[each.cell].kind == "alarm" or not math.isnan(each.lockstep)
-    }
-    rows = [each for each in rows if (each.cell, each.number) in known]
+    known = {(each.cell, each.number) for each in rows}
     # aircraft by aircraft, so that a run that ends early has some of each cell
     cases: dict[tuple[int, float, str], list[str]] = {}
     for n in range(aircraft):
@@ -670,7 +636,7 @@ def main(
                 shared = "" if CELLS[name].kind == "learn" else name
                 cases.setdefault((n, CELLS[name].uncertainty, shared), []).append(name)
     with ProcessPoolExecutor(jobs) as pool:
-        pending = [pool.submit(flown_rows, names, n, lockstep) for (n, _, _), names in cases.items()]
+        pending = [pool.submit(flown_rows, names, n) for (n, _, _), names in cases.items()]
         for future in track(as_completed(pending), "aircraft", total=len(pending)):
             rows += [each._replace(revision=flown_by) for each in future.result()]
             write(results, rows)

@@ -9,12 +9,10 @@ The scenario osprey_gust with aircraft and reference model at the 100 Hz of the 
     without ROS      the same parts in one loop
     bare echo        a vector of four channels to another process and back, by the same publisher and subscription
 
-    .venv/bin/python -m benchmarks.lockstep [--duration 60] [--repeat 3]
+    .venv/bin/python -m benchmarks.speed --only lockstep
 """
 
-import argparse
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -91,22 +89,3 @@ def measure(folder: Path, duration: float, repeat: int) -> dict[str, float]:
     }
     rates = [[of(folder / f"{name} {k}") for name, of in measurements.items()] for k in range(repeat)]
     return dict(zip(measurements, np.median(rates, axis=0).tolist(), strict=True))
-
-
-def main() -> None:
-    """Measure all four, interleaved, and print medians."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--duration", type=float, default=60.0, help="flight time, s")
-    parser.add_argument("--repeat", type=int, default=3)
-    options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        rates = measure(Path(folder), options.duration, options.repeat)
-    print(f"median of {options.repeat}, {options.duration:g} s of flight each")
-    print(f"{'':38}{'steps/s':>9}{'to the echo':>13}{'times real time':>17}")
-    for name, rate in rates.items():
-        real_time = "" if name == FLOOR else f"{rate / RATE:.1f}"
-        print(f"{name:38}{rate:9.0f}{rate / rates[FLOOR]:13.2f}{real_time:>17}")
-
-
-if __name__ == "__main__":
-    main()

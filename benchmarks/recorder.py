@@ -5,13 +5,11 @@
 Another process publishes y, y_m, u, u_m, internals and truth, as wide and as noisy as those of the scenario osprey_servo. Then
 the same messages, in the order recorded, go through rosbags.rosbag2.Writer: plain, and with its chunks compressed.
 
-    .venv/bin/python -m benchmarks.recorder [--duration 60] [--rate 1000]
+    .venv/bin/python -m benchmarks.speed --only recorder
 """
 
-import argparse
 import json
 import sys
-import tempfile
 import time
 from collections import Counter
 from pathlib import Path
@@ -63,7 +61,7 @@ def record(run: Path, rate: float, duration: float) -> tuple[dict[str, float], f
     options = ("--ros-args", "--params-file", str(scenario), "-p", f"directory:={run}")
     with (
         Child("flight_recorder.main", *options) as recorder,
-        Child("benchmarks.recorder", "--publish", f"--rate={rate}", f"--duration={duration}") as publisher,
+        Child("benchmarks.recorder", f"{rate}", f"{duration}") as publisher,
     ):
         if publisher.popen.stdout.readline() != "matched\n":
             sys.exit("error: the publisher did not find the recorder")
@@ -108,30 +106,5 @@ def mcap_size(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*.mcap"))
 
 
-def main() -> None:
-    """Record, and print counts and sizes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--duration", type=float, default=60.0, help="how long to publish, s")
-    parser.add_argument("--rate", type=float, default=1000.0, help="of each topic, Hz")
-    parser.add_argument("--publish", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    if arguments.publish:
-        publish(arguments.rate, arguments.duration)
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "run"
-        sent, processor = record(run, arguments.rate, arguments.duration)
-        modes = (CompressionMode.NONE, CompressionMode.STORAGE)
-        rewritten = {mode.name.lower(): rewrite(run, Path(folder) / mode.name, mode) for mode in modes}
-        counts = rewritten["none"].counts
-        print(f"sent {sent['sent']:.0f} messages in {sent['seconds']:.1f} s, {sent['missed']:.0f} ticks missed; lost:", end=" ")
-        print(", ".join(f"{topic.name} {sent['sent'] / len(TOPICS) - counts[topic.name]:.0f}" for topic in TOPICS))
-        percent, each = 100 * processor / sent["seconds"], 1e6 * processor / counts.total()
-        print(f"recorder: {percent:.1f} % of one core, {each:.1f} us a message")
-        print(f"bytes a message: {mcap_size(run) / counts.total():.1f}")
-        for mode, of in rewritten.items():
-            print(f"  rosbags Writer, {mode}: {of.size:.1f}")
-
-
 if __name__ == "__main__":
-    main()
+    publish(*map(float, sys.argv[1:]))

@@ -20,6 +20,7 @@ import numpy as np
 import polars as pl
 import psutil
 import pytest
+from distributed import LocalCluster
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -496,6 +497,25 @@ def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
     assert stopped.returncode == 130, errors
     assert "Traceback" not in errors
     assert f"continue with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + errors
+
+
+def square(job: engines.Job) -> int:
+    time.sleep(0.02)  # so that some are underway when the scheduler is lost
+    return job[0] ** 2
+
+
+def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
+    def cluster(port: int) -> LocalCluster:
+        where: dict[str, Any] = {"protocol": "tcp", "host": "127.0.0.1", "scheduler_port": port, "dashboard_address": ":0"}
+        return LocalCluster(n_workers=2, threads_per_worker=1, processes=False, **where)
+
+    with cluster(0) as first:
+        address = first.scheduler_address
+        flown = engines.dask(2, address)(square, [(k,) for k in range(20)])
+        results = [next(flown) for _ in range(3)]
+    with cluster(int(address.rsplit(":", 1)[1])):
+        results += list(flown)
+    assert sorted(results) == [((k,), k**2) for k in range(20)]
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 640 bytes.")])
