@@ -24,8 +24,6 @@ COMMANDS = {
     "campaign-missions": f"{CAMPAIGN} osprey_route --aircraft 5000",
     "compare": COMPARE,
     "compare-self_tuner": f"{COMPARE} --laws self_tuner",
-    "margins": "python -m benchmarks.margins --json FILE",
-    "effectors": "python -m benchmarks.effectors --faults lost --seeds 50 --json FILE",
     "view": "python -m benchmarks.view --json FILE",
     "replay": "python -m benchmarks.replays",
     "long-faults": f"{RANDOM_FAULTS} 1000 --lockstep 100",
@@ -36,7 +34,7 @@ COMMANDS = {
 }
 """By name. FILE stands for the file of the result; without FILE, the result is the output."""
 
-LONG = {"effectors", "long-faults", "long-fuzz", "long-lockstep", "long-real-time", "long-jsbsim"}
+LONG = {"long-faults", "long-fuzz", "long-lockstep", "long-real-time", "long-jsbsim"}
 """Half an hour and more each: measured by name alone."""
 
 FUZZED, DRAWN = {"status": "<= 0"}, {"draws that fail": "<= 0"}
@@ -61,7 +59,6 @@ GOALS = {
     "long-jsbsim": LOGGED | COUNTED,
     "long-real-time": LOGGED | {"excluding host delays.*": "<= 0"},
     "campaign": {"flown": ">= 150000", "memory_growth": "<= 1.1", "integration: .*": "<= 0.01", "on a GPU": "<= 10"},
-    "effectors": {"beyond": "<= 0"},
     "view": {
         "live: processor": "<= 0.03",
         "live: memory": "<= 80",

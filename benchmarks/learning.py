@@ -35,7 +35,6 @@ from PIL import Image
 from rich.progress import track
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.plant import Drift
 from aircraft_sim.turbulence import MODERATE
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, sampled_matrices, wind_factors
 from control_laws.catalogue import LAWS
@@ -46,7 +45,6 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_campaign import batch, tuning
-from flight_campaign.batch import Fleet
 from flight_campaign.learning_flights import learned
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.outcome import COMPLETED
@@ -550,41 +548,6 @@ def rival_figures(uncertainty: float, numbers: Sequence[int]) -> Iterator[eviden
         yield row(f"{subject}: share lost with u {1e3 * LATE:.0f} ms late, {law.title}", lost)
 
 
-def damaged_rival_figures(name: str, numbers: Sequence[int]) -> Iterator[evidence.Row]:
-    """Scores over WINDOWS of the laws of RIVALS, with the aircraft, wind, noise and damage of the cell `name`."""
-    brief = learning(CELLS[name], 0, 0.1)
-    model = tuning.build_benchmark(brief.vary(controller=start_of(brief))).model  # of the airframe file: one for all aircraft
-    tuned = load(tuned_file(find_scenario("osprey_servo")))
-    rivals = {
-        law: (LAWS[law].control_law(model), LAWS[law].params(tuning.as_gains(tuned[law][OBJECTIVE]), model)) for law in RIVALS
-    }
-    found = {law: list[FloatArray]() for law in RIVALS}
-    for number in numbers:
-        flights, benchmark = damaged_flight(learning(CELLS[name], number, END))
-        ends = tuple(round(end / benchmark.model.period) for _, end in WINDOWS[:-1])
-        for law, (control_law, params) in rivals.items():
-            course = benchmark.courses[tuning.GUST][LAWS[law].feedforward]
-            flown = batch.fly(flights, benchmark.vehicle, course, control_law, params, windows=ends)
-            scores_of_law = np.sum(np.asarray(flown.windows)[:, :, 0] / benchmark.unit, axis=1)
-            found[law].append(np.where(np.asarray(flown.diverged)[0], math.inf, scores_of_law))
-    for law, values in found.items():
-        yield from window_figures(f"rivals, {name}", LAWS[law].title, np.array(values))
-        lost = float(np.sum(np.array(values)[:, -1] > LOSS_OF_TRACK_SCORE))
-        yield row(f"rivals, {name}: lost, {LAWS[law].title}", lost)
-
-
-def damaged_flight(chosen: Scenario) -> tuple[Fleet, tuning.Benchmark]:
-    """The aircraft of a scenario whose elevator and aileron lose half of their effect, alone in a fleet, and its benchmark."""
-    benchmark = tuning.build_benchmark(chosen.vary(controller=start_of(chosen)))
-    aircraft = chosen.aircraft.sampled_airframe()
-    A, B = aircraft.matrix_a()[None], aircraft.matrix_b()[None]
-    left = np.array([WEAK if key in {"elevator", "aileron"} else 1.0 for key in aircraft.inputs])
-    wind = np.ones((len(aircraft.states), len(aircraft.gusts)))
-    fault = Drift(DAMAGED, 0.0, np.ones_like(A[0]), np.ones_like(B[0]) * left, wind)
-    benchmark = benchmark._replace(plant=benchmark.plant._replace(drift=fault))
-    return tuning.benchmark_fleet(A, B, 0, tuning.GUST, benchmark), benchmark
-
-
 def plot(rows: Sequence[Row]) -> Figure:
     """The score of every aircraft in the flight with gusts, a panel an uncertainty; the bar is the mean."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
@@ -646,8 +609,6 @@ def main(
     found, airs = list(figures(rows)), [name for name in CELLS if CELLS[name].kind == "learn"]
     for uncertainty in sorted({CELLS[name].uncertainty for name in airs if name in whole}):
         found += rival_figures(uncertainty, range(aircraft))
-    if "weak" in whole:
-        found += damaged_rival_figures("weak", range(count("weak", aircraft)))
     for each in found:
         print(each.name, each.value, each.unit, each.goal and f"(goal {each.goal})")
     if found:

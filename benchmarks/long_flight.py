@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import psutil
-from benchmarks.host_delays import Intervals, excluding_delays, missed_excluding_delays
+from benchmarks.host_delays import Intervals, missed_excluding_delays
 from benchmarks.processes import PRIORITY, RISE_DI, delay_monitors, real_time
 from benchmarks.view import Client, figures_of_ticks, watching
 from numpy.typing import NDArray
@@ -48,7 +48,6 @@ TURBULENCE = {  # of 1.5 m/s: at the altitude of the c172p; moderate at 100 m ab
     "c172p": {"altitude": 1219.2, "sigma": 1.5, "seed": 1},
     "osprey": MODERATE | {"seed": 1},
 }
-LONGEST = 20  # skips that are named
 PERIOD, REPORT_PERIOD = 2.0, 0.1  # s between samples of the memory, in flight and while the report is written
 IN_VIEW = """(() => {
   document.querySelector("figure")?.scrollIntoView();
@@ -151,19 +150,6 @@ def missing(tape: Tape, scenario: Scenario, delays: Intervals | None, *, real_ti
     }
 
 
-def longest_skips(tape: Tape, scenario: Scenario, delays: Intervals) -> list[dict[str, Any]]:
-    """The longest skips of samples in real time excluding host delays: topic, flight time and length, s; at most LONGEST."""
-    found: list[dict[str, Any]] = []
-    for name, (ends, period) in skips(tape, scenario, real_time=True).items():
-        lengths = excluding_delays(ends, delays)
-        found += [
-            {"topic": name, "t": float(begin - tape.start_ns) / NANOSECONDS, "length": float(length) / NANOSECONDS}
-            for (begin, _), length in zip(ends, lengths, strict=True)
-            if length >= period
-        ]
-    return sorted(found, key=lambda pause: pause["length"], reverse=True)[:LONGEST]
-
-
 def opened(report: Path) -> dict[str, float] | None:
     """Times from the address to the figures drawn in a browser, s; None without a browser.
 
@@ -200,7 +186,6 @@ def figures(run: Path, memory: Mapping[str, list[int]], delays: Intervals | None
         "minutes": (tape["y"].stamp_ns[-1] - tape.start_ns) / NANOSECONDS / 60.0,
         "legs": int(log["leg"].max()),
         "missing": missing(tape, scenario, delays, real_time=real_time),
-        "longest skips": longest_skips(tape, scenario, delays) if real_time and delays is not None else [],
         "lost": sum(int(count) for count in read.metadata.get(LOST_MESSAGES, {}).values()),
         "ticks": figures_of_ticks(tape["internals"], delays, period_ns(scenario.controller.rate, "rate")) if real_time else {},
         "guidance": {"steps": replay.steps, "differing": replay.differing},

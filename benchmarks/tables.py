@@ -5,12 +5,9 @@
 from collections.abc import Sequence
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from flight_core.vectors import FloatArray
-
-WIDTH = 150  # characters, smallest width of the tables
 
 
 def cells(values: FloatArray, factor: float = 1.0) -> str:
@@ -24,10 +21,3 @@ def new_table(title: str, columns: Sequence[str], texts: int) -> Table:
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
     return table
-
-
-def wide_console() -> Console:
-    """Standard output, wide enough for the tables."""
-    console = Console()
-    console.width = max(console.width, WIDTH)
-    return console
