@@ -20,14 +20,11 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.metrics import error_metrics, sample_times
 from flight_analysis.report.account import (
     Account,
-    Commands,
-    ProcessAccount,
     TopicAccount,
     account,
-    account_of_json,
     final_outcome,
 )
-from flight_analysis.report.run_folder import SUMMARY, read_flight, write_report
+from flight_analysis.report.run_folder import read_flight
 from flight_analysis.report.summary import command_results, pulse_edges, taken_over
 from flight_bringup.fly import fly_and_report
 from flight_cli.replay import replay
@@ -134,14 +131,6 @@ def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys
     assert "note: 134 ticks have no sample on the topic u: what was sent is not compared" in output
 
 
-def test_outcome_survives_lost_summary(whole: Path, tmp_path: Path) -> None:
-    for kept, expected in ((True, "completed"), (False, "completed")):
-        run = shutil.copytree(whole.parent, tmp_path / str(kept), dirs_exist_ok=True)
-        if not kept:
-            (run / SUMMARY).unlink()
-        assert write_report(run).flight.summary["outcome"] == expected
-
-
 @pytest.mark.parametrize(
     ("begin", "outcome"), [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")]
 )
@@ -200,15 +189,6 @@ def test_one_missing_sample_is_no_lack_of_short_topic(found: int, expected: int,
     topic = TopicAccount(expected, found, 0.0, 0.97, 0.01, 0.5, 0, 0, 0.0, 0, 0)
     assert topic.holds(found) == whole
     assert (Account(0.97, {"u": topic}, ()).over("u") == "") == whole
-
-
-def test_account_survives_summary(figures: dict[str, Any]) -> None:
-    busy = "this host is too busy: 147 of 2001 y were never sent; see docs/faults.md"
-    processes = {"/controller#1": ProcessAccount(-1.5, 0.0, 2.0, 7), "/recorder": ProcessAccount(-2.0, None, None)}
-    commands = Commands(3, 2, 1, 1)
-    of = Account(2.0, {}, ("y 1 of 2 samples",), busy, unguided=True, processes=processes, commands=commands)
-    assert account_of_json(figures | {"account": json.loads(json.dumps(of.as_json()))}) == of
-    assert account_of_json({"account": None}) is None
 
 
 def stamps(*parts: range) -> Iterator[Any]:

@@ -261,30 +261,6 @@ def test_mean_position_at_limit_is_right_to_second_order(rate: float, stop: floa
     assert errors[1] < 5e-6  # measured 2e-6 to 3e-6; the positions at the ends of the steps give 7e-5 to 1.4e-4
 
 
-@given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 1), st.floats(0.01, 100), st.floats(0.01, 1))
-def test_mean_position_is_between_both_ends_of_step(commands: list[float], lag: float, rate: float, stop: float) -> None:
-    params, position = actuator(lag, -stop, stop, rate), np.zeros(1)
-    for command in commands:
-        new, mean = move(0.0, position, np.array([command]), 0.01, params)
-        assert min(position, new) <= mean <= max(position, new)
-        assert abs(mean - position) <= rate * 0.005 * (1.0 + 1e-9) + 1e-15
-        position = new
-
-
-def test_the_mean_positions_of_faulty_actuators() -> None:
-    # Stuck: the position itself. Lost: that without thrust, from the first step on, although the position was elsewhere.
-    never, no_thrust = np.inf, np.array([-0.5, 0.0, -0.5, np.nan])
-    params = Actuators(
-        lag=np.full(4, 0.02),
-        stuck_at=np.array([1.0, never, never, never]),
-        lost_at=np.array([never, 1.0, 1.0, never]),
-        no_thrust=no_thrust,
-    )
-    new, mean = move(1.0, np.full(4, 0.1), np.full(4, 0.5), 0.005, params)
-    assert new[:3].tolist() == mean[:3].tolist() == [0.1, 0.0, -0.5]
-    assert 0.1 < mean[3] < new[3]
-
-
 def test_mean_positions_of_fleet_are_those_of_each_aircraft() -> None:
     position, command = np.linspace(-0.04, 0.04, 12).reshape(6, 2), np.linspace(0.3, -0.3, 12).reshape(6, 2)
     columns = Actuators(*(None if value is None else value[:, None] for value in SIX))

@@ -6,14 +6,11 @@ import signal
 import time
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
-from textwrap import dedent
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-import yaml
-from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
 
 from autopilot_bridge.bridge import Bridge, Phase, trim_key
@@ -670,13 +667,6 @@ def test_problem_of_the_link_refuses_an_engagement_is_said_while_engaged_and_sta
     assert bridge.reason.endswith("s old (mavlink/VFR_HUD); ATTITUDE comes at 4 Hz")
 
 
-def test_engagement_needs_sources_of_trims() -> None:
-    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
-    receive_outputs(bridge, 0.6, tuple(bridge.outputs))
-    receive_u(bridge, 0.6)
-    assert bridge.engage(at(0.6)).startswith("trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s")
-
-
 def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})  # 90 % of throttle, upper limit 30 % above
     assert bridge.engage(at(0.0)) == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"
@@ -750,27 +740,6 @@ def test_leaving_envelope_releases_channels_with_sentence(name: str, raw: float,
     assert bridge.step(at(0.03)) is Phase.RELEASE
     lower, upper = ENVELOPE[name]
     assert bridge.reason == f"{name} is {channel:g}, outside the envelope [{lower:g}, {upper:g}]"
-
-
-def test_listening_link_of_docs_adds_sensor_and_receiver_to_the_map_over_dds() -> None:
-    page = (REPOSITORY / "docs" / "autopilots-reference.md").read_text(encoding="utf-8")
-    block = page[page.index("    link: {") : page.index("The condition `receiver`")]
-    content = named_map("ardupilot").model_dump()
-    for section, rows in yaml.safe_load(dedent(block)).items():
-        content[section] = (content[section] or {}) | rows
-    content["envelope"] = {name: limits for name, limits in content["envelope"].items() if name == "airspeed"}
-    bridge = Bridge(ChannelMap.validate_mapping({**content, "engage_if": {}, "trims": {}}, "map"), dry_run=False)
-    receive_outputs(bridge, 0.0)
-    receive_u(bridge, 0.0)
-    for name, raw in {"manual": 0.0, "armed": 1.0, "flying": 1.0, "receiver": 0.0}.items():
-        bridge.take_condition(name, raw, at(0.0))
-    bridge.take_output("airspeed", 25.0, at(0.0), at(0.0))
-    assert bridge.engage(at(0.0)) == "the transmitter is lost (rssi is 0)"
-    bridge.take_condition("receiver", 90.0, at(0.0))
-    assert bridge.engage(at(0.0)) == ""
-    bridge.take_output("airspeed", 15.0, at(0.05), at(0.05))  # a gust that the estimator's V does not have
-    bridge.step(at(0.05))
-    assert bridge.reason == "airspeed is 15, outside the envelope [16, 40]"
 
 
 def test_climb_refuses_an_engagement_and_does_not_end_one() -> None:

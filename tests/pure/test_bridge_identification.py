@@ -26,7 +26,6 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
-from flight_core.vectors import FloatArray
 from flight_design.identification import open_loop_fit
 from flight_design.identification.bridge_identification import (
     Channels,
@@ -108,15 +107,6 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified, tmp_
     assert rms["V"] < 0.05
 
 
-def test_a_longer_delay_lowers_the_bandwidths(identified: Identified, tmp_path: Path) -> None:
-    def bandwidths(found: Channels) -> FloatArray:
-        params = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller.law_params()
-        return np.asarray(params.K * params.input_scale)  # per response, which is the same in both
-
-    channels = identified.channels
-    assert (bandwidths(channels._replace(delay=channels.delay + 0.03)) < bandwidths(channels)).all()
-
-
 def channels_of_first_order(stiff: str, damping: float, stiffness: float, zero: float) -> Channels:
     """Channels y_dot = Omega u, all but one."""
     one = np.array([1.0 if name == stiff else 0.0 for name in MAP.outputs])
@@ -137,24 +127,6 @@ def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(tmp_
     s = 1j * gain
     loop = gain * (s + integral) / s * (s + zero) / (s**2 + damping * s + stiffness)
     assert abs(loop) == pytest.approx(1.0, rel=1e-6)
-
-
-def test_feedforward_of_coordinated_turn_needs_no_rudder_against_sideslip(tmp_path: Path) -> None:
-    """Rates of a steady turn, without sideslip: the rudder of the feedforward is N_r r / N_rudder, closed form."""
-    found = channels_of_first_order(stiff="r", damping=22.0, stiffness=470.0, zero=2.0)
-    model = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller.feedforward
-    assert model is not None
-    n, r = len(model.states), list(model.states).index("r")
-    np.testing.assert_allclose(np.reshape(model.A, (n, n))[r], np.where(np.arange(n) == r, -20.0, 0.0))
-
-
-def test_command_of_speed_needs_half_of_thrust_in_end(tmp_path: Path) -> None:
-    """V_dot = Omega u - damping V rests at Omega u / damping: 5 m/s^2 per 1 of thrust, half of its limit, 2 1/s."""
-    found = channels_of_first_order(stiff="V", damping=2.0, stiffness=0.0, zero=0.0)
-    content = yaml.safe_load(flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).scenario)
-    thrust = MAP.inputs["thrust"]
-    expected = 0.5 * 5.0 * min(-thrust.lower, thrust.upper) / 2.0
-    assert content["/**/reference_model"]["ros__parameters"]["pulses"]["V"]["value"] == [pytest.approx(expected)]
 
 
 def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
@@ -215,23 +187,6 @@ def test_noise_as_large_as_response_leaves_model_with_standard_errors() -> None:
     known = 80.0 / (s + 12.0) / (0.05 * s + 1.0) * np.exp(-0.08 * s)
     assert abs(gain.value - abs(known)) < 3.0 * gain.deviation  # 99.7 %
     assert abs(phase.value + np.angle(known)) < 3.0 * phase.deviation
-
-
-def test_lag_that_zero_cancels_is_not_taken_for_lag_of_channel() -> None:
-    # Two complex poles without a lag: the second order fits them with a lag of up to 1 s and a zero at its pole, and the loop's
-    # bandwidth follows from the lag. The first order has one of 1/12 s or less: 23 1/s is the sum of both poles.
-    t = np.arange(0.0, 14.0, 0.01)
-    arrays = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller.law_params()
-    u = np.array([(arrays.amplitude * excitation.signal(instant, arrays))[0] for instant in t])
-    plant = np.array([[0.0, 1.0], [-267.0, -23.0]]), np.array([[0.0], [1120.0]]), np.array([[1.0, 0.0]]), np.zeros((1, 1))
-    _, y, _ = dlsim((*cont2discrete(plant, 0.01)[:4], 0.01), np.concatenate([np.zeros(7), u[:-7]]))
-    stamps = np.round(t * 1e9).astype(np.int64)
-    noise = 0.01 * np.random.default_rng(1).standard_normal(y.shape)
-    model = fit_channel(Signal(stamps, ("q",), y + noise), Signal(stamps, ("elevator",), u[:, None]), "q", "elevator", 1.0)
-    assert model is not None
-    assert model.usable
-    assert model.lag < 0.09
-    assert model.delay + model.lag == pytest.approx(0.07 + 0.005 + 0.04, abs=0.03)  # s; a lag of 0.04 s is the slower real part
 
 
 def test_fast_oscillation_of_light_airplane_found() -> None:
@@ -305,13 +260,6 @@ def test_written_map_has_trims_that_were_sent() -> None:
     written = ChannelMap.validate_mapping(yaml.safe_load(map_text(MAP, {"elevator": trims["elevator"]}, "a log")), "map")
     assert written.inputs["elevator"].trim == pytest.approx(0.25 * row.scale, rel=1e-4)
     assert written.outputs == MAP.outputs
-
-
-def test_experiment_stays_within_part_of_limits_of_map() -> None:
-    planned = experiment(MAP, SPEED, 0.2, "airframe.yaml").controller
-    for name, amplitude in zip(planned.inputs, planned.amplitude, strict=True):
-        row = MAP.inputs[name]
-        assert amplitude == pytest.approx(0.2 * min(-row.lower, row.upper))
 
 
 def test_trim_near_a_stop_narrows_the_limits_and_says_what_to_change() -> None:

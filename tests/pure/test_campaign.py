@@ -205,20 +205,6 @@ def test_each_mission_of_campaign_flies_as_in_single_process_simulation(name: st
     assert chunk.figures["score"][0] != chunk.figures["score"][1]  # each has its own A and B
 
 
-REFUSED_MISSIONS: dict[str, dict[str, Any]] = {
-    r"controller.rate: found .* a period of guidance": {"controller": {"rate": 125.0}},
-    r"guidance.program: found heading, expected a route alone": {
-        "guidance": {"program": {"heading": {"start": [1.0], "value": [1.0]}}}
-    },
-}
-
-
-@pytest.mark.parametrize("sentence", REFUSED_MISSIONS)
-def test_mission_that_fleet_cannot_fly_refused(sentence: str) -> None:
-    with pytest.raises(ParameterError, match=sentence):
-        define(CORNER.vary(**REFUSED_MISSIONS[sentence]), 2, 0.3, 7, 2)
-
-
 @pytest.mark.parametrize(
     ("scenario", "sentence"),
     [

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Environments in which no node can start: each is one sentence with the mend, from every command and from a node."""
 
-import os
 import resource
 import shutil
 import subprocess
@@ -78,17 +77,6 @@ def test_limit_of_open_files_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_log_folder_is_made_and_left_empty(tmp_path: Path) -> None:
     require_ros_environment()
     assert not list((tmp_path / ".ros" / "log").iterdir())
-
-
-@pytest.mark.parametrize("start", STARTS)
-def test_start_without_home_is_one_sentence(start: str, tmp_path: Path) -> None:
-    pytest.importorskip("rclpy")
-    variables = {name: value for name, value in os.environ.items() if name != "HOME"}
-    result = subprocess.run(STARTS[start], env=variables, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert result.returncode == BAD_INPUT
-    assert result.stderr.startswith("error: ROS_LOG_DIR: found none and no HOME")
-    assert result.stderr.count("\n") == 1
-    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.parametrize(

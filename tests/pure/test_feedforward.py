@@ -15,7 +15,6 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.integrators import rk4
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
-from flight_core.tape import Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_design.gains.gain_selection import manoeuvre, study_airframe, with_feedforward
 from rise_di_controller import feedforward, guard
@@ -157,36 +156,6 @@ def both(scenario: Scenario) -> tuple[Scenario, Scenario]:
     """The scenario without feedforward, and with that of its airframe as published."""
     chosen = with_feedforward(scenario.controller, scenario.aircraft.load()[0])
     return scenario.vary(controller={"feedforward": None}), scenario.vary(controller=chosen.model_dump())
-
-
-def recomputed(params: ControllerConfig, tape: Tape) -> tuple[FloatArray, FloatArray]:
-    """Inputs u and u_ff of every step of a tape, from its y, y_m and dt only."""
-    log, limits, law = tape["internals"], params.guard(), params.law_params()
-    y, y_m = log.group("y").values, log.group("y_m").values
-    u = log.group("u").values[0]
-    u_trim, state = u, rise.engage(y[0], y_m[0])
-    ff_state = None if limits.nominal is None else feedforward.initial_state(y_m[0], limits.nominal)
-    us, added = [u], [np.zeros_like(u)]
-    for k in range(1, len(y)):
-        start, u_ff, dt = u_trim, np.zeros_like(u), float(log["dt"][k])
-        if ff_state is not None and limits.nominal is not None:
-            ff_state, u_ff = feedforward.step(ff_state, y_m[k], dt, limits.nominal)
-            start = u_trim + u_ff
-        state, _, u = rise.step_with_anti_windup(state, y[k], y_m[k], dt, start, u, law, limits.limits)
-        us.append(u)
-        added.append(u_ff)
-    return np.array(us), np.array(added)
-
-
-@pytest.mark.parametrize("enabled", [False, True])
-def test_u_recomputed_from_log_to_last_bit(enabled: bool) -> None:
-    # Without feedforward the loop above is the law inside its limits only: the feedforward that is off changes no bit.
-    scenario = both(short(flight={"duration": 3.0}))[enabled]
-    tape = simulate(scenario)
-    u, u_ff = recomputed(scenario.controller, tape)
-    assert u.tobytes() == tape["internals"].group("u").values.tobytes() == tape["u"].values.tobytes()
-    assert u_ff.tobytes() == tape["internals"].group("u_ff").values.tobytes()
-    assert bool(u_ff.any()) is enabled
 
 
 def ticks(

@@ -97,26 +97,6 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     assert float(right if side > 0.0 else left) == pytest.approx(nearest, abs=0.5)
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-@pytest.mark.parametrize("phi", [0.0, -0.3])
-def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None:
-    """The course points home all the time, 15 deg to the side: the turn is flown until the bank is there, no longer.
-
-    That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a step of the prediction.
-    """
-    speed, bank, lag, roll_rate = 25.0, math.radians(30.0), 3.0, 0.35
-    edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
-    bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)  # the bank to the other side turns by 10 deg before
-    home = (900.0, side * 900.0 * math.tan(bearing))
-    motion = Motion(np.float64(0.0), np.float64(0.0), np.float64(side * phi), 0.0, speed, (0.0, 0.0), bank, roll_rate, lag)
-    right, left = turn_clearance(Fence((edge,), home), motion)
-    rolled = lag + (bank - phi) / roll_rate
-    longest = lag + 2.0 * bank / roll_rate + 1.95 * math.pi / (min(SHARES) * GRAVITY * math.tan(bank) / speed)
-    ahead = 1000.0 - float(right if side > 0.0 else left)
-    slowed = 0.97  # the cosine of the course on the way, at least
-    assert slowed * speed * rolled < ahead < speed * (rolled + longest / 63.0)
-
-
 def test_turn_begins_at_last_moment() -> None:
     fence, bank = Fence((FIELD,), (200.0, 0.0)), math.radians(30.0)
 
