@@ -1,19 +1,15 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: D101, D102 - launch documents its classes and methods
-"""Stand-in for the parts of `launch` and `launch_ros` that the launch files use, on machines without them. It runs nothing.
+"""Stand-in for the parts of `launch` and `launch_ros` that the launch files use. It runs nothing.
 
-Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other argument is a TypeError. Where the
-official packages are installed, each action, substitution and handler is an object of the official class, which checks its
-arguments; only the context that runs them is a stand-in.
+Names and arguments are those of launch 3.4.3 and launch_ros 0.26.6 (branch jazzy); any other argument is a TypeError.
+.ci/ros launches a flight with the official packages.
 """
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
-from importlib import import_module
-from importlib.util import find_spec
-from operator import attrgetter
+from dataclasses import dataclass, field
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -206,43 +202,10 @@ MODULES: dict[str, tuple[Any, ...]] = {
 }
 
 
-OFFICIAL = find_spec("launch_ros") is not None
-
-STAND_INS_ONLY = (LaunchContext, ProcessExited, get_ros_node)
-"""What the tests make or replace themselves, also beside the official packages."""
-
-
 def modules() -> dict[str, ModuleType]:
     """The modules by their names."""
     stand_ins = {name: ModuleType(name) for name in MODULES}
     for name, members in MODULES.items():
-        if OFFICIAL:
-            vars(stand_ins[name]).update(vars(import_module(name)))
         for member in members:
             setattr(stand_ins[name], member.__name__, globals()[member.__name__])
     return stand_ins
-
-
-def _official_class(stand_in: type, official: type) -> type:
-    """The official class, whose objects have their arguments as attributes, as the stand-in has them."""
-
-    def construct(self: Any, *positional: Any, **named: Any) -> None:
-        official.__init__(self, *positional, **named)  # type: ignore[misc]
-        self.given = stand_in(*positional, **named)
-
-    def equals(self: Any, other: object) -> bool:
-        return bool(self.given == getattr(other, "given", None))
-
-    names = [*(item.name for item in fields(stand_in)), *(["perform"] if hasattr(stand_in, "perform") else [])]
-    shown = {name: property(attrgetter(f"given.{name}")) for name in names}
-    return type(stand_in.__name__, (official,), {"__init__": construct, "__eq__": equals, "__hash__": object.__hash__, **shown})
-
-
-if OFFICIAL:
-    for name, members in MODULES.items():
-        for member in members:
-            if member not in STAND_INS_ONLY:
-                official = getattr(import_module(name), member.__name__)
-                globals()[member.__name__] = (
-                    _official_class(member, official) if isinstance(member, type) and is_dataclass(member) else official
-                )

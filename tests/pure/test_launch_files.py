@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The launch files with the official `launch` where it is installed, else with a stand-in (tests/launch_stand_in.py).
+"""The launch files with a stand-in for `launch` (tests/launch_stand_in.py).
 
 Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
 """
 
-import os
 import runpy
 import subprocess
 import sys
@@ -32,7 +31,6 @@ from flight_core.environment import PROFILE_VARIABLE
 from flight_core.parameters import Config, ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_log.bag import LogAttachments
-from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 from flight_ros.messages import stamp_of
 from flight_ros.topics import NodeState
@@ -223,54 +221,6 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
 
-def test_end_of_learner_is_said_and_does_not_end_flight(tmp_path: Path) -> None:
-    actions, context = started("fly", scenario="osprey_learn", runs=tmp_path)
-    learner = nodes(all_ready(actions, context))["learner"]
-    assert learner.on_exit is not None
-    (said,) = learner.on_exit(ProcessExited("learner-5", -9), context)
-    assert said.msg == "learner-5 ended before the flight did: the law flies on with the model that it has"
-
-
-def test_node_of_another_flight_does_not_start_second_stage(tmp_path: Path) -> None:
-    actions, context = started("fly", runs=tmp_path)
-    for key in (f"/controller#{os.getpid()}", f"/controller#{os.getppid()}", "/controller#0", "/controller", "/controller#x"):
-        assert publish(actions, context, key) == []
-    for key in (f"/two/controller#{PID}", f"/my_controller#{PID}", "", "#"):
-        assert publish(actions, context, key) == []
-    assert publish(actions, context, f"/recorder#{PID}") == []
-    assert publish(actions, context, f"/controller#{PID}", "starting") == []
-    assert nodes(publish(actions, context, f"/controller#{PID}"))
-
-
-@pytest.mark.parametrize(
-    ("namespace", "pushed", "full"),
-    [("one", "", "/one"), ("one", "/fleet", "/fleet/one"), ("/one", "fleet", "/one"), ("", "fleet", "/fleet")],
-)
-def test_states_of_flight_are_those_in_namespace(namespace: str, pushed: str, full: str, tmp_path: Path) -> None:
-    actions, context = started("fly", pushed, namespace=namespace, runs=tmp_path)
-    assert publish(actions, context, f"/controller#{PID}", topic=f"{full}/node_state") == []
-    assert nodes(all_ready(actions, context, full))
-
-
-def test_no_line_of_output_starts_stage(tmp_path: Path) -> None:
-    actions, context = started("fly", runs=tmp_path)
-    matchers = [action.event_handler.matcher for action in every(stand_in.RegisterEventHandler, actions)]
-    assert matchers
-    assert not any(matcher(ProcessExited("[INFO] [12.5] [controller]: ready", 0)) for matcher in matchers)
-    assert set(context.ros_node.subscriptions) == {"/node_state"}
-
-
-def test_node_that_is_not_ready_in_time_named(tmp_path: Path) -> None:
-    actions, context = started("fly", runs=tmp_path)
-    (timer,) = every(TimerAction, actions)
-    (warn,) = timer.actions
-    assert isinstance(warn, OpaqueFunction)
-    assert publish(actions, context, f"/recorder#{PID}") == []
-    assert warn.function(context) == [stand_in.LogInfo(msg="timed out waiting for controller: not ready after 20 s")]
-    assert publish(actions, context, f"/controller#{PID}")
-    assert warn.function(context) == []
-
-
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
     """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
     sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)
@@ -313,74 +263,6 @@ def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path:
     assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8") == "completed"
 
 
-@pytest.mark.parametrize(
-    ("states", "reason"),
-    [
-        (FLYING[:2], "never flew: aircraft, reference_model not ready, or with an input without a publisher, after 20 s"),
-        (FLYING[:3], "never flew: reference_model not ready, or with an input without a publisher, after 20 s"),
-        (FLYING, "never flew: y did not reach the controller"),
-        ((*FLYING, "flying"), ""),
-    ],
-)
-def test_flight_without_u_at_aircraft_never_flew(states: Sequence[str], reason: str, tmp_path: Path) -> None:
-    actions, context = started("fly", duration=5, runs=tmp_path)
-    follow = all_ready(actions, context)
-    timers = every(TimerAction, follow)[:1]
-    for name in states:
-        key, state = ("aircraft", NodeState.FLYING) if name == "flying" else (name, NodeState.MATCHED)
-        timers += every(TimerAction, publish(follow, context, f"/{key}#{PID}", state))[:1]
-    checks = [check for timer in timers for check in every(OpaqueFunction, timer.actions)]
-    if not reason:
-        assert [check.function(context) for check in checks] == [None, None]
-        return
-    with pytest.raises(RuntimeError, match=reason):
-        [check.function(context) for check in checks]
-    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8").startswith(reason)
-
-
-def test_lockstep_flight_ends_when_aircraft_completes_it(tmp_path: Path) -> None:
-    follow = all_ready(*started("fly", duration=5, runs=tmp_path))
-    assert {"start_time"} == overrides(nodes(follow)["reference_model"]).keys() - {"lockstep"}
-
-    actions, context = started("fly", lockstep="true", duration=5, runs=tmp_path)
-    follow = all_ready(actions, context)
-    assert overrides(nodes(follow)["aircraft"])["duration"] == 5.0
-    assert not every(TimerAction, follow)
-    for key, state in ((f"/aircraft#{PID}", NodeState.READY), (f"/controller#{PID}", NodeState.COMPLETED)):
-        assert not publish(follow, context, key, state)
-    assert ends(publish(follow, context, f"/aircraft#{PID}", NodeState.COMPLETED))
-
-
-@pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
-def test_live_page_served_on_request_and_may_end(name: str, given: dict[str, str], tmp_path: Path) -> None:
-    assert not every(ExecuteProcess, started(name, **given, runs=tmp_path)[0])
-    actions, context = started(name, **given, watch="true", runs=tmp_path)
-    (page,) = every(ExecuteProcess, actions)
-    run = overrides(nodes(actions)["recorder"])["directory"]
-    assert page.cmd == [stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di"), "watch", run, "--wait"]
-    assert page.on_exit is None
-    assert nodes(all_ready(actions, context))
-
-
-@pytest.mark.parametrize(("name", "given"), [("fly", {}), ("bridge", {"map": "ardupilot"})])
-def test_rosbag2_records_topics_of_recorder_in_place(name: str, given: dict[str, str], tmp_path: Path) -> None:
-    actions, context = started(name, **given, recorder="rosbag2", namespace="one", runs=tmp_path)
-    (process,) = every(ExecuteProcess, actions)
-    (run,) = tmp_path.iterdir()
-    *command, output, option = process.cmd[: process.cmd.index("/one/y")]
-    assert command == ["ros2", "bag", "record", "--storage", "mcap", "--output"]  # options of Jazzy's ros2bag
-    assert (output, option) == (str(run / "rosbag2"), "--topics")
-    topics = process.cmd[process.cmd.index("/one/y") :]
-    assert {"/one/y_m", "/one/u", "/one/internals", "/one/pose", "/diagnostics", "/rosout", "/parameter_events"} <= {*topics}
-    assert ("/one/bridge/engagement" in topics) is (name == "bridge")
-    assert len({*topics}) == len(topics)
-    assert process.on_exit is not None
-    assert "recorder" not in nodes(actions)
-    assert nodes(all_ready(actions, context, "/one"))  # the second stage does not wait for it
-    with pytest.raises(ParameterError, match=f"{run}: found no sample on any topic"):
-        read_run(run)  # until there is a bag
-
-
 def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="recorder: found rosbag2 in lockstep, expected true"):
         started("fly", recorder="rosbag2", lockstep="true", runs=tmp_path)
@@ -399,19 +281,6 @@ def test_bridge_is_dry_run_by_default_and_topics_recorded(tmp_path: Path) -> Non
     follow = all_ready(*started("bridge", map=str(MAP_FILES["ardupilot_2024"]), scenario=slow, dry_run="false", runs=tmp_path))
     assert overrides(nodes(follow)["bridge"])["dry_run"] is False
     assert not every(TimerAction, follow)  # until Ctrl-C
-
-
-def test_flight_with_autopilot_ends_once_log_holds_it(tmp_path: Path) -> None:
-    actions, context = started("bridge", map="ardupilot", duration=1, runs=tmp_path)
-    follow = all_ready(actions, context)
-    (timer,) = every(TimerAction, follow)
-    (end,) = every(OpaqueFunction, timer.actions)
-    assert ends(end.function(context) or [])  # a log without u
-    assert not flown_to(context, follow, time.time())
-    (wait,) = end.function(context) or []  # a log that grows
-    assert isinstance(wait, TimerAction)
-    assert ends(wait.actions)
-    assert not flown_to(context, follow, time.time() + 3600.0)  # stamps of a clock that is ahead
 
 
 def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path) -> None:
@@ -455,9 +324,7 @@ def options(process: ExecuteProcess) -> dict[str, Any]:
     [
         ({}, "/pose,/truth,/y,/y_m"),  # the controller publishes u and internals
         ({"controller": "false", "aircraft": "true"}, "/internals,/u,/y_m"),
-        ({"controller": "false", "reference_model": "true"}, "/internals,/pose,/truth,/u,/y"),
         ({"map": "ardupilot"}, "/truth,/y_m"),  # y is the bridge's
-        ({"namespace": "one"}, "/internals,/pose,/truth,/u,/y,/y_m"),  # a flight without one: no node publishes these
         ({"topics": "y,y_m"}, "y,y_m"),
     ],
     ids=str,
@@ -468,27 +335,6 @@ def test_topics_without_a_publisher_are_played(given: dict[str, str], topics: st
     assert values["topics"] == topics
     assert values["run"] == short
     assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (1.0, 0.0, False, "now")
-
-
-def test_playing_follows_arguments_and_end_of_log_is_end(short: Path, tmp_path: Path) -> None:
-    given = {"rate": "2", "start": "0.1", "loop": "true", "lockstep": "true", "recorder": "true"}
-    actions, context = started("replay", run=short, runs=tmp_path, **given)
-    assert overrides(nodes(actions)["controller"]) == {"lockstep": True, "y_rate": 500.0}
-    process = player(all_ready(actions, context))
-    values = options(process)
-    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (2.0, 0.1, True, "recorded")
-    assert process.on_exit is not None
-    assert ends(process.on_exit(ProcessExited("play-3", 0), context))
-    with pytest.raises(RuntimeError, match="play-3 ended before the flight did"):
-        process.on_exit(ProcessExited("play-3", 2), context)
-
-
-def test_without_nodes_log_played_at_once(short: Path) -> None:
-    actions, context = started("replay", run=short, controller="false")
-    process = player(actions)
-    assert options(process)["topics"] == "/internals,/pose,/truth,/u,/y,/y_m"
-    assert process.on_exit is not None
-    assert ends(process.on_exit(ProcessExited("play-1", 0), context))
 
 
 def test_lockstep_is_for_the_controller_alone(short: Path) -> None:
