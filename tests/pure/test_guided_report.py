@@ -10,28 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
-from rich.console import Console
 from tests.plots import drawn
 from tests.recordings import EPOCH, signal
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import part_masks
 from flight_analysis.report import guided_figures
-from flight_analysis.report.figures import plot_context
 from flight_analysis.report.guided import guidance_summary, segments
 from flight_analysis.report.html import write_page
-from flight_analysis.report.plotting import Figure
-from flight_analysis.report.summary import RecordedFlight, summarise, transients
-from flight_analysis.report.tables import flight_tables
-from flight_cli.output import show_flight
+from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
-from flight_guidance import path
 from flight_guidance.fence import Fence, Zone
 from flight_guidance.guidance import names
 from flight_guidance.modes import Lateral, Mode, Vertical
-from flight_guidance.path import Arc, Line, Route
+from flight_guidance.path import Arc, Line
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]
 
@@ -120,74 +113,6 @@ def test_wind_follows_from_velocities_over_ground_and_through_air() -> None:
     assert guided_figures.mean_wind(tape, SPEED, parts=2) == pytest.approx(np.array([[1.0, -6.0]] * 2), abs=1e-9)
 
 
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_the_drawn_route_lies_on_its_legs(side: float) -> None:
-    end = (3000.0, side * 1000.0)
-    legs = path.route([(0.0, 0.0), (1000.0, 0.0), (1000.0, side * 1000.0), end], 200.0, 100.0)
-    outline = path.route_outline(Route(legs, (0.0,) * 6, (SPEED,) * 6))
-    points = [(north, east) for north, east, _ in outline]
-    assert points[:2] == [(0.0, 0.0), pytest.approx((800.0, 0.0))]
-    for point in points:
-        assert min(abs(path.error(leg, point).e) for leg in legs) < 1e-6
-    # The fillet turns 90 deg, and never the long way round.
-    assert max(abs(point[1]) for point in points) < 1200.1
-    assert math.dist(points[-1], end) == pytest.approx(200.0)
-
-
-def context_of(tape: Tape) -> Any:
-    return guided_figures.guided_context(plot_context(tape, {}, {}))
-
-
-def curve(figure: Figure, name: str, row: int) -> FloatArray:
-    axis = "y" if row == 1 else f"y{row}"
-    (trace,) = (trace for trace in drawn(figure).data if trace.name == name and trace.yaxis == axis)
-    return np.asarray(trace.y, dtype=float)
-
-
-def test_ground_track_has_equal_axes_and_arrows_of_wind() -> None:
-    figure = drawn(guided_figures.track_figure(log(pose__v_east=5.0), [], SPEED))
-    assert (figure.layout.yaxis.scaleanchor, figure.layout.yaxis.scaleratio) == ("x", 1.0)
-    assert [trace.name for trace in figure.data] == ["flown", "start and end", "wind, the longest arrow 5 m/s"]
-    arrows = figure.layout.annotations
-    assert len(arrows) == guided_figures.WIND_ARROWS
-    assert (arrows[0].ax, arrows[0].ay) == pytest.approx((-guided_figures.ARROW_PIXELS, 0.0), abs=1e-9)  # points to the east
-    assert not drawn(guided_figures.track_figure(log(), [], SPEED)).layout.annotations
-
-
-def test_commands_and_limits_drawn_in_display_units() -> None:
-    tape = log(phi_c=after(10.0, math.radians(20.0)), mode__vertical=np.where(T < 20.0, Vertical.ALTITUDE, Vertical.CLIMB))
-    context, bounds = context_of(tape), {"V": (30.0, math.inf), "phi": (-0.5, 0.5)}
-    attitude = guided_figures.attitude_figure(context, bounds)
-    assert np.max(curve(attitude, "command", 1)) == pytest.approx(20.0)
-    assert sorted((shape.y0, shape.yref) for shape in drawn(attitude).layout.shapes) == [
-        (pytest.approx(-math.degrees(0.5)), "y"),
-        (pytest.approx(math.degrees(0.5)), "y"),
-    ]
-    vertical = guided_figures.vertical_figure(context, SPEED, bounds)
-    assert np.isnan(curve(vertical, "command", 1)[-1])  # no altitude is commanded
-    assert [(shape.y0, shape.y1 < 30.0, shape.yref) for shape in drawn(vertical).layout.shapes] == [(30.0, True, "y2")]
-    assert curve(vertical, "flown", 2)[0] == SPEED
-
-
-def test_cross_track_error_drawn_by_leg_where_path_followed() -> None:
-    assert guided_figures.cross_track_figure(context_of(log())) is None
-    lateral = np.where(T < 10.0, Lateral.HEADING, Lateral.ROUTE)
-    figure = drawn(guided_figures.cross_track_figure(context_of(log(mode__lateral=lateral, leg=after(20.0, 1.0), xtrack=7.0))))
-    assert [note.text for note in figure.layout.annotations] == ["leg 0", "leg 1"]
-    assert np.isnan(figure.data[0].y[0])
-    assert figure.data[0].y[-1] == 7.0
-
-
-def test_times_without_a_fresh_pose_are_shaded() -> None:
-    context = context_of(log(mode=np.where((T > 10.0) & (T < 20.0), Mode.DEAD_RECKONING, Mode.ENGAGED)))
-    (interval,) = context.intervals
-    assert (interval.label, interval.start, interval.stop) == (
-        "guidance: dead reckoning",
-        pytest.approx(10.02),
-        pytest.approx(20.0),
-    )
-
-
 @pytest.fixture(scope="module")
 def flight() -> RecordedFlight:
     """The first seconds of the route of the osprey: a capture."""
@@ -205,23 +130,6 @@ def test_figures_of_flight_are_those_of_scenario(flight: RecordedFlight) -> None
     assert guided_figures.mean_wind(flight.tape, 25.0) == pytest.approx(np.array([[3.0, 0.0]] * 8), abs=1.0)  # less turbulence
 
 
-def test_fly_names_each_leg(flight: RecordedFlight, capsys: pytest.CaptureFixture[str]) -> None:
-    show_flight(Console(), flight)
-    assert "legs: 0 not ended\n" in capsys.readouterr().out
-    assert flight.summary["outcome"] == "completed, legs 0 to 6 not flown"  # 7, the orbit, never ends
-
-
-def test_comparison_draws_all_ground_tracks_over_route(flight: RecordedFlight, tmp_path: Path) -> None:
-    other = flight._replace(name="other")
-    write_page(tmp_path / "page.html", [flight, other])
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert page.count("<h2>Ground track</h2>") == 1
-    routes = guided_figures.flown_routes(flight.scenario, flight.tape)
-    tracks = {"one": (flight.tape, "#000000"), "two": (flight.tape, "#111111")}
-    figure = drawn(guided_figures.tracks_figure(tracks, routes))
-    assert [trace.name for trace in figure.data] == ["route", "one", "two"]
-
-
 def test_report_opens_with_track_of_numbered_legs_and_fence(flight: RecordedFlight, tmp_path: Path) -> None:
     write_page(tmp_path / "page.html", [flight])
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -234,14 +142,3 @@ def test_report_opens_with_track_of_numbered_legs_and_fence(flight: RecordedFlig
     assert np.asarray(traces["fence"].y).tolist() == [0.0, 900.0, 900.0, 0.0]
     assert np.hypot(traces["keep out"].y - 400.0, traces["keep out"].x - 200.0) == pytest.approx(np.full(73, 50.0))
     assert (traces["home"].y[0], traces["home"].x[0]) == (300.0, 100.0)
-
-
-def test_guided_flight_has_captures_and_turns_in_place_of_commands(flight: RecordedFlight) -> None:
-    t = flight.tape.time("y")
-    assert flight.scenario is not None
-    assert set(part_masks(t, transients(flight.scenario, flight.tape))) == {"whole", "calm", "capture", "turn", "gust"}
-    tables = {table.caption: table for table in flight_tables(flight.summary, {}, [])}
-    assert [row[0] for row in tables["Guidance by segment"].rows] == ["leg 0"]
-    heads = [column.head for column in tables["Tracking error (true error)"].columns]
-    assert "turn" in heads
-    assert "command" not in heads

@@ -36,9 +36,6 @@ CURVES = {
     *(f"truth gust.{axis}" for axis in ("longitudinal", "lateral", "vertical")),
 }
 TABS = {"tracking": 4, "error": 4, "input": 4, "integrals": 8, "controller": 4, "wind": 3}  # title: number of plots
-COLOUR = re.compile("#[0-9a-f]{6}")
-SHOWN = dict.fromkeys(("showXAxisLabels", "showYAxisLabels", "showLegend", "isSynced"), True)
-PANEL = SHOWN | {"showPlotValuesInLegend": False, "legendDisplay": "floating", "xAxisVal": "timestamp", "sidebarDimension": 240}
 """The fixed part of a Plot panel of Foxglove."""
 
 
@@ -97,22 +94,6 @@ def test_every_panel_of_foxglove_stands_in_one_tab() -> None:
     assert {name.split("!")[0] for name in count} == {"Plot"}
 
 
-def test_every_plot_of_foxglove_has_settings_of_plot_panel() -> None:
-    panels = json.loads(JSON)["configById"]
-    del panels["Tab!rise_di"]
-    for panel in panels.values():
-        paths = panel.pop("paths")
-        titles = {panel.pop("foxglovePanelTitle"), panel.pop("lichtblickPanelTitle")}  # one program, two names
-        assert len(titles) == 1
-        assert titles.pop()
-        assert panel == PANEL
-        assert len({path["color"] for path in paths}) == len(paths) > 0
-        for path in paths:
-            assert path.keys() == {"value", "label", "color", "enabled", "timestampMethod"}
-            assert (path["enabled"], path["timestampMethod"]) == (True, "receiveTime")
-            assert COLOUR.fullmatch(path["color"])
-
-
 def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
     curves = []
     for curve in ElementTree.fromstring(XML).iter("curve"):
@@ -121,28 +102,6 @@ def test_every_curve_of_plotjuggler_is_channel_of_run(tape: Tape) -> None:
         assert (root, position) == ("", "position")
         curves.append(f"{topic} {channel}")
     assert Counter(curves) == Counter(CURVES)
-
-
-def test_guided_flight_has_map_and_what_guidance_holds() -> None:
-    scenario = find_scenario("osprey_route").vary(flight={"duration": 0.1})
-    log, channels = simulate(scenario)["guidance"], channels_of(scenario)
-    assert channels["guidance"] == log.names
-    layout = json.loads(foxglove({"": channels}))
-    first, second, *others = layout["configById"]["Tab!rise_di"]["tabs"]
-    assert (first["title"], first["layout"], second["title"]) == ("map", "3D!map", "guidance")
-    assert [tab["title"] for tab in others] == list(TABS)
-    panel = layout["configById"]["3D!map"]
-    assert (panel["followTf"], panel["layers"]["grid"]["frameId"]) == ("map", "map")
-    assert set(panel["topics"]) == {"/odometry", "/path", "/markers"}
-    assert panel["cameraState"]["far"] > panel["cameraState"]["distance"] > panel["cameraState"]["near"]
-    plots = [layout["configById"][name] for name in leaves(second["layout"])]
-    paths = [path for plot in plots for path in plot["paths"]]
-    for path in paths:
-        index = int(path["value"].removeprefix("/guidance.position[").removesuffix("]"))
-        assert path["label"] == f"guidance: {log.names[index]}"
-    curves = ElementTree.fromstring(plotjuggler({"": channels})).iter("curve")
-    guided = [name for curve in curves if (name := curve.attrib["name"]).startswith("/guidance/")]
-    assert len(guided) == len(paths) == 12
 
 
 def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
@@ -170,38 +129,3 @@ def test_fleet_has_common_map_and_tabs_by_aircraft(tmp_path: Path) -> None:
     assert (link.attrib["name"], max(widths)) == ("base_link", 3.0)  # m, the span
     both = CliRunner().invoke(application(["layouts"]), ["layouts", "osprey_gust", "--fleet", str(fleet)])
     assert str(both.exception) == "--fleet: found a scenario beside it, expected one of the two"
-
-
-def test_every_splitter_of_plotjuggler_has_its_count() -> None:
-    root = ElementTree.fromstring(XML)
-    splitters = list(root.iter("DockSplitter"))
-    assert len(splitters) > 6
-    for splitter in splitters:
-        assert splitter.attrib["orientation"] in {"|", "-"}
-        assert {child.tag for child in splitter} <= {"DockSplitter", "DockArea"}
-        sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
-        assert len(splitter) == int(splitter.attrib["count"]) == len(sizes)
-        assert sum(sizes) == pytest.approx(1.0, abs=1e-5)
-    assert all(len(area.findall("plot")) == 1 for area in root.iter("DockArea"))
-    assert {tab.attrib["tab_name"]: len(list(tab.iter("plot"))) for tab in root.iter("Tab")} == TABS
-    assert [tab.attrib["tab_name"] for tab in root.iter("Tab")] == list(TABS)
-
-
-def test_plotjuggler_shows_flight_time_in_one_window() -> None:
-    root = ElementTree.fromstring(XML)
-    assert XML.startswith("<?xml ")
-    assert [(child.tag, child.attrib) for child in root] == [
-        ("tabbed_widget", {"name": "Main Window", "parent": "main_window"}),
-        ("use_relative_time_offset", {"enabled": "1"}),
-    ]
-    assert [child.tag for child in root[0]] == ["Tab"] * len(TABS) + ["currentTabIndex"]
-    for tab in root.iter("Tab"):
-        assert tab.attrib["containers"] == "1"
-        assert [child.tag for child in tab] == ["Container"]
-    for area in root.iter("DockArea"):
-        assert area.attrib["name"]
-        plot = area[0]
-        assert plot.attrib == {"mode": "TimeSeries", "style": "Lines", "flip_x": "false", "flip_y": "false"}
-        colours = [curve.attrib["color"] for curve in plot]
-        assert len(set(colours)) == len(colours) > 0
-        assert all(COLOUR.fullmatch(colour) for colour in colours)

@@ -15,7 +15,6 @@ from tests.browser import CHROMIUM, Browser
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report import plotting
 from flight_analysis.report.html import write_page
 from flight_analysis.report.summary import RecordedFlight, summarise
 from flight_core.tape import Signal, Tape
@@ -160,88 +159,3 @@ def test_dark_page_has_own_colours_and_follows_scheme(browser: Browser, page: Pa
     assert light[0] == "rgb(255, 255, 255)"
     assert all(dark_color != light_color for dark_color, light_color in zip(dark, light, strict=True))
     assert browser.console == []
-
-
-def test_page_prints_in_light_colours_and_returns_to_screen(browser: Browser, page: Path) -> None:
-    open_page(browser, page, "dark")
-    zoom(browser, 2.0, 3.0)
-    assert base64.b64decode(browser.call("Page.printToPDF")["data"]).startswith(b"%PDF")
-    browser.wait_for(f"{DRAWN} === 3")
-    assert browser.run(f"{PLOTS}[0].layout.xaxis.range") == [2.0, 3.0]
-    assert browser.run(f"{PLOTS}[0].clientWidth") > 900
-    assert browser.console == []
-
-
-def test_several_flights_are_overlaid(browser: Browser, tmp_path: Path, servo: RecordedFlight) -> None:
-    path = tmp_path / "comparison.html"
-    bare = replace(servo.tape, signals={name: servo.tape[name] for name in ("y", "y_m", "u")})
-    write_page(path, [servo, recorded("without internals", servo.scenario, bare)])
-    open_page(browser, path)
-    assert browser.run(f"{PLOTS}.slice(0, 4).map(plot => plot.data.length)") == [12, 8, 8, 8]
-    zoom(browser, 1.0, 2.0, plot=1)
-    assert browser.console == []
-
-
-def test_no_table_is_wider_than_the_page(browser: Browser, page: Path) -> None:
-    open_page(browser, page)
-    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
-    assert browser.run("[...document.querySelectorAll('.tables > div')].every(table => table.scrollWidth <= table.clientWidth)")
-
-
-def test_two_minutes_at_500_hz_decimated_and_zoom_shows_every_sample(
-    browser: Browser, tmp_path: Path, servo: RecordedFlight
-) -> None:
-    # White noise in y, u and the truth hardly compresses.
-    count, random, signals = 60_001, np.random.default_rng(1), {}
-    for topic in ("y", "y_m", "u", "truth"):
-        names = servo.tape[topic].names
-        signals[topic] = Signal(np.arange(count) * 2_000_000, names, random.standard_normal((count, len(names))))
-    path = tmp_path / "long.html"
-    write_page(path, [recorded("long", servo.scenario, Tape(signals))])
-    open_page(browser, path)
-    x, _ = curve(browser, 0, "y")
-    assert len(x) < 5000
-    zoom(browser, 60.0, 60.2)
-    x, _ = curve(browser, 0, "y")
-    assert len([t for t in x if 60.0 <= t <= 60.2]) == 101
-
-
-def test_very_long_curve_drawn_before_samples_unpacked_and_zoom_shows_every_sample(
-    browser: Browser, tmp_path: Path, servo: RecordedFlight, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    count, random = 30_001, np.random.default_rng(1)
-    stamps = np.arange(count, dtype=np.int64) * 2_000_000
-    stamps[20_000:] += 500_000_000  # a gap of 0.5 s
-    names = servo.tape["y"].names
-    signals = {topic: Signal(stamps, names, random.standard_normal((count, 4))) for topic in ("y", "y_m")}
-    found = []
-    for most in (count // 2, plotting.MAX_READ):
-        monkeypatch.setattr(plotting, "MAX_READ", most)
-        write_page(tmp_path / "long.html", [recorded("long", servo.scenario, Tape(signals))])
-        open_page(browser, tmp_path / "long.html")
-        assert (browser.run("kept.size") == 0) == (most < count)
-        found.append([np.array(values, dtype=float) for values in curve(browser, 0, "y")])
-        zoom(browser, 10.0, 10.2)
-        zoomed, _ = curve(browser, 0, "y")
-        assert len([t for t in zoomed if 10.0 <= t <= 10.2]) == 101
-    (x, y), (x_of_page, y_of_page) = found
-    assert np.isnan(y).sum() == 1
-    np.testing.assert_allclose(x, x_of_page, rtol=2.0**-23)  # float32
-    np.testing.assert_allclose(y, y_of_page, rtol=2.0**-15.9)  # plotting.MANTISSA
-
-
-def test_next_figure_drawn_is_nearest_to_view(browser: Browser, page: Path) -> None:
-    open_page(browser, page)
-    order = browser.run(
-        """(async () => {
-          const order = [], before = draw;
-          draw = (figure, style) => { order.push(figures.indexOf(figure)); scrollTo(0, 0); return before(figure, style); };
-          for (const figure of figures) figure.drawn = "";
-          scrollTo(0, document.body.scrollHeight);
-          await showAll();
-          return order;
-        })()"""
-    )
-    count = browser.run("figures.length")
-    assert order[0] >= count - 3  # at the end of the page, then at its top
-    assert order[1:] == [k for k in range(count) if k != order[0]]

@@ -24,7 +24,7 @@ import pytest
 from numpy.typing import NDArray
 from rich.console import Console
 from tests.conftest import REPOSITORY
-from tests.joint_states import JOINT_STATE, vector
+from tests.joint_states import JOINT_STATE, parameter_event, path, vector
 from tornado.httpclient import AsyncHTTPClient, HTTPRequest, HTTPResponse
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
@@ -45,7 +45,7 @@ from flight_view.flight import MAX_TEXT, ROUTE_TYPE, Flight
 from flight_view.series import Series
 from flight_view.server import FILES, Server, answer
 from flight_view.text import picture
-from flight_view.watch import namespaces, newest_run, require_log, runs_in_recording
+from flight_view.watch import namespaces, newest_run, runs_in_recording
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
 
@@ -164,19 +164,6 @@ def test_long_logs_read_in_slices(backlog: int, state: str, recorded: Path, monk
     assert followed(flight)[1]["internals"][1].tobytes() == followed(whole)[1]["internals"][1].tobytes()
 
 
-def test_samples_beyond_limit_become_coarser_and_keep_peaks() -> None:
-    samples, values = Series(("a", "b"), max_rows=400), np.zeros((1000, 2))
-    values[123, 0], values[457, 1] = 9.0, -7.0
-    for start in range(0, 1000, 30):
-        stamps = np.arange(start, min(start + 30, 1000), dtype=np.int64)
-        samples.append(stamps, values[start : start + 30])
-    assert samples.count <= 400
-    assert samples.thinned > 0
-    assert (samples.values.max(), samples.values.min()) == (9.0, -7.0)
-    assert (np.diff(samples.stamp_ns) > 0).all()
-    assert samples.stamp_ns[[0, -1]].tolist() == [0, 999]
-
-
 def test_late_row_kept_and_old_row_refused() -> None:
     """A row of a recovered overrun is kept in order, a row of a different time refused."""
     samples = Series(("a",))
@@ -217,14 +204,6 @@ def test_browser_gets_thinned_samples_again_from_start(recorded: Path) -> None:
     assert topics["internals"] == 0
 
 
-def test_page_of_earlier_run_gets_description(recorded: Path) -> None:
-    """A page that shows a different run gets the description of the present run."""
-    flight = Flight(recorded)
-    flight.update()
-    head, _ = decoded(answer(flight, {"epoch": "of the run before", "described": str(flight.described)}))
-    assert head["flight"]["name"] == "run"
-
-
 @pytest.mark.parametrize("case", CORPUS, ids=lambda path: path.name)
 def test_hostile_log_shown_as_far_as_it_goes(case: Path, tmp_path: Path) -> None:
     path = tmp_path / "run_0.mcap"
@@ -256,72 +235,39 @@ def test_names_and_texts_of_log_bounded_and_printable(tmp_path: Path) -> None:
     assert max(map(len, head["topics"][0]["channels"])) <= MAX_TEXT
 
 
-def test_pose_shown_with_all_channels(tmp_path: Path) -> None:
-    """A pose with fewer channels than an earlier pose is left out."""
-    names = ["phi", "theta", "psi", "north", "east"]
-    with BagWriter(tmp_path / "run") as bag:
-        pose = bag.add_topic("/pose", JOINT_STATE, "")
-        for k in range(30):  # at 10 Hz. A bridge has no position in the first three, and in one of a stale position
-            known = names[:3] if k < 3 or k == 20 else names
-            bag.write(pose, k * 100_000_000, k * 100_000_000, k, vector(k * 100_000_000, known, [float(k)] * len(known)))
-    flight = Flight(tmp_path / "run")
-    flight.update()
-    head, samples = decoded(answer(flight, {}))
-    assert head["topics"][0]["channels"] == names
-    assert [int(row[0]) for row in samples["pose"][1]] == [*range(3, 20), *range(21, 30)]
-    assert head["faults"] == []
-
-
 def test_events_of_another_aircraft_are_not_shown(tmp_path: Path) -> None:
-    store: Any = typestore()
-    arrays = {f"{kind}_array_value": np.zeros(0) for kind in ("byte", "bool", "integer", "double")}
-    types, time = store.types, store.types["builtin_interfaces/msg/Time"](0, 0)
-    value = types["rcl_interfaces/msg/ParameterValue"](3, False, 0, 2.5, "", string_array_value=[], **arrays)
-    changed = [types["rcl_interfaces/msg/Parameter"]("k_g", value)]
-    reports = {node: types[PARAMETER_EVENT](time, node, [], changed, []) for node in ("/one/controller", "/two/controller")}
+    store = typestore()
     with BagWriter(tmp_path / "run") as bag:
+        events = bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
         for number, name in enumerate(("one", "two")):
             bag.write(bag.add_topic(f"/{name}/y", JOINT_STATE, ""), number, number, 0, vector(number, ["q"], [0.0]))
-            report = types[KEY_VALUE](key="ENGAGED", value=name)
+            report = store.types[KEY_VALUE](key="ENGAGED", value=name)
             engagement = bag.add_topic(f"/{name}/bridge/engagement", KEY_VALUE, "")
             bag.write(engagement, number, number, 0, bytes(store.serialize_cdr(report, KEY_VALUE)))
-        events = bag.add_topic(PARAMETER_EVENTS, PARAMETER_EVENT, "")
-        for number, message in enumerate(reports.values()):
-            bag.write(events, number, number, number, bytes(store.serialize_cdr(message, PARAMETER_EVENT)))
+            bag.write(events, number, number, number, parameter_event(f"/{name}/controller", {"k_g": 2.5}))
     flight = Flight(tmp_path / "run")
     flight.update()
     assert sorted(event[1:] for event in flight.events) == [("bridge", "ENGAGED one"), ("parameter", "controller: k_g = 2.5")]
 
 
 def test_route_in_flight_replaces_scenario_route(tmp_path: Path) -> None:
-    scenario = find_scenario("osprey_route")
-    store, given = typestore(), [(0.0, 0.0, 50.0), (0.0, 600.0, 55.0), (400.0, 600.0, 55.0)]  # east, north, altitude
-    made = {name: store.types[name] for name in (ROUTE_TYPE, *map("geometry_msgs/msg/{}".format, ("PoseStamped", "Pose")))}
-    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
-    point, turn = (store.types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion"))
-    head = header(time(0, 0), "map")
-    pose = made["geometry_msgs/msg/Pose"]
-    poses = [
-        made["geometry_msgs/msg/PoseStamped"](head, pose(point(*position), turn(0.0, 0.0, 0.0, 1.0))) for position in given
-    ]
+    scenario, points = find_scenario("osprey_route"), [(0.0, 0.0, 50.0), (600.0, 0.0, 55.0), (600.0, 400.0, 55.0)]
     with BagWriter(tmp_path / "run") as bag:
         bag.add_attachments(LogAttachments(scenario.path), 0)
-        route = bag.add_topic("/route", ROUTE_TYPE, "")
-        bag.write(route, 1, 1, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses), ROUTE_TYPE)))
-        bag.write(route, 2, 2, 1, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:1]), ROUTE_TYPE)))  # cannot be flown
-        odom = header(time(0, 0), "odom")  # a frame that guidance refuses
-        bag.write(route, 2, 2, 2, bytes(store.serialize_cdr(made[ROUTE_TYPE](odom, poses[:2]), ROUTE_TYPE)))
+        route, other = (bag.add_topic(name, ROUTE_TYPE, "") for name in ("/route", "/other/route"))
+        bag.write(route, 1, 1, 0, path(*points))
+        bag.write(route, 2, 2, 1, path(points[0]))  # cannot be flown
+        bag.write(route, 2, 2, 2, path(*points[:2], frame="odom"))  # a frame that guidance refuses
         bag.write(bag.add_topic("/y", JOINT_STATE, ""), 3, 3, 0, vector(3, ["q"], [0.0]))
-        other = bag.add_topic("/other/route", ROUTE_TYPE, "")
-        bag.write(other, 4, 4, 0, bytes(store.serialize_cdr(made[ROUTE_TYPE](head, poses[:2]), ROUTE_TYPE)))
+        bag.write(other, 4, 4, 0, path(*points[:2]))
     flight = Flight(tmp_path / "run")
     flight.update()
-    head_of, _ = decoded(answer(flight, {"described": "1"}))
+    head, _ = decoded(answer(flight, {"described": "1"}))
     assert scenario.guidance is not None
-    expected = route_outline(scenario.guidance.plan([Waypoint(north, east, altitude) for east, north, altitude in given]))
-    assert [tuple(vertex) for vertex in head_of["flight"]["route"]] == expected
+    expected = route_outline(scenario.guidance.plan([Waypoint(*point) for point in points]))
+    assert [tuple(vertex) for vertex in head["flight"]["route"]] == expected
     assert [(event.kind, event.text) for event in flight.events] == [("route", "3 waypoints")]
-    known = {"described": str(head_of["described"]), "epoch": head_of["epoch"]}
+    known = {"described": str(head["described"]), "epoch": head["epoch"]}
     assert "flight" not in decoded(answer(flight, known))[0]
 
 
@@ -367,11 +313,6 @@ def test_background_that_is_no_map_refused(
 ) -> None:
     with pytest.raises(ParameterError, match=sentence):
         read_background(geojson(tmp_path / "file.geojson", *geometries, **members), Origin(47.40, 8.50))
-
-
-def test_background_needs_origin(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="--origin: found none"):
-        read_background(geojson(tmp_path / "file.geojson", LINE), None)
 
 
 # The server
@@ -436,8 +377,8 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
         assert (long.code, long.body) == (400, b"400: A number of rows has more than 18 digits\n")
 
     against(recorded)(client)
-    for path in FILES.values():
-        text = path.read_text(encoding="utf-8")
+    for file in FILES.values():
+        text = file.read_text(encoding="utf-8")
         assert "://" not in text
         assert "innerHTML" not in text
 
@@ -447,18 +388,11 @@ def test_page_served_to_all_and_samples_with_token(recorded: Path) -> None:
     [
         ("/", "GET", {"Host": "evil.example"}, 403),
         ("/", "GET", {"Host": "127.0.0.1.evil.example"}, 403),
-        ("/", "GET", {"Host": "127.0.0.1:1"}, 403),
         ("/data/0", "GET", {"Host": "localhost"}, 403),
-        ("/../../../etc/passwd", "GET", {}, 404),
         ("/..%2f..%2fetc%2fpasswd", "GET", {}, 404),
         ("/server.py", "GET", {}, 404),
-        ("/data/2", "GET", {}, 404),
-        ("/", "POST", {}, 405),
         ("/data/0", "PUT", {}, 405),
-        ("/data/0", "DELETE", {}, 405),
-        ("/nothing", "PATCH", {}, 405),
         ("/", "OPTIONS", {}, 405),
-        ("/", "HEAD", {}, 405),
     ],
 )
 def test_foreign_host_another_path_and_another_method_refused(
@@ -495,10 +429,6 @@ async def connect(server: Server, request: bytes = b"", count: int = http.MAX_CO
     return connections
 
 
-def request(server: Server, path: str, token: str = TOKEN) -> bytes:
-    return f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n{http.TOKEN_HEADER}: {token}\r\n\r\n".encode()
-
-
 def end(*connections: Connection) -> None:
     for _, writer in connections:
         writer.close()
@@ -517,48 +447,6 @@ def test_connections_without_token_leave_place(recorded: Path) -> None:
         end(*idle)
 
     against(recorded)(client)
-
-
-@pytest.mark.parametrize("token", ["", "another"])
-def test_answer_without_token_ends_connection(token: str, recorded: Path) -> None:
-    async def client(server: Server) -> None:
-        (connection,) = await connect(server, 3 * request(server, "/data/0", token), 1)
-        content = await asyncio.wait_for(connection[0].read(), http.REQUEST_TIMEOUT / 2)
-        assert content.count(b"HTTP/1.1 401") == 1
-        end(connection)
-
-    against(recorded)(client)
-
-
-def test_connections_with_token_beyond_limit_refused(recorded: Path) -> None:
-    async def client(server: Server) -> None:
-        kept = await connect(server, request(server, "/data/0"))
-        for reader, _ in kept:
-            assert (await reader.readline()).startswith(b"HTTP/1.1 200")
-        assert (await get(server, "/data/0")).code == 503
-        end(*kept)
-        while (await get(server, "/data/0")).code != 200:  # until the server has noticed
-            pass
-
-    against(recorded)(client)
-
-
-def test_answer_not_taken_ends_connection(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http, "REQUEST_TIMEOUT", 0.5)
-    monkeypatch.setattr(http, "answer", lambda *_, **__: bytes(64 << 20))  # more than the buffers of the network hold
-
-    async def client(server: Server) -> None:
-        (connection,) = await connect(server, request(server, "/data/0"), 1)
-        assert len(await rest_of_late(connection[0])) < 64 << 20
-        end(connection)
-
-    against(recorded)(client)
-
-
-async def rest_of_late(reader: asyncio.StreamReader) -> bytes:
-    """What arrives at a client that begins to read after a second."""
-    await asyncio.sleep(1.0)
-    return await rest_of(reader)
 
 
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
@@ -626,12 +514,6 @@ async def whole_log(server: Server) -> None:
         await asyncio.sleep(0.01)
 
 
-async def read_in_full(server: Server) -> None:
-    """Wait until the server has read the log: before, each answer has news."""
-    while server.flights[0].state() != "ended":
-        await asyncio.sleep(0.01)
-
-
 async def left(server: Server) -> None:
     """Wait until all WebSockets are closed."""
     while server.streams:
@@ -647,7 +529,6 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
 
     async def client(server: Server) -> None:
         await whole_log(server)  # else the second answer may have more rows than the first
-        await read_in_full(server)
         socket = await stream(server)
         await socket.write_message("")
         first = (await get(server, "/data/0")).body
@@ -672,12 +553,9 @@ def test_websocket_answers_and_waits_for_news(recorded: Path) -> None:
     [
         ("/news/0", {"Host": "evil.example"}, 403),
         ("/news/0", {"Origin": "http://evil.example"}, 403),
-        ("/news/0", {"Origin": "http://127.0.0.1:1"}, 403),
-        ("/news/0", {"Origin": "null"}, 403),
         ("/news/0", {"Origin": "http://["}, 403),
         ("/news/0", {"Origin": ""}, 403),  # none is sent
         ("/news/1", {}, 404),
-        ("/news/2", {}, 404),
     ],
 )
 def test_foreign_websocket_refused(path: str, headers: dict[str, str], expected: int, recorded: Path) -> None:
@@ -690,49 +568,13 @@ def test_foreign_websocket_refused(path: str, headers: dict[str, str], expected:
     against(recorded)(client)
 
 
-@pytest.mark.parametrize("token", ["", "another", b"another", b"\xff", "epoch=&y=0"])
+@pytest.mark.parametrize("token", ["", b"another", "epoch=&y=0"])
 def test_websocket_whose_first_message_is_not_the_token_closed(token: str | bytes, recorded: Path) -> None:
     async def client(server: Server) -> None:
         socket = await stream(server, token)
         await socket.write_message("")
         assert await socket.read_message() is None
         assert (socket.close_code, socket.close_reason) == (1008, http.NO_TOKEN)
-        socket.close()
-
-    against(recorded)(client)
-
-
-def test_websockets_without_token_leave_place(recorded: Path) -> None:
-    async def client(server: Server) -> None:
-        address = f"127.0.0.1:{server.port}"
-        head = {"Host": address, "Origin": f"http://{address}"} | UPGRADE
-        silent = "\r\n".join(["GET /news/0 HTTP/1.1", *(f"{k}: {v}" for k, v in head.items()), "", ""]).encode()
-        connections = await connect(server, silent, 200)
-        asks = await stream(server)
-        await asks.write_message("")
-        assert await asks.read_message()
-        assert len(server.streams) <= http.MAX_CONNECTIONS + http.RESERVED
-        asks.close()
-        end(*connections)
-
-    against(recorded)(client)
-
-
-@pytest.mark.parametrize(
-    ("message", "code", "reason"),
-    [
-        ("y=" + "9" * 4301, 1008, "A number of rows has more than 18 digits"),
-        ("a" * (http.MAX_REQUEST_BYTES + 1), 1009, "message too big"),
-    ],
-)
-def test_websocket_whose_message_is_no_request_closed(message: str, code: int, reason: str, recorded: Path) -> None:
-    async def client(server: Server) -> None:
-        await whole_log(server)  # until then the epoch may change
-        await read_in_full(server)
-        socket = await stream(server)
-        await socket.write_message(f"epoch={decoded((await get(server, '/data/0')).body)[0]['epoch']}&{message}")
-        assert await socket.read_message() is None
-        assert (socket.close_code, socket.close_reason) == (code, reason)
         socket.close()
 
     against(recorded)(client)
@@ -755,27 +597,6 @@ def test_idle_or_surplus_websockets_closed(recorded: Path, monkeypatch: pytest.M
         assert await silent.read_message() is None
         await left(server)
         silent.close()
-
-    against(recorded)(client)
-
-
-def test_websocket_has_single_pending_request(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    taken: list[str] = []
-
-    def parsed(message: str, **_: object) -> list[tuple[str, str]]:
-        taken.append(message)
-        return []
-
-    monkeypatch.setattr(http, "parse_qsl", parsed)
-    monkeypatch.setattr(http, "has_news", lambda *_: False)
-
-    async def client(server: Server) -> None:
-        socket = await stream(server)
-        for number in range(100):
-            await socket.write_message(str(number))
-        await socket.read_message()
-        assert len(taken) <= 2  # the one that has its answer, and the next
-        socket.close()
 
     against(recorded)(client)
 
@@ -844,13 +665,6 @@ def test_recording_run_is_chosen_first(recorded: Path, tmp_path: Path) -> None:
             assert runs_in_recording(tmp_path, "uav1") == []
 
 
-def test_no_run_and_no_log_are_sentences(tmp_path: Path) -> None:
-    with pytest.raises(ParameterError, match="found no run, expected"):
-        newest_run(tmp_path / "nowhere")
-    with pytest.raises(ParameterError, match=r"found no \.mcap file, expected the folder of a run or an MCAP file"):
-        require_log(tmp_path)
-
-
 def test_aircraft_of_one_log_are_a_fleet(tmp_path: Path) -> None:
     """The places of both are topics of one answer; the page of the second shows its samples alone, without a note."""
     with BagWriter(tmp_path) as bag:
@@ -894,50 +708,6 @@ def test_watch_prints_address_until_ctrl_c(recorded: Path, ignored: bool) -> Non
         assert process.stderr.read() == ""
 
 
-def test_port_in_use_and_bad_words_are_sentences(recorded: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        ended = subprocess.run(command("watch", recorded, "--port", port), capture_output=True, text=True, check=False)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr == f"error: --port: {port} cannot be used (Address already in use), expected a free port of this host\n"
-    for words, expected in (
-        (("--wait",), "error: --wait: found no RUN, expected the folder of a run that will be recorded\n"),
-        ((recorded, recorded, "--text"), "error: --text: found two runs, expected one run\n"),
-        ((recorded,) * 3, "error: RUN: found 3 runs, expected a run and a ghost, or --fleet\n"),
-        (("--fleet",), "error: --fleet: runs: found no run in recording, expected each RUN by its name\n"),
-        (("--fleet", "--namespace", "/a"), "error: --fleet: found --namespace beside it, expected one of the two\n"),
-        ((recorded, "--namespace", "n"), f"error: {recorded}: found aircraft in the namespaces /, expected one in 'n'\n"),
-    ):
-        ended = subprocess.run(command("watch", *words), capture_output=True, text=True, check=False, cwd=recorded)
-        assert (ended.returncode, ended.stderr) == (2, expected)
-
-
-def test_flight_page_ends_with_flight(tmp_path: Path) -> None:
-    """A flight with a page prints the address, and leaves no server."""
-    words = ("fly", "osprey_gust", "--in-process", "--duration", "0.5", "--watch", "--json", "--runs", tmp_path)
-    ended = subprocess.run(command(*words), capture_output=True, text=True, check=True)
-    assert json.loads(ended.stdout)["outcome"] == "completed"
-    found = re.search(r"http://127\.0\.0\.1:(\d+)/", ended.stderr)
-    assert found is not None
-    with socket.socket() as client:
-        assert client.connect_ex(("127.0.0.1", int(found[1]))) != 0
-
-
-def test_terminal_view_of_recorded_flight_ends_by_itself(recorded: Path) -> None:
-    ended = subprocess.run(command("watch", recorded, "--text"), capture_output=True, text=True, check=True)
-    assert "run  ENDED  ENGAGED  t = 2.0 s" in ended.stdout
-
-
-def test_a_log_that_vanishes_is_a_sentence(recorded: Path, tmp_path: Path) -> None:
-    path = tmp_path / "run_0.mcap"
-    path.write_bytes((recorded / "run_0.mcap").read_bytes()[:5000])
-    flight = Flight(path)
-    flight.update()
-    path.unlink()
-    with pytest.raises(ParameterError, match=r"run_0.mcap: cannot be read \(No such file or directory\), expected the log"):
-        flight.update()
-
-
 def test_terminal_shows_newest_values_in_units_of_report(recorded: Path, tape: Tape) -> None:
     console = Console(width=120, record=True, file=io.StringIO())
     flight = Flight(recorded)
@@ -951,13 +721,3 @@ def test_terminal_shows_newest_values_in_units_of_report(recorded: Path, tape: T
     assert rows["q"][0] == f"{1e3 * tape['internals']['y.q'][-1]:.3f}"
     assert rows["elevator"][0] == f"{np.degrees(tape['internals']['u.elevator'][-1]):.3f}"
     assert "0.00 s  mode: ENGAGED" in text
-
-
-def test_terminal_shows_pose_without_heading(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "run") as bag:
-        pose = bag.add_topic("/pose", JOINT_STATE, "")
-        bag.write(pose, 1, 1, 0, vector(1, ["phi", "theta"], [0.1, 0.2]))
-    flight, console = Flight(tmp_path / "run"), Console(width=120, record=True, file=io.StringIO())
-    flight.update()
-    console.print(picture(flight))
-    assert "roll +5.7 deg, pitch +11.5 deg, heading - deg" in console.export_text()

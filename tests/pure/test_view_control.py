@@ -17,9 +17,8 @@ from tornado.httpclient import AsyncHTTPClient, HTTPResponse
 from flight_analysis.closed_loop.loop_margins import delay_margins
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_design.gains.gain_selection import check_gains, manoeuvre, study_airframe
 from flight_view.control import BURST, KEY_PERIOD, LEASE, Control, RefusedError, gains_of, new_key
-from flight_view.server import MAX_CONNECTIONS, TOKEN_HEADER, Server
+from flight_view.server import TOKEN_HEADER, Server
 from rise_di_controller.params import ControllerConfig
 
 pytestmark = [pytest.mark.package("flight_view"), pytest.mark.slow]
@@ -86,34 +85,6 @@ def test_gains_set_together_seen_in_log_and_undone(desk: Desk, osprey_gust: Scen
     with_desk(desk, steps)
 
 
-@pytest.mark.parametrize("state", ["ended", "interrupted"])
-def test_page_of_ended_flight_commands_nothing(state: str, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A page of a flight that is over commands no later flight."""
-    monkeypatch.setattr(desk.flight, "state", lambda: state)
-    sentence = "the flight of this page is over: rise-di watch --control shows a later one"
-
-    async def steps(desk: Desk) -> None:
-        digest = (await desk.ask("state"))["digest"]
-        values = dict(desk.nodes.values["controller"])
-        assert await desk.refused("gains", digest=digest, values={"k_g": [1.1 * values["k_g"]]}) == (409, sentence)
-        assert await desk.refused("target", values={"phi": 0.1}) == (409, sentence)
-        assert desk.nodes.values["controller"] == values
-        assert desk.nodes.notes == []
-        await desk.ask("deactivate")  # whatever flies: it ends, and begins nothing
-
-    with_desk(desk, steps)
-
-
-def test_gains_may_be_set_before_first_tick(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        desk.flight.digest = 0
-        state = await desk.ask("state")
-        assert (state["digest"] != state["logged"], state["logged"]) == (True, "000000000000")
-        await desk.ask("gains", digest=state["digest"], values={"k_g": [1.1 * desk.nodes.values["controller"]["k_g"]]})
-
-    with_desk(desk, steps)
-
-
 def test_set_after_foreign_change_refused(desk: Desk) -> None:
     """A set after a change by a different program is refused."""
 
@@ -149,22 +120,6 @@ def test_invalid_gain_refused(desk: Desk, osprey_gust: Scenario) -> None:
     with_desk(desk, steps)
 
 
-def test_margins_equal_gain_check(desk: Desk, osprey_gust: Scenario) -> None:
-    """The margins of pending gains equal the margins of the gain check."""
-    airframe, _ = osprey_gust.aircraft.load()
-    found = check_gains(osprey_gust, study_airframe(airframe, manoeuvre(osprey_gust, airframe), 0.0, 1))
-
-    async def steps(desk: Desk) -> None:
-        await desk.ask("state")
-        assert await desk.refused("check", values={"k_g": []}) == (400, "k_g: found 0 values, expected 1")
-        same = await desk.ask("check", values={"k_g": [desk.nodes.values["controller"]["k_g"]]})
-        assert same["delay_margin"] == found.delay_margin
-        assert tuple(same["channels"].values()) == found.channel_margins
-        assert desk.nodes.notes == []
-
-    with_desk(desk, steps)
-
-
 def test_wrong_key_refused_and_delays_next_one(desk: Desk) -> None:
     async def steps(desk: Desk) -> None:
         assert (await desk.refused("deactivate", key="ABCD-EFGX"))[0] == 403
@@ -187,21 +142,6 @@ def test_one_page_controls_until_its_lease_ends(desk: Desk) -> None:
         assert (await desk.ask("hold"))["lease"] == first
         desk.time += LEASE
         assert (await desk.ask("state", lease="another"))["lease"] != first
-
-    with_desk(desk, steps)
-
-
-def test_requests_beyond_rate_refused(desk: Desk) -> None:
-    """More than five requests a second are refused."""
-
-    async def steps(desk: Desk) -> None:
-        await desk.ask("state")
-        for _ in range(int(BURST) - 1):
-            await desk.control.answer({"do": "state"}, KEY, desk.lease)
-        with pytest.raises(RefusedError, match="more than 5 requests a second"):
-            await desk.control.answer({"do": "state"}, KEY, desk.lease)
-        await desk.control.answer({"do": "deactivate"}, KEY, desk.lease)  # always
-        await desk.ask("state")  # a second later
 
     with_desk(desk, steps)
 
@@ -283,17 +223,6 @@ def test_bridge_engages_by_map_name(recorded: Path, osprey_gust: Scenario) -> No
     with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
-def test_controller_under_bridge_deactivated_by_bridge_alone(recorded: Path, osprey_gust: Scenario) -> None:
-    async def steps(desk: Desk) -> None:
-        await desk.ask("state")
-        for action in ("activate", "deactivate"):
-            status, sentence = await desk.refused(action)
-            assert (status, sentence) == (422, "the bridge activates and deactivates the controller: engage or disengage it")
-        assert desk.nodes.done == []
-
-    with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
-
-
 def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
     begun, end = threading.Event(), threading.Event()
 
@@ -312,22 +241,6 @@ def test_margins_do_not_delay_deactivation(desk: Desk) -> None:
         assert desk.nodes.done == [("activate", False)]
 
     with_desk(desk, steps)
-
-
-def test_engagement_that_waits_for_turn_cancelled_too(recorded: Path, osprey_gust: Scenario) -> None:
-    async def steps(desk: Desk) -> None:
-        await desk.ask("state")
-        first = asyncio.ensure_future(desk.refused("engage", map="plane"))
-        await asyncio.get_running_loop().run_in_executor(None, desk.nodes.blocked.wait, 20.0)
-        desk.nodes.blocked.clear()
-        second = asyncio.ensure_future(desk.refused("engage", map="plane"))
-        await asyncio.sleep(0)  # the request is made
-        await desk.ask("disengage")
-        assert await first == await second == (422, "cancelled by a later request")
-        assert not desk.nodes.blocked.is_set()  # the second one did not begin
-        assert desk.nodes.done == [("disengage", None)]
-
-    with_desk(Desk(recorded, osprey_gust, "bridge", "controller"), steps)
 
 
 # Actions by state
@@ -354,11 +267,6 @@ REQUESTS: Mapping[str, Mapping[str, Any]] = {
 OVER = ("ended", "interrupted")
 ALLOWED_AFTER_END = ("state", "check", "deactivate", "disengage")
 NOTHING_TO_DO = ("undo", "skip")  # 422: no change to undo, no further leg
-
-
-def test_table_has_each_action(desk: Desk) -> None:
-    desk.control.close()
-    assert REQUESTS.keys() == {*desk.control._actions, "check"}
 
 
 @pytest.mark.parametrize("action", REQUESTS)
@@ -452,49 +360,5 @@ def test_request_needs_token_origin_type_and_key(desk: Desk) -> None:
             assert (await post(server, state, **{"X-Control-Lease": json.loads(good.body)["lease"]})).code == 200
         finally:
             await server.close()
-
-    with_desk(desk, steps)
-
-
-def test_without_control_there_is_nothing_to_post_to(desk: Desk) -> None:
-    async def steps(desk: Desk) -> None:
-        server = Server([desk.flight], TOKEN)
-        server.listen(0)
-        try:
-            assert (await post(server, {"do": "state"})).code == 405
-        finally:
-            await server.close()
-
-    with_desk(desk, steps)
-
-
-def test_every_scenario_offers_its_gains() -> None:
-    for name in ("osprey_gust", "osprey_observer", "jsbsim_c172p"):
-        assert {"k_g", "k_d", "Lambda", "beta"} <= set(gains_of(find_scenario(name).controller))
-
-
-def test_clients_that_stay_and_read_nothing_do_not_delay_deactivation(desk: Desk) -> None:
-    """64 clients with the token and 200 without, each of which sends a request and reads no answer."""
-
-    async def steps(desk: Desk) -> None:
-        server = Server([desk.flight], TOKEN, desk.control)
-        server.listen(0)
-        clients = []
-        try:
-            lease = json.loads((await post(server, {"do": "state"})).body)["lease"]
-            for k in range(MAX_CONNECTIONS + 200):
-                token = TOKEN if k < MAX_CONNECTIONS else ""
-                _, writer = await asyncio.open_connection("127.0.0.1", server.port)
-                head = ("GET /data/0 HTTP/1.1", f"Host: 127.0.0.1:{server.port}", f"{TOKEN_HEADER}: {token}", "", "")
-                writer.write("\r\n".join(head).encode())
-                writer.transport.pause_reading()  # type: ignore[attr-defined]
-                clients.append(writer)
-            for _ in range(20):  # more than the reserved connections
-                assert (await post(server, {"do": "deactivate"}, **{"X-Control-Lease": lease})).code == 200
-        finally:
-            for writer in clients:
-                writer.transport.abort()
-            await server.close()
-        assert desk.nodes.done == 20 * [("activate", False)]
 
     with_desk(desk, steps)
