@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from flight_analysis.report.account import Account, account, final_outcome
-from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results, unflown_legs
+from flight_analysis.report.account import account, final_outcome
+from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
 from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
@@ -21,8 +21,8 @@ from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance import guidance, path
 from flight_guidance.guidance import Guidance
 from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
-from flight_guidance.modes import Lateral, Mode, bits
-from flight_guidance.notices import LEARNED, Notices
+from flight_guidance.modes import Lateral, Mode
+from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
 from flight_guidance.reach import Authority
@@ -78,11 +78,6 @@ def test_last_line_touches_orbit(last: path.Point) -> None:
     assert math.cos(touching.track - error.track) == pytest.approx(1.0)
 
 
-def test_short_line_leads_to_last_waypoint() -> None:
-    (line, orbit) = path.route([(0.0, 0.0), (150.0, 0.0)], 200.0, 100.0)
-    assert (line, orbit) == (Line((0.0, 0.0), (150.0, 0.0)), Arc((150.0, 0.0), 200.0))
-
-
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
     """Lengths of the way onto a course to the north at the origin."""
@@ -98,26 +93,6 @@ def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
     assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(1000.0 + R * math.pi / 2.0)
     # A turn to the tangent costs R times the angle.
     assert length((-1000.0, 0.0), 0.5) == pytest.approx(1000.0 + 0.5 * R)
-
-
-def test_shorter_side_joins_leg() -> None:
-    def side(position: path.Point, flown: float) -> float:
-        return float(path.joining((0.0, 0.0), 0.0, R, R, position, flown))
-
-    assert side((1000.0, 2.0 * R), math.pi) == 1.0
-    assert side((1000.0, -2.0 * R), math.pi) == -1.0
-    assert side((-R / 2.0, 10.0), 0.5) == 0.0  # near, and nearly on course
-    assert abs(side((-10.0, 0.0), math.pi)) == 1.0  # near, on the opposite course
-
-
-def test_leg_is_joined_near_its_start_on_course() -> None:
-    def joined(position: path.Point, flown: float) -> bool:
-        return bool(path.joined((0.0, 0.0), 0.0, R, position, flown))
-
-    assert joined((1.0, 5.0), math.radians(29.0))
-    assert not joined((1.0, 5.0), math.radians(31.0))
-    assert not joined((-1.0, 5.0), 0.0)  # before the start
-    assert not joined((1.0, R + 1.0), 0.0)  # beside the start
 
 
 def test_wind_is_velocity_over_ground_less_through_air() -> None:
@@ -361,49 +336,3 @@ def test_summary_says_which_legs_were_flown() -> None:
     outcome = final_outcome(COMPLETED, account(tape, None))
     assert (outcome, exit_status(outcome)) == ("completed, missed leg 1 by 321 m", STATUS_INCOMPLETE)
     assert final_outcome(outcome, account(tape, None)) == outcome
-
-
-def test_flight_that_ends_on_earlier_leg_has_legs_not_flown() -> None:
-    """A box of three lines, two fillets and the orbit: legs 0 to 5."""
-    box = {"north": [0.0, 2000.0, 2000.0, 0.0], "east": [0.0, 0.0, 2000.0, 2000.0], "altitude": [100.0] * 4}
-    section = GuidanceConfig.validate_mapping(SECTION | {"route": box}, "guidance")
-    number = guidance.digest(section.plan(section.waypoints()))
-
-    def unflown(leg: list[float], **channels: ArrayLike) -> list[int]:
-        return list(unflown_legs(log_of(3, leg=leg, route=number, **channels), section))
-
-    assert unflown([0, 1, 2]) == [2, 3, 4]
-    assert unflown([3, 4, 5]) == []
-    left = {"mode__lateral": [Lateral.ROUTE, Lateral.ORBIT, Lateral.ORBIT]}
-    assert unflown([2, 0, 0], **left) == [2, 3, 4]  # by the fence
-    assert unflown([2, 0, 0], **left, given=[0, bits(("north", "east", "radius")), 0]) == []
-    assert list(unflown_legs(log_of(1, route=1.0), section)) == []  # a route that the log does not have
-
-
-@pytest.mark.parametrize(("unflown", "words"), [((3,), "leg 3 not flown"), ((2, 3, 4), "legs 2 to 4 not flown")])
-def test_legs_not_flown_are_in_outcome(unflown: tuple[int, ...], words: str) -> None:
-    missed = FlownLeg(1, 3.0, 3.0, 5.0, "missed", 321.0)
-    flown = Account(9.0, {}, ("u 3 of 9 samples",), legs=(missed,), unflown=unflown)
-    outcome = final_outcome(COMPLETED, flown)
-    assert outcome == f"completed, missed leg 1 by 321 m, {words}, log incomplete: u 3 of 9 samples"
-    assert final_outcome(outcome, flown) == outcome
-    assert exit_status(final_outcome(COMPLETED, flown._replace(lacks=(), legs=()))) == STATUS_INCOMPLETE
-    assert final_outcome("lost contact with guidance", flown) == "lost contact with guidance"
-
-
-def test_flight_carried_back_is_noticed_once() -> None:
-    ahead = np.where(np.arange(60) < 20, SPEED, -5.0)  # from 20 s on in a wind of 30 m/s from ahead
-    tape = log_of(60, pose__v_north=ahead, wind__north=ahead - SPEED)
-    beyond = "above 3.5 m/s circles of the least radius take more than the largest bank"
-    assert guidance_notices(tape, CONFIG) == [
-        "guidance at t = 30.0 s: the ground speed along the path is below 0 for 10 s, in a wind of 30.0 m/s",
-        f"guidance at t = 30.0 s: wind 30.0 m/s, guidance.wind 0 m/s: {beyond}",
-    ]
-    # An aircraft that turns back flies back through the air too.
-    assert guidance_notices(log_of(60, pose__v_north=-SPEED), CONFIG) == []
-
-
-def test_log_without_channels_has_no_notices() -> None:
-    old = Tape({"guidance": Signal(np.array([0]), ("leg", "given"), np.zeros((1, 2)))}, 0)
-    assert (flown_legs(old), guidance_notices(old, CONFIG)) == ([], [])
-    assert Notices(0.0, 0.2, lambda speed: speed).of_log(np.array([0.0]), {"leg": np.array([0.0])}) == []
