@@ -19,9 +19,6 @@ from flight_analysis.closed_loop.replay import replay, vary
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, written
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.metrics import errors_by_model
-from flight_analysis.report.figures import learned_figure, plot_context
-from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_in_process
 from flight_cli.cli import application
 from flight_core.modes import Mode
@@ -36,10 +33,8 @@ from flight_design.learning.learner import Known, Learner
 from flight_design.learning.scenario_learner import learn_again, learner
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from flight_view.flight import Flight
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.observer import PastTick, estimates_after
-from rise_di_controller.proposals import acting_inputs, authority, authority_names, changes, given_up
+from rise_di_controller.proposals import acting_inputs, authority, authority_names, given_up
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
@@ -81,6 +76,12 @@ def made_learner(chosen: Scenario) -> Learner:
     made = make(chosen.rise_di())
     assert isinstance(made, Learner)
     return made
+
+
+def record_rest(made: Learner) -> None:
+    """10 s at rest, with the law of the start."""
+    for k in range(1001):
+        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
 
 
 def error(tape: Tape, first: float, last: float) -> FloatArray:
@@ -163,14 +164,6 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flow
         learner(scenario(learn={"prior": "navion_lateral"}))
 
 
-def test_log_teaches_with_other_settings(flown: Flown) -> None:
-    """The flight has other parameters than what this learner proposes: it knows no refusal, and identifies once a window."""
-    result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--updates", "10"])
-    first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
-    assert first.startswith("t = 10.00 s: B["), result.output
-    assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
-
-
 def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     tape = read_run(flown.run).tape
     ticks, t = tape["internals"], tape.time("internals")
@@ -183,14 +176,6 @@ def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     assert [step.sentence for step in steps] == [f"record: found {length} s, expected 10 s" for length in (2.99, 3.01)]
     with pytest.raises(ParameterError, match=r"^the log: found at most 5\.02 s of ticks of an active controller"):
         learn_again(cut, scenario(learn={"updates": [6.0]}))
-
-
-def test_log_that_ends_before_first_update_is_refused(flown: Flown) -> None:
-    with pytest.raises(
-        ParameterError,
-        match=r"^the log: found at most 22 s of ticks of an active controller, expected 30 s or more, the first of learn",
-    ):
-        learn_again(read_run(flown.run).tape, scenario(learn={"updates": [30.0]}))
 
 
 def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:
@@ -220,38 +205,16 @@ def test_short_record_is_refused() -> None:
     assert made.propose(0) == LearnerResult(None, "record: found 5.01 s, expected 10 s")
 
 
-def test_record_without_motion_and_noise_is_refused() -> None:
-    made = made_learner(scenario(learn={"updates": [10.0]}))
-    for k in range(1001):
-        made.take(k * 10_000_000, np.array([0.0, 0.01 * (k % 3), 0.0, 0.0]), np.zeros(4), 0)
-    expected = "record: found a constant q, V, r, expected outputs that move, or the noise of their sensors"
-    assert made.propose(0) == LearnerResult(None, expected)
-
-
 def test_identification_is_due_where_last_proposal_does_not_fly(monkeypatch: pytest.MonkeyPatch) -> None:
     made, identified = made_learner(scenario(learn={"updates": [15.0]})), Mock(return_value=SimpleNamespace(parts=()))
     monkeypatch.setattr(design_learner, "identify", identified)
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
+    record_rest(made)
     sentence = made.propose(scenario(learn={"updates": [15.0]}).rise_di().digest()).sentence
     assert sentence == "no identification is due, and no part is tested for a change"
     identified.assert_not_called()
     # other parameters fly: the proposal was refused, or the controller fell back
     assert made.propose(0).sentence == "each part flies the law of the start from before on"
     identified.assert_called_once()
-
-
-def test_only_part_of_a_proposal_that_was_refused_is_proposed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    chosen = scenario(learn={"updates": [10.0]})
-    made, start = made_learner(chosen), chosen.rise_di()
-    worse, better = (Prediction(np.ones(2), np.ones(2), value) for value in (1.0, 2.0))
-    aileron = Entry("B", "p", "aileron", 85.94, 0.1, 0.01, 85.94)
-    part = Part(("aileron", "rudder"), ("p", "r"), (aileron,), worse, better, "", 0.0, gusts=False)
-    monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
-    sentences = [made.propose(start.digest()).sentence for _ in range(2)]  # the start flies on
-    assert sentences == ["B[p, aileron] +10 +- 1 %"] * 2
 
 
 def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,8 +230,7 @@ def test_model_with_coupling_is_not_replaced_by_one_of_a_part(monkeypatch: pytes
     identified = Mock(side_effect=[SimpleNamespace(parts=each) for each in parts])
     monkeypatch.setattr(design_learner, "identify", identified)
     monkeypatch.setattr(made, "_design", lambda *_: start)
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
+    record_rest(made)
     assert made.propose(0).sentence == "B[q, elevator] +10 +- 1 %, with coupling"
     assert made.model is not None
     assert made.model.matrix_b()[5, 0] == pytest.approx(0.3 * 29.0)
@@ -297,15 +259,6 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     again = learned.propose(fallen.digest()).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
-    restarted = made_learner(scenario())  # it has proposed nothing yet
-    restarted._record = learned._record
-    restarted._first_ns = learned._first_ns
-    fresh = restarted.propose(given_up(start, start, ["q", "V"]).digest()).controller
-    assert fresh is not None
-    assert acting_inputs(fresh) == ("aileron", "rudder")
-    none_left = given_up(start, fresh, ["p", "r"]).digest()
-    sentences = [restarted.propose(none_left).sentence for _ in range(2)]
-    assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
 
 
 @pytest.mark.parametrize(
@@ -330,29 +283,8 @@ def test_input_is_dead_only_where_a_free_a_predicts_as_well_without_it(
     monkeypatch.setattr(design_learner, "identify", identified)
     change = Change(("p", "r"), 10.0, {"aileron": 1.0, "rudder": 0.05}, "rudder")
     monkeypatch.setattr(made, "_changes", lambda _: [change])
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
+    record_rest(made)
     assert made.propose(start.digest()).sentence.startswith(sentence)
-
-
-def test_prior_after_a_change_is_the_model_that_flew_and_the_file_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A wrong model that looked like a change was the prior from then on, and each later model had entries at their bounds."""
-    made, file = made_learner(scenario()), load_airframe("osprey")
-    flew = file.with_matrices(file.matrix_a(), 1.1 * file.matrix_b(), np.ones((8, 3)))
-    at_bounds = tuple(Entry("B", "p", name, 1.0, -0.6, 0.1, 1.0) for name in ("aileron", "rudder"))
-    coloured = Prediction(np.ones(2), np.full(2, 9.0), 1.0)
-    refused = Part(("aileron", "rudder"), ("p", "r"), at_bounds, coloured, coloured, "at a bound", 0.0, gusts=False)
-    identified = Mock(return_value=SimpleNamespace(parts=(refused,)))
-    monkeypatch.setattr(design_learner, "identify", identified)
-    monkeypatch.setattr(made, "_changes", lambda _: [Change(("p", "r"), 10.0, {"rudder": 0.4}, "")])
-    monkeypatch.setattr(made, "_model", flew)
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
-    made.propose(made._proposed)
-    monkeypatch.setattr(made, "_changes", lambda _: [])
-    for _ in range(2):
-        made.propose(made._proposed)
-    assert [call.args[1] for call in identified.call_args_list] == [flew, file, flew]
 
 
 def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
@@ -365,28 +297,6 @@ def test_effect_that_gusts_hide_does_not_replace_a_stronger_one() -> None:
     assert design_learner.weaker(part._replace(gusts=False), flown) == ""
     near = effects[0]._replace(error=-0.09), effects[1]
     assert design_learner.weaker(part._replace(entries=near), flown) == ""
-
-
-def test_weaker_effect_replaces_that_of_the_file_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No flight has measured the file: one with an elevator that was a third too strong refused each model in gusts."""
-    chosen = scenario(learn={"updates": [10.0, 11.0, 12.0], "latency": 0.0})
-    made, white = made_learner(chosen), Prediction(np.ones(2), np.ones(2), 1.0)
-    better, thrust = white._replace(log_likelihood=2.0), Entry("B", "V", "thrust", 6.0, 0.0, 0.01, 6.0)
-    found = []
-    for error, after in ((0.0, white), (-0.3, better), (-0.5, better)):
-        effects = Entry("B", "q", "elevator", 56.1499, error, 0.02, 56.1499), thrust
-        found.append(Part(("elevator", "thrust"), ("q", "V"), effects, white, after, "", 0.0, gusts=True))
-    identified = Mock(side_effect=[SimpleNamespace(parts=(part,)) for part in found])
-    monkeypatch.setattr(design_learner, "identify", identified)
-    monkeypatch.setattr(made, "_design", lambda *_: chosen.rise_di())
-    sentences = []
-    for k in range(1201):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
-        if k in {1000, 1100, 1200}:
-            sentences.append(made.propose(made._proposed).sentence)
-    assert sentences[0] == "q and V of the airframe osprey as it is"
-    assert sentences[1].startswith("B[q, elevator] -30 +- 2 %")
-    assert sentences[2].startswith("B[q, elevator]: found 71 % of that of the model that flies")
 
 
 LATERAL = Entry("B", "p", "aileron", 85.9437, 0.1, 0.05, 85.9437), Entry("B", "r", "rudder", 9.74028, -0.2, 0.08, 9.74028)
@@ -405,18 +315,8 @@ def learner_that_finds(part: Part, monkeypatch: pytest.MonkeyPatch) -> Learner:
     """A learner with a record of 10 s, whose search finds a part."""
     made = made_learner(scenario(learn={"updates": [10.0]}))
     monkeypatch.setattr(design_learner, "identify", lambda *_, **__: SimpleNamespace(parts=(part,)))
-    for k in range(1001):
-        made.take(k * 10_000_000, np.zeros(4), np.zeros(4), 0)
+    record_rest(made)
     return made
-
-
-def test_model_that_leaves_out_what_the_aircraft_does_is_refused_for_its_whiteness_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """White innovations have 1 with a deviation of 0.3; the bound is 3."""
-    refused = learner_that_finds(lateral(whiteness=3.1), monkeypatch).propose(0)
-    assert refused == LearnerResult(None, "innovations of r: found a whiteness of 3.1, expected at most 3, 1 being white")
-    assert learner_that_finds(lateral(whiteness=2.9), monkeypatch).propose(0).controller is not None
 
 
 def test_guidance_gets_effects_less_two_deviations_of_what_was_learned(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -453,30 +353,6 @@ def test_delay_margin_counts_the_delay_that_was_found(
     late = f"u is up to {1e3 * (delay + 2.0 * deviation):.0f} ms late: " if margin > 0.03 else ""
     assert sentence == f"{late}none has it"
     assert made.model is None  # what flies stays
-
-
-def test_file_that_explains_the_flight_behind_a_delay_is_designed_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The nominal model predicts the flight with the delay that the search found: without it, its innovations are not white."""
-    white = Prediction(np.ones(2), np.ones(2), 2.0)
-    made = learner_that_finds(lateral(delay=0.02, delay_deviation=0.002)._replace(before=white, after=white), monkeypatch)
-    proposed = made.propose(0)
-    assert proposed.sentence == "p and r of the airframe osprey as it is"
-    assert proposed.controller is not None
-    assert proposed.controller.observer is not None
-    assert proposed.controller.observer.margin == pytest.approx(0.034)  # found, two deviations, and 10 ms that are left
-
-
-def test_start_with_less_margin_keeps_what_it_leaves_beyond_its_own_delay() -> None:
-    observer = scenario().rise_di().model_dump()["observer"] | {"margin": 0.015}
-    start = scenario(delay=0.006, observer=observer).rise_di()
-    assert design_learner.margin_behind(0.006, start) == 0.015
-    assert design_learner.margin_behind(0.02, start) == pytest.approx(0.029)  # 9 ms beyond 6 ms, and so beyond 20 ms
-
-
-def test_part_whose_inputs_are_later_than_the_search_looks_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four deviations of 15 ms: the delay may be any longer one."""
-    refused = learner_that_finds(lateral(delay=0.06), monkeypatch).propose(0)
-    assert refused == LearnerResult(None, "aileron and rudder: found u 60 ms late or later, expected less than 60 ms")
 
 
 def test_model_of_a_late_u_has_margin_behind_its_delay_and_errs_less_than_the_law_alone() -> None:
@@ -550,95 +426,3 @@ def test_law_with_wrong_model_falls_back_and_replay_is_equal() -> None:
     # the law alone has up to 0.11 m/s in this turbulence
     assert (error(tape, 10.0, 12.0) < 0.15).all()
     assert replay(tape).equal()
-
-
-def test_filter_of_a_constant_record_begins_as_after_a_long_one() -> None:
-    """What the law holds is known at once: 5 s are too short to estimate it."""
-    params = find_scenario("osprey_observer").rise_di().tuned_law().params
-    e, u = np.array([0.01, -0.02, 0.01, 0.1]), np.array([0.02, 0.01, -0.02, 0.05])
-    record = (PastTick(e, u, np.zeros(4), np.float64(0.01)),) * 2
-    z = np.zeros(len(params.Phi))
-    for _ in range(60_000):  # six times as long as the slowest decay, of 100 s
-        z = params.Phi @ (z + params.L @ (e - params.H @ z)) + params.Gamma @ (u - 0.01)
-    assert estimates_after(record, np.full(4, 0.01), [params] * len(record)) == pytest.approx(
-        z, rel=0.01, abs=1e-6
-    )  # exp(-6) is 0.0025
-
-
-def test_changes_in_log_are_those_that_the_controller_took(flown: Flown) -> None:
-    start = scenario().rise_di()
-    (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
-    learned = vary(start, change)
-    assert changes(start, learned) == {
-        name: tuple(value) if isinstance(value, list) else value for name, value in change.items()
-    }
-    assert learned.observer is not None
-    assert learned.observer.part == 0.6
-
-
-def test_page_shows_what_became_of_proposals(flown: Flown) -> None:
-    flight = Flight(flown.run)
-    flight.update()
-    shown = [event for event in flight.events if event.kind == "learning"]
-    assert [f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.text}" for event in shown] == flown.lines
-    (changed,) = (event.text for event in flight.events if event.kind == "parameter")
-    assert "observer.F = 76 values" in changed
-
-
-def test_page_shows_known_entries_and_measured_error_by_model(flown: Flown) -> None:
-    flight, ticks = Flight(flown.run), read_run(flown.run).tape["internals"]
-    flight.update()
-    assert "B[p, aileron]" in flight.description["learned"]
-    assert "A[V, V]" not in flight.description["learned"]  # a slow decay, which 14 s do not show
-    e, t = ticks.group("e"), ticks.stamp_ns / NANOSECONDS
-    rms = [1e3 * np.sqrt(np.mean(e["p"][within] ** 2)) for within in (t < SWITCH, t >= SWITCH)]
-    column = flight.models["headings"].index("p (mrad/s)")
-    rows = flight.models["rows"]
-    assert [row[0] for row in rows] == ["start", "model 1"]
-    assert [float(row[column]) for row in rows] == pytest.approx(rms, rel=0.01)  # three digits
-
-
-def test_page_has_the_error_of_the_engaged_law_alone(flown: Flown) -> None:
-    flight = Flight(flown.run)
-    flight.update()
-    before = flight.models["rows"]
-    names = read_run(flown.run).tape["internals"].names
-    released = np.full((100, len(names)), 9.0)  # errors after the end, with parameters of their own
-    released[:, names.index("mode")] = Mode.INACTIVE
-    flight._take_errors(10**12 + np.arange(100), names, released)
-    assert flight.models["rows"][0] == before[0]
-    assert [row[-4:] for row in flight.models["rows"]] == [row[-4:] for row in before]
-
-
-def test_report_has_error_by_model(flown: Flown) -> None:
-    flight = read_flight(flown.run)
-    before, under = errors_by_model(flight.tape)
-    assert (before.stop, under.start) == (SWITCH, SWITCH)
-    truth = error(flight.tape, SWITCH, 23.0)
-    assert [under.rms[name] for name in NAMES] == pytest.approx(truth, rel=1e-2)
-    assert [span["rms"] for span in flight.summary["models"]] == [before.rms, under.rms]
-
-
-def test_error_by_model_is_that_of_the_engaged_law(flown: Flown) -> None:
-    tape = read_flight(flown.run).tape
-    ticks, t = tape["internals"], tape.time("internals")
-    changed, since = ticks.values.copy(), SWITCH + 2.0  # s, from which on the law is deactivated
-    changed[t >= since, ticks.names.index("mode")] = Mode.INACTIVE
-    changed[t >= since + 2.0, ticks.names.index("parameters")] = changed[0, ticks.names.index("parameters")]
-    signals = {**tape.signals, "internals": Signal(ticks.stamp_ns, ticks.names, changed)}
-    before, under = errors_by_model(replace(tape, signals=signals))  # none after the release
-    truth = error(tape, SWITCH, since)
-    assert [under.rms[name] for name in NAMES] == pytest.approx(truth, rel=1e-2)
-    assert before.stop == SWITCH
-
-
-def test_report_draws_what_was_identified_with_its_deviations(flown: Flown) -> None:
-    flight, found = read_flight(flown.run), flown.learner.identification
-    assert found is not None
-    figure = learned_figure(plot_context(flight.tape, {}, {}))
-    assert figure is not None
-    (entry,) = (entry for entry in found.entries if entry.name == "B[p, aileron]")
-    (drawn,) = (trace for trace in figure.data if trace["name"] == entry.name)
-    assert drawn["y"] == pytest.approx([entry.nominal * (1.0 + entry.error)])
-    assert drawn["error_y"]["array"] == pytest.approx([2.0 * abs(entry.nominal) * entry.deviation])
-    assert drawn["x"] == pytest.approx([14.0])

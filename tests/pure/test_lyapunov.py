@@ -8,6 +8,7 @@ determines P: P stays above zero, and V2 bounds e and r, only if (29), (30) hold
 """
 
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -46,6 +47,7 @@ def fly_example(dt: float, duration: float, **gains: Any) -> tuple[Example, LawP
     return case, params, evidence(case.plant, fly(case.plant, case.y_m, dt, params, case.x_0), params)
 
 
+@cache
 def osprey(rate: float, beta_factor: float = 1.0, duration: float = 12.0) -> tuple[Scenario, KnownPlant, Evidence]:
     """The default scenario at another rate of the law, with both gusts in its first twelve seconds."""
     scenario = find_scenario("osprey_gust")

@@ -77,17 +77,6 @@ def test_missed_tick_predicts_with_the_u_that_was_held() -> None:
     assert law.missed(state, measured(0.0, u_before=10.5), observer).z == pytest.approx([1.5], abs=1e-15)
 
 
-def test_filter_over_the_record_equals_the_ticks_of_the_law() -> None:
-    # the same equations from another start: each tick leaves Phi (1 - L H) = 0.375 of its effect, 60 ticks 1e-26
-    law, observer = with_observer(TRIM_LAW), params()
-    state = law.engage(measured(1.0), observer)
-    record = []
-    for e in np.sin(np.arange(60.0)):
-        state, u = law.step(state, measured(e), DT, observer)
-        record.append(PastTick(vector(e), u - TRIM, vector(7.0), DT))
-    assert estimates_after(tuple(record), vector(0.0), [observer] * len(record)) == pytest.approx(state.z, abs=1e-14)
-
-
 def test_filter_over_the_record_is_that_of_each_tick() -> None:
     law, slow = with_observer(TRIM_LAW), params()
     fast = slow._replace(Phi=0.6 * slow.Phi, Gamma=2.0 * slow.Gamma)

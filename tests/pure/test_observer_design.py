@@ -11,7 +11,7 @@ from aircraft_sim.airframe import load_airframe
 from aircraft_sim.uncertainty import KINEMATIC, nominal_and_sampled
 from control_laws import observer_design
 from control_laws.nominal_model import NominalModel
-from control_laws.observer_design import ExtendedStateWeights, Names, ObserverDesign, Weights
+from control_laws.observer_design import ExtendedStateWeights, Names, Weights
 from flight_core.vectors import FloatArray
 
 pytestmark = pytest.mark.package("control_laws")
@@ -62,15 +62,6 @@ def uncertain(count: int) -> NominalModel:
     return osprey()._replace(A=A, B=B)
 
 
-def test_names_of_states_say_what_each_estimate_is() -> None:
-    design = observer_design.aircraft_observer(osprey(), NAMES, weights())
-    assert len(design.states) == len(design.Phi) == 8 + 4 + 3 + 4
-    assert {"x.alpha", "position.elevator", "wind.vertical", "disturbance.q"} <= set(design.states)
-    assert [design.states[k] for k in design.H.argmax(axis=1)] == ["x.q", "x.V", "x.p", "x.r"]
-    extended = observer_design.extended_state_observer(osprey(), NAMES, extended_weights())
-    assert extended.states[::5] == ("x.q", "position.thrust", "disturbance.p", "disturbance_rate.r")
-
-
 def test_step_of_aircraft_model_is_motion_of_equations() -> None:
     model, wind_time = osprey(), np.array([4.7, 0.6, 1.9])
     sampled = observer_design.aircraft_model(model, NAMES, wind_time)
@@ -99,23 +90,6 @@ def test_extended_state_step_solves_equations() -> None:
 
     flown = solve_ivp(motion, (0.0, model.period), z, method="DOP853", rtol=1e-12, atol=1e-14).y[:, -1]
     np.testing.assert_allclose(sampled.Phi @ z + sampled.Gamma @ u, flown, atol=1e-11)
-
-
-def one_of(design: ObserverDesign, k: int) -> ObserverDesign:
-    return design._replace(Phi=design.Phi[k], Gamma=design.Gamma[k], L=design.L[k], F=design.F[k])
-
-
-def test_batched_designs_equal_single_designs() -> None:
-    """Designs for many aircraft and weights at once equal the single designs."""
-    models, sets = uncertain(3), weights(3)
-    many = observer_design.aircraft_observer(models, NAMES, sets)
-    for k in range(3):
-        alone = observer_design.aircraft_observer(
-            models._replace(A=models.A[k], B=models.B[k]), NAMES, Weights(*(weight[k] for weight in sets))
-        )
-        # both stop when a doubling adds less than 1e-13 of P, so they may differ by one of them
-        for matrix, expected in zip(one_of(many, k)[1:], alone[1:], strict=True):
-            np.testing.assert_allclose(matrix, expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["aircraft", "extended state"])

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Selection of an observer: shipped scenarios, delay margin, models that are refused, the one without A, the command."""
 
-import math
 from functools import cache
 from pathlib import Path
 
@@ -21,14 +20,12 @@ from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import observer_selection
-from flight_design.gains.gain_design import observed
 from flight_design.gains.observer_selection import (
     gains_by_rule,
     model_for,
     with_aircraft_observer,
     with_extended_state_observer,
 )
-from flight_design.gains.requirement import Requirement
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -97,20 +94,6 @@ def test_margin_of_selected_observer_holds_and_is_one_that_was_asked_for() -> No
     assert np.prod(by_rule(0.045).relaxation) > np.prod(by_rule(0.03).relaxation)
 
 
-def test_gain_set_that_the_margins_change_least_is_taken() -> None:
-    gains = gains_by_rule(model_for(OSPREY, SERVO.controller, NOISE), tuple(OSPREY.gusts), OSPREY.speed)
-    narrow = gains._replace(weights=gains.weights._replace(effort=1.5 * gains.weights.effort))
-    weak = gains._replace(weights=gains.weights._replace(effort=4.0 * gains.weights.effort))
-
-    def selected(*sets: observer_selection.ObserverGains) -> observer_selection.SelectedObserver:
-        return with_aircraft_observer(SERVO.rise_di(), OSPREY, sets, NOISE, 0.045, uncertain=False)
-
-    taken = selected(gains, narrow)
-    assert taken.place == 1
-    assert taken.controller == selected(narrow).controller
-    assert selected(weak, weak).place == 0  # neither needs any
-
-
 def _plant(controller: RiseDiConfig) -> tuple[FloatArray, FloatArray, FloatArray]:
     nominal = controller.nominal()
     assert nominal is not None
@@ -133,31 +116,6 @@ def test_observer_by_rule_halves_error_of_speed_roll_and_yaw() -> None:
     # q, V, p, r in gusts: measured 0.94, 0.15, 0.14, 0.46; the rule is a start, and the gains of a search are better still
     alone, observed = rms_alone(), rms(simulate(with_observer(by_rule().controller)))
     assert (observed < [1.0, 0.5, 0.5, 0.5] * alone).all()
-
-
-def test_extended_state_observer_needs_no_model_and_lowers_every_error() -> None:
-    # The model y_dot = Omega u has none of the aircraft's damping: 12 ms there are 26 ms on the osprey. Only K of p is lowered.
-    without_margins = Requirement(phase=0.01, gain=1.01, sensitivity=math.inf, damping=1e-9, worst_phase=0.0)
-    selected = with_extended_state_observer(SERVO.rise_di(), Omega(), NOISE, SIZE, 0.012, without_margins)
-    assert selected.delay_margin >= 0.012
-    np.testing.assert_array_equal(np.delete(selected.relaxation, 1), 1.0)
-    controller = selected.controller
-    assert controller.feedforward is not None
-    assert not any(controller.feedforward.A)
-    alone, observed = rms_alone(), rms(simulate(with_observer(controller)))
-    assert (observed < 0.6 * alone).all()  # measured 0.37, 0.33, 0.21, 0.42 in q, V, p, r
-
-
-def test_loop_much_slower_than_that_of_a_search_starts_from_rule_and_shows_progress() -> None:
-    # Behind an autopilot: 100 ms of total lag in q, where the search had 38 ms. The loop has to be stable, no more: the margins
-    # take half a minute.
-    behind, texts = SERVO.rise_di().model_copy(update={"delay": 0.065}), list[str]()
-    any_margins = Requirement(phase=0.01, gain=1.01, sensitivity=1e6, damping=1e-9)
-    controller, origin = observed(behind, SERVO, OSPREY, 0.0, any_margins, uncertain=False, progress=texts.append)
-    assert origin.startswith("observer of osprey: gains by a rule from the lags")
-    assert controller.observer is not None
-    assert all(text.startswith("observer: ") for text in texts)
-    assert len(texts) > 1
 
 
 def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

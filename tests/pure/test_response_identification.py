@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete
 
-from flight_core.parameters import ParameterError
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal
 from flight_core.vectors import FloatArray
@@ -77,30 +76,6 @@ def test_only_time_in_which_u_acts_on_aircraft_counts() -> None:
 def test_input_that_hardly_moves_refused_with_excitation_that_it_needs() -> None:
     found = identified(*flown(2e-4))
     assert all("excite" in sentence and "times as strongly" in sentence for sentence in found.refusal)
-
-
-def test_input_that_never_moves_refused_by_name() -> None:
-    y, u = flown(0.1)
-    still = Signal(u.stamp_ns, u.names, u.values * np.array([1.0, 0.0]))
-    found = identified(y, still)
-    assert found.refusal[1].startswith("r by rudder: found rudder constant")
-    assert np.isnan(found.Omega[:, 1]).all()
-    assert not found.refusal[0]
-
-
-def test_output_that_never_moves_refused_by_name() -> None:
-    y, u = flown(0.1)
-    found = identified(Signal(y.stamp_ns, y.names, np.where([True, False], y.values, 0.3)), u)
-    assert found.refusal[1].startswith("r by rudder: found r constant, expected it to move")
-    assert not found.refusal[0]
-    assert found.Omega[0, 0] == pytest.approx(OMEGA[0, 0], rel=0.2)
-    assert found.Omega[1, 0] == 0.0
-
-
-def test_short_log_refused_with_needed_time() -> None:
-    y, u = flown(0.1, seconds=5.0)
-    with pytest.raises(ParameterError, match=r"the log: found .* s in which u acts .* expected .* s or more"):
-        identified(y, u)
 
 
 def test_response_whose_sign_is_not_that_of_omega_is_no_fit() -> None:
