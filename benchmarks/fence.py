@@ -105,6 +105,7 @@ class Row(NamedTuple):
     farthest: float  # m beyond the fence
     turned: int  # flights with a bank of nine tenths of the largest
     lost: int  # flights
+    home: int  # flights within HOME_RADII at the end
 
     def figures(self) -> Iterator[evidence.Row]:
         """The rows of evidence."""
@@ -162,7 +163,7 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
     fence = Fence(of_radius(fence.zones, radius), at(fence.home, radius), radius)
     mission = replace(mission, guidance=mission.guidance._replace(fence=fence))
     control_law, params = scenario.controller.tuned_law()
-    beyond, banks, lost = [], [], 0
+    beyond, banks, lost, home = [], [], 0, 0
     for first in range(0, aircraft, CHUNK):
         A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
         directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
@@ -172,7 +173,8 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
         beyond += np.asarray(figures["max.breach"]).tolist()
         banks += np.asarray(figures["max.phi"]).tolist()
         lost += int(np.sum(np.asarray(result.diverged)))
-    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)
+        home += int(np.sum(np.asarray(figures["home"]) <= HOME_RADII * radius))
+    return row_of(OSPREY, shape, wind, beyond, banks, lost, mission.guidance.limits.bank)._replace(home=home)
 
 
 def fly_alone(name: str, shape: str, wind: str) -> Row:
@@ -187,7 +189,10 @@ def fly_alone(name: str, shape: str, wind: str) -> Row:
     tape = simulate(scenario.vary(guidance={"fence": fence, "program": program}))
     beyond = max(-float(tape["guidance"]["fence.clearance"].min()), 0.0)
     bank = float(np.abs(tape["pose"]["phi"]).max())
-    return row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
+    pose, home = tape["pose"], at(HOME, radius)
+    to_home = math.hypot(pose["north"][-1] - home[0], pose["east"][-1] - home[1])
+    row = row_of(name, shape, wind, [beyond], [bank], int(tape.outcome != COMPLETED), section.bank)
+    return row._replace(home=int(to_home <= HOME_RADII * radius))
 
 
 def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]:
@@ -204,7 +209,7 @@ def fly_home(aircraft: int, seed: int, show: Callable[[Row], Any]) -> list[bool]
 def row_of(name: str, shape: str, wind: str, beyond: list[float], banks: list[float], lost: int, largest: float) -> Row:
     """A row from the distances beyond the fence, m, and the largest banks of the flights."""
     outside, turned = sum(distance > 0.0 for distance in beyond), sum(bank > 0.9 * largest for bank in banks)
-    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost)
+    return Row(name, shape, wind, len(beyond), outside, round(max(beyond), 2), turned, lost, 0)
 
 
 def main() -> int:

@@ -20,17 +20,15 @@ from tests.conftest import REPOSITORY
 from aircraft_sim import jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, Command, FlightCondition, WindModel, aircraft_names
+from aircraft_sim.jsbsim_aircraft import INPUTS, Command, FlightCondition, WindModel, aircraft_names
 from aircraft_sim.jsbsim_model import JsbsimModel
-from aircraft_sim.jsbsim_trim import sideslip_zero
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core import isolated
-from flight_core.outcome import FlightEnded, exit_status
+from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError
-from flight_core.units import FOOT
 from flight_core.vectors import FloatArray
 
 pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
@@ -83,23 +81,6 @@ def test_trim_is_an_equilibrium_that_lasts(condition: FlightCondition) -> None:
     assert np.max(np.abs(truth["x.altitude"])) < 0.1
 
 
-def test_in_trim_every_deviation_is_zero() -> None:
-    model = cessna()
-    # To rounding: altitude is a difference of radii of 6.4e6 m, whose last digit is 1e-9 m.
-    assert np.max(np.abs(model.y())) < 1e-12
-    assert np.max(np.abs(model.truth(0))) < 1e-8
-    assert model.trim.states[list(STATES).index("V")] == pytest.approx(46.3, rel=1e-6)
-    assert model.trim.states[list(STATES).index("altitude")] == pytest.approx(1219.2, rel=1e-6)
-
-
-def test_end_stops_are_those_of_whole_command() -> None:
-    trim = cessna().trim
-    # The nose-down pitch trim uses a part of the elevator.
-    assert trim.commands + trim.upper == pytest.approx([1.0, 1.0, 1.0, 1.0])
-    assert trim.commands[1] + trim.lower[1] == pytest.approx(0.0)
-    assert trim.lower[0] == -1.0  # the other way the stick reaches its own stop first
-
-
 @pytest.mark.parametrize(
     ("name", "output", "sign", "duration"),
     [
@@ -117,13 +98,6 @@ def test_positive_command_has_sign_of_table(name: str, output: str, sign: float,
     assert output == "V" or max(rates, key=lambda channel: rates[channel]) == output
 
 
-def test_every_engine_gets_the_throttle() -> None:
-    # One engine of a twin alone would yaw the aircraft. Both together leave r unchanged.
-    truth = fly(cessna(condition=FlightCondition("737", 154.3, 6096.0, STEP_NS)), command(throttle=0.1), 1.0)
-    assert truth["x.V"][-1] > 0.05
-    assert np.max(np.abs(truth["x.r"])) < 1e-6
-
-
 @pytest.mark.parametrize(
     ("axis", "state", "scale"),
     # A wind w along x, y, z of the flight path adds -w to airspeed, -w/V0 to sideslip, -w/V0 to alpha.
@@ -136,18 +110,6 @@ def test_wind_acts_along_the_axes_of_trim(axis: str, state: str, scale: float) -
     assert peak == pytest.approx(2.0, rel=0.01)
     assert truth[f"x.{state}"][-1] == pytest.approx(scale * peak, rel=0.2)
     assert not any(truth[f"gust.{name}"].any() for name in AXES if name != axis)
-
-
-def test_the_wind_turns_with_the_heading() -> None:
-    model = cessna(one_gust("lateral", 2.0, 46.3 * 0.05))
-    node = model._node("attitude/psi-rad")
-    model._fdm["ic/psi-true-deg"] = 90.0
-    model._fdm.run_ic()
-    assert node.get_double_value() == pytest.approx(math.pi / 2.0)
-    model.advance(0, command(), 10 * STEP_NS)
-    # The aircraft heads east, so wind to the right blows to the south.
-    assert model._fdm["atmosphere/wind-north-fps"] * FOOT == pytest.approx(-2.0, rel=0.01)
-    assert model._fdm["atmosphere/wind-east-fps"] == pytest.approx(0.0, abs=1e-2)
 
 
 def test_turbulence_acts_from_the_first_sample_on() -> None:
@@ -194,32 +156,6 @@ def test_lost_engines_give_no_thrust(condition: FlightCondition) -> None:
     lost = dict(zip(model.truth_names, model.truth(0), strict=True))
     assert lost["actuator.throttle"] == -model.trim.commands[list(INPUTS).index("throttle")]
     assert max(thrusts(model)) <= 0.0
-
-
-def test_engine_runs_again_after_its_loss() -> None:
-    model = cessna()
-    model.retune(0, with_lost_throttle(0.0))
-    fly(model, command(), 2.0)  # the propeller spins down
-    assert max(thrusts(model)) <= 0.0
-    model.retune(0, with_lost_throttle(math.inf))
-    fly(model, command(), 1.0)
-    assert min(thrusts(model)) > 0.0
-
-
-def test_weak_engine_has_its_part_of_the_whole_throttle() -> None:
-    """JSBSim's own position of the throttle, behind its flight control system."""
-    model = cessna()
-    weak = {"weak_at": [0.0] * 4, "weak_effect": [1.0, 0.25, 1.0, 1.0]}
-    model.retune(0, aircraft_parameters(**SECTION, actuators=weak))
-    fly(model, command(throttle=0.1), 0.1)
-    throttle = model.trim.commands[list(INPUTS).index("throttle")]
-    assert model._fdm["fcs/throttle-pos-norm"] == pytest.approx(0.25 * (throttle + 0.1), rel=1e-6)
-
-
-def test_two_flights_agree_to_the_last_bit() -> None:
-    u = command(elevator=-0.05, throttle=0.1, aileron=0.1, rudder=0.02)
-    first, second = (fly(cessna(one_gust("vertical", 5.0, 30.0)), u, 3.0) for _ in range(2))
-    assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
 def test_flight_in_another_process_agrees_to_last_bit() -> None:
@@ -293,12 +229,10 @@ def test_crash_of_jsbsim_ends_flight_in_one_process_with_sentence(monkeypatch: p
     ("condition", "sentence"),
     [
         (("c172p", 20.0, 1219.2), "does not trim at 20 m/s and 1219.2 m: accelerations of .* are left at best"),
-        (("pa28", 51.0, 1219.2), "does not trim at .*: engine 1 cannot be started$"),
-        (("SGS", 25.0, 900.0), r"has no engine to control V with: no fcs/throttle-cmd-norm\[0\]$"),
         (("dr1", 41.0, 900.0), ".*: its model needs the property /sim/model/pushback/position-norm, which JSBSim alone "),
         (("blank", 41.0, 900.0), "cannot be loaded: "),
     ],
-    ids=["stalled", "engine", "glider", "property", "empty"],
+    ids=["stalled", "property", "empty"],
 )
 def test_condition_without_trim_refused_in_one_sentence(condition: tuple[str, float, float], sentence: str) -> None:
     with pytest.raises(FlightEnded, match=f"^jsbsim:{condition[0]} {sentence}") as ended:
@@ -319,39 +253,12 @@ def test_the_ground_ends_a_flight() -> None:
         fly(cessna(condition=CESSNA._replace(altitude=15.0)), command(elevator=0.3), 10.0)
 
 
-def test_soft_touch_of_wheels_is_landing() -> None:
-    """0.7 m above its wheels the aircraft sinks with less thrust, and touches before it sinks fast."""
-    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p landed at t = \d.* s, with a sink of [01]\.\d\d m/s$") as ended:
-        fly(cessna(condition=CESSNA._replace(altitude=2.0)), command(throttle=-0.2), 10.0)
-    assert exit_status(str(ended.value)) == 0
-
-
-def test_an_engine_that_stops_ends_a_flight() -> None:
-    model = cessna()
-    for i in range(2):
-        model._fdm[f"propulsion/tank[{i}]/contents-lbs"] = 0.0
-    with pytest.raises(FlightEnded, match=r"^jsbsim:c172p: engine 1 stopped at t = \d.* s, out of fuel$"):
-        fly(model, command(), 1.0)
-
-
-def test_state_that_is_not_finite_counts_as_diverged() -> None:
-    model = cessna()
-    assert not model.diverged()
-    model._x = np.array([np.nan, *np.zeros(len(STATES) - 1)])
-    assert model.diverged()
-
-
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"airframe": "jsbsim:c172q"}, r"airframe: found 'jsbsim:c172q', expected jsbsim:c172\w perhaps, or jsbsim:PATH "),
         ({"airframe": "jsbsim:../c172p"}, r"airframe: found 'jsbsim:../c172p', where no file is"),
         ({"speed": None}, r"speed: found none, expected the true airspeed to trim at, m/s"),
-        ({"altitude": None}, r"altitude: found none, expected the altitude to trim at, m"),
-        ({"bias": {"q": {"start": 0.0, "value": 1.0, "rise": 1.0}}}, "bias: found a value, expected none: jsbsim:c172p has no"),
         ({"uncertainty": {"A": 0.1}}, r"uncertainty: found a value, expected none: jsbsim:c172p has no matrices"),
-        ({"gusts": {"up": {"start": 0.0, "speed": 1.0, "length": 1.0}}}, r"gusts.up: found 'up', expected an axis of the wind"),
-        ({"actuators": {"lag": [0.1]}}, r"actuators.lag: found 1 values, expected 4, one for each of elevator, throttle, "),
         ({"airframe": "osprey"}, r"speed: found 46.3, expected none: the airframe osprey has a fixed trim"),
     ],
 )
@@ -365,16 +272,3 @@ def test_without_jsbsim_aircraft_refused_in_one_sentence(monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "jsbsim", None)  # its import then fails
     with pytest.raises(ParameterError, match=r"^aircraft\.airframe: found no Python package jsbsim, expected it"):
         aircraft_parameters(**SECTION)
-
-
-def test_channels_match_the_tables() -> None:
-    channels = aircraft_parameters(**SECTION).channels()
-    assert list(channels.outputs) == list(OUTPUTS) == ["q", "V", "p", "r"]
-    assert channels.inputs == {"elevator": "1", "throttle": "1", "aileron": "1", "rudder": "1"}
-    assert channels.speed == 46.3
-
-
-def test_sideslip_of_f15_grows_while_rates_held() -> None:
-    # In flight with p and r held, sideslip grows from 0.023 to 0.063 rad in 5 s: 0.20 1/s.
-    assert sideslip_zero(FlightCondition("f15", 180.06, 4572.0, STEP_NS)) == pytest.approx(0.20, abs=0.05)
-    assert sideslip_zero(CESSNA) < 0.0

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models of JSBSim of the user's own: found by path, with engines beside them or in a root, electric engines too."""
 
-import io
 import shutil
 import zipfile
 from pathlib import Path
@@ -24,7 +23,6 @@ from aircraft_sim.jsbsim_aircraft import (
     require_aircraft,
     root,
 )
-from aircraft_sim.jsbsim_files import model_files
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import trim_solution
 from flight_analysis.closed_loop.scenario_library import find_scenario
@@ -100,26 +98,6 @@ def test_archive_of_run_flies_alike(electric: Path, tmp_path: Path) -> None:
     assert (tmp_path / "elsewhere" / "engine" / "prop_75in2f.xml").is_file()  # of the package, which the model names
 
 
-def test_archive_has_same_bytes_and_no_foreign_file(electric: Path) -> None:
-    first = model_files(electric).archive()
-    foreign = electric.parent / "deep" / "notes.xml"  # a model may lie in a folder with much else, such as the home
-    foreign.parent.mkdir()
-    foreign.write_text("<notes/>", encoding="utf-8")
-    assert model_files(electric).archive() == first
-    names = set(zipfile.ZipFile(io.BytesIO(first)).namelist())
-    assert {"aircraft/plane/plane.xml", "aircraft/plane/Engines/own_engine.xml", "engine/prop_75in2f.xml"} == names
-
-
-def test_model_cut_short_is_one_sentence(electric: Path, tmp_path: Path) -> None:
-    model = tmp_path / "cut.xml"
-    model.write_bytes(electric.read_bytes()[:3000])
-    condition = FlightCondition(str(model), 46.3, 1219.2, STEP_NS)
-    with pytest.raises(
-        FlightEnded, match=r"cannot be loaded: .*cut.xml: found XML with no element found: .*, expected a whole file$"
-    ):
-        trim_solution(condition)
-
-
 def test_model_without_trim_of_its_own_trims_by_its_elevator(electric: Path, tmp_path: Path) -> None:
     # as flying wings have it: no surface reads fcs/pitch-trim-cmd-norm
     text = electric.read_text(encoding="utf-8")
@@ -158,13 +136,9 @@ def test_root_of_user_has_names_and_engines(tmp_path: Path, monkeypatch: pytest.
     ("path", "sentence"),
     [
         ("nowhere.xml", "found 'jsbsim:nowhere.xml', where no file is, expected the XML file of an aircraft of JSBSim"),
-        ("./empty", "found 'jsbsim:./empty', a folder with no model, expected a folder with one model"),
         ("./two", "found 'jsbsim:./two', a folder with a.xml, b.xml, expected a folder with one model"),
         ("empty", "found 'jsbsim:empty', expected jsbsim:./empty perhaps"),
-        ("engine.xml", "found 'jsbsim:engine.xml', a file with piston_engine, expected the XML file of an aircraft"),
         ("./page", "found 'jsbsim:./page', a file with html, expected the XML file of an aircraft"),
-        ("text.xml", "found 'jsbsim:text.xml', a file with no XML, expected the XML file of an aircraft"),
-        ("c172q", r"found 'jsbsim:c172q', expected jsbsim:c172\w perhaps, or jsbsim:PATH with a /"),
         ("zzz", "found 'jsbsim:zzz', expected a name in .*/aircraft, or jsbsim:PATH with a /"),
     ],
 )
@@ -182,12 +156,6 @@ def test_wrong_path_refused_with_what_is_there(
     with pytest.raises(ParameterError, match=f"^aircraft.airframe: {sentence}") as refused:
         aircraft_parameters(**SECTION, airframe=f"{PREFIX}{path}")
     assert len(str(refused.value)) < 300  # no list of all names
-
-
-def test_engine_in_small_letters_beside_model_is_found(electric: Path, tmp_path: Path) -> None:
-    model = write_model(tmp_path, "electric147kW", engines="engine")
-    assert np.array_equal(throttle_step(f"{PREFIX}{model}"), throttle_step(f"{PREFIX}{electric}"))
-    assert "aircraft/plane/engine/own_engine.xml" in model_files(model).members
 
 
 def test_missing_engine_named_with_folders_searched(electric: Path, tmp_path: Path) -> None:

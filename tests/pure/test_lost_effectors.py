@@ -11,9 +11,8 @@ from tests.conftest import REPOSITORY
 
 from aircraft_sim import plant
 from aircraft_sim.actuators import move
-from aircraft_sim.airframe import airframes, load_airframe
+from aircraft_sim.airframe import load_airframe
 from aircraft_sim.params import AircraftConfig
-from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_core.parameters import ParameterError
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
@@ -81,13 +80,6 @@ def test_hexarotor_loses_a_sixth_of_its_lift_and_the_moments_of_the_rotor(number
     assert [found[rate] for rate in "pqr"] == pytest.approx(expected.tolist(), rel=2e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize("name", airframes())
-def test_lost_surface_floats_at_trim(name: str) -> None:
-    surfaces = [surface for surface, column in load_airframe(name).inputs.items() if column.unit in {"rad", "crad", "deg"}]
-    for surface in surfaces:
-        assert not any(accelerations(name, surface).values())
-
-
 def positions(params: AircraftConfig, commands: list[float]) -> FloatArray:
     position, at = np.zeros(len(commands)), []
     for k in range(5):
@@ -132,10 +124,3 @@ def test_loss_of_an_unknown_thrust_is_refused_with_the_way_out(key: str) -> None
     )
     for accepted in ([5.0, never], [never, never], []):
         AircraftConfig.validate_mapping(values | {"actuators": {key: accepted}}, "aircraft")
-
-
-@pytest.mark.parametrize("name", scenarios())
-def test_each_effector_of_shipped_scenario_can_be_lost(name: str) -> None:
-    aircraft = find_scenario(name).aircraft
-    times = {"lost_at": [1.0] * len(aircraft.channels().inputs)}
-    find_scenario(name).vary(aircraft={"actuators": aircraft.actuators.model_dump() | times})

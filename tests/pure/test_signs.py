@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from tests.closed_loop import CALM_SERVO, error, fly, law_params, reference_outputs, still_air
+from tests.closed_loop import CALM_SERVO, error, fly, law_params, still_air
 
 from aircraft_sim.airframe import LIBRARY
-from aircraft_sim.dynamics import Aircraft
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import error_metrics
 from flight_core.vectors import FloatArray
-from rise_di_controller.law import LawParams
 
 pytestmark = [pytest.mark.package("rise_di_controller"), pytest.mark.slow]
 
@@ -78,66 +76,10 @@ def test_flipped_elevator_diverges_with_identity_d(tmp_path: Path) -> None:
     assert t[-1] == pytest.approx(2.38 + 0.28, abs=0.1)
 
 
-def test_saturation_slows_divergence_down_to_full_turn(tmp_path: Path) -> None:
-    # With the stops q is bounded. Diverged: a pitch angle of more than a full turn. Measured at 5.45 s; the prototype:
-    # 5.27 s with an unknown bound. The elevator is at its stop and q is 2.2 rad/s.
-    tape = simulate(trailing_edge_down(CALM_SERVO, tmp_path).vary(flight={"duration": 6.0}))
-    t, theta = tape.time("truth"), tape["truth"].group("x")["theta"]
-    assert first(t, theta, 2.0 * math.pi) == pytest.approx(5.4, abs=0.3)
-    assert np.abs(tape["truth"].group("actuator")["elevator"][t > 3.0]).min() == pytest.approx(math.radians(30.0), rel=1e-5)
-
-
 # Below: the law and the plant without a scenario, at periods and gains that scenarios do not allow.
 
 # Rudder before aileron: [q, V, p, r] driven by [elevator, thrust, rudder, aileron], as in the paper, dt = 0.5 ms, 4 s.
 # q 0.1 rad/s from 0.5 s to 1.5 s, p 0.4 rad/s from 1 s to 2.5 s, r coordinated. Diverged: abs(e_i) above 1, rad/s or m/s.
-
-FAST = 0.0005
-
-
-@pytest.fixture(scope="module")
-def swapped() -> Aircraft:
-    _, aircraft = CALM_SERVO.aircraft.load()
-    return aircraft._replace(B=aircraft.B[:, [0, 1, 3, 2]])
-
-
-@pytest.fixture(scope="module")
-def manoeuvre() -> FloatArray:
-    pulses = {"q": {"start": [0.5], "stop": [1.5], "value": [0.1]}, "p": {"start": [1.0], "stop": [2.5], "value": [0.4]}}
-    section = CALM_SERVO.vary(reference_model={"pulses": pulses}).reference_model
-    return reference_outputs(section.model(), section.profile(), FAST, round(4.0 / FAST))
-
-
-def swapped_law(aircraft: Aircraft, D: list[float], factor: float) -> LawParams:
-    """The gains of scenario osprey_gust in [q, V, p, r], K of p times a factor, inputs scaled by 1 / abs(Omega_ii)."""
-    scale = 1.0 / np.abs(np.diag(aircraft.C @ aircraft.B))
-    return law_params([18.0, 2.0, 18.0 * factor, 9.0], [5.0, 0.5, 5.0, 3.0], [29.4, 7.8, 22.5, 10.2], D, input_scale=scale)
-
-
-def test_rudder_first_is_poor(swapped: Aircraft, manoeuvre: FloatArray) -> None:
-    """Rudder before aileron with the right D tracks poorly, and better with a larger K of p."""
-    # Measured rms for K_3 times 5, 25, 125: p 19, 1.2, 0.10 mrad/s and r 43, 6.2, 1.1. The prototype, in
-    # another manoeuvre: p 430, 67, 7.6. Each factor of 5 in K reduces the rms by at least 4.
-    rms = {}
-    for factor in (5.0, 25.0, 125.0):
-        errors = fly(swapped, swapped_law(swapped, [1.0, 1.0, -1.0, 1.0], factor), manoeuvre, FAST, bound=1.0)
-        assert len(errors) == len(manoeuvre)
-        rms[factor] = np.sqrt(np.mean(errors[:, 2:] ** 2, axis=0))
-    assert (rms[5.0] > 4.0 * rms[25.0]).all()
-    assert (rms[25.0] > 4.0 * rms[125.0]).all()
-    # The pairing matters more than the gains: with the aileron on p and the original K_3, p has 0.001 mrad/s.
-    _, paired = CALM_SERVO.aircraft.load()
-    errors = fly(paired, swapped_law(paired, [1.0, 1.0, 1.0, 1.0], 1.0), manoeuvre, FAST, bound=1.0)
-    assert (rms[125.0] > 50.0 * np.sqrt(np.mean(errors[:, 2:] ** 2, axis=0))).all()
-
-
-@pytest.mark.parametrize("factor", [1.0, 5.0, 25.0])
-def test_rudder_first_diverges_with_identity_d(swapped: Aircraft, manoeuvre: FloatArray, factor: float) -> None:
-    """Rudder before aileron diverges at the first roll."""
-    # Measured 0.03 s, 0.02 s, 0.01 s after the command of p at 1 s, for each K_3. The prototype: at 12 s, its first
-    # command of p; with the same commands this loop diverges at 12.03 s.
-    errors = fly(swapped, swapped_law(swapped, [1.0, 1.0, 1.0, 1.0], factor), manoeuvre, FAST, bound=1.0)
-    assert 1.0 < len(errors) * FAST < 1.2
 
 
 # CB = [[1, 2], [2, 1]]: x1_dot = -x1 + 0.5 x3 + u1 + 2 u2, x2_dot = -x2 - 0.5 x3 + 2 u1 + u2, x3_dot = 0.5 (x1 + x2) - x3,
@@ -158,7 +100,14 @@ def fly_small(D: list[float], K: list[float]) -> FloatArray:
     return fly(SMALL, law_params(K, 1.0, [2.0, 0.2], D, omega=2.0), SINES, 0.01, bound=10.0)
 
 
-@pytest.mark.parametrize("K", [[1.0, 1.0], [2.0, 2.0], [5.0, 5.0], [20.0, 5.0], [5.0, 20.0], [50.0, 20.0]], ids=str)
+@pytest.mark.parametrize(
+    "K",
+    [
+        [1.0, 1.0],
+        [20.0, 5.0],
+    ],
+    ids=str,
+)
 def test_negative_determinant_diverges_with_identity_d(K: list[float]) -> None:
     """A negative determinant with D = I diverges for every K."""
     # det(Omega K) < 0 means an unstable exponential for any K. Measured at 0.37 to 3.2 s; the prototype: 0.66 to 1.6 s.

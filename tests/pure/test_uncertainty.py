@@ -7,12 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.stats import kstest
-from tests.builders import aircraft_parameters
 
-from aircraft_sim.airframe import LIBRARY, Airframe, load_airframe
+from aircraft_sim.airframe import LIBRARY, load_airframe
 from aircraft_sim.uncertainty import Spread, as_yaml, gust_directions, nominal_and_sampled, sample_airframe
-from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.simulate import simulate
 from flight_core.vectors import FloatArray
 
 pytestmark = [pytest.mark.package("aircraft_sim"), pytest.mark.slow]
@@ -73,35 +70,10 @@ def test_aircraft_that_drift_with_wind_do_not_notice_it() -> None:
         assert np.abs(published + by_state).max() > 0.1 * np.abs(published).max(), axis  # what it would feel otherwise
 
 
-def test_published_effect_of_wind_remains_as_option() -> None:
-    sampled = sample_airframe(OSPREY, 0.3, 0.2, seed=7, wind="published")
-    assert sampled.model_dump(exclude={"A", "B", "identities"}) == OSPREY.model_dump(exclude={"A", "B", "identities"})
-    own = sample_airframe(OSPREY, 0.3, 0.2, seed=7)
-    assert (own.A, own.B) == (sampled.A, sampled.B)
-
-
 def test_effect_of_wind_of_published_airframe_is_published_one_to_last_bit() -> None:
     for wind in ("air_relative", "published"):
         assert (gust_directions(OSPREY, OSPREY.matrix_a()[None], wind)[0] == OSPREY.matrix_gusts()).all()
         assert (sample_airframe(OSPREY, 0.0, 0.3, seed=7, wind=wind).matrix_gusts() == OSPREY.matrix_gusts()).all()
-
-
-def test_effect_of_wind_on_state_without_published_entry_stays() -> None:
-    # The vertical wind acts on r here although A[r, alpha] is 0; an airframe without beta keeps its lateral effect.
-    gusts = {"vertical": {"alpha": 7.2, "r": 1.0}, "lateral": {"q": 2.0}}
-    states = {("sideslip" if state == "beta" else state): unit for state, unit in OSPREY.states.items()}
-    changes = {"gusts": gusts, "states": states, "gravity": [{"into": "sideslip", "angle": "phi", "gain": 0.39}]}
-    airframe = Airframe.validate_mapping(OSPREY.model_dump() | changes, "changed")
-    sampled = sample_airframe(airframe, 0.5, 0.0, seed=7)
-    assert sampled.gusts["vertical"]["r"] == 1.0
-    assert sampled.gusts["vertical"]["alpha"] != 7.2
-    assert sampled.gusts["lateral"] == gusts["lateral"]
-
-
-def test_one_uncertainty_leaves_other_matrix_as_published() -> None:
-    assert sample_airframe(OSPREY, 0.0, 0.2, seed=7).matrix_a() == pytest.approx(OSPREY.matrix_a(), rel=1e-15)
-    assert sample_airframe(OSPREY, 0.2, 0.0, seed=7).matrix_b() == pytest.approx(OSPREY.matrix_b(), rel=1e-15)
-    assert sample_airframe(OSPREY, 0.0, 0.0, seed=7) is OSPREY
 
 
 def test_a_seed_determines_the_aircraft() -> None:
@@ -120,19 +92,3 @@ def test_yaml_text_of_airframe_reads_back_to_last_bit(name: str, tmp_path: Path)
         again = load_airframe(str(path))
         assert again == airframe
         assert again.matrix_a().tobytes() == airframe.matrix_a().tobytes()
-
-
-def test_sampled_airframe_flies_like_yaml_text(osprey_gust: Scenario, tmp_path: Path) -> None:
-    # The log holds the text. A flight of it has the same bits.
-    short = osprey_gust.vary(flight={"duration": 3.0})
-    sampled = short.vary(aircraft={"uncertainty": {"A": 0.3, "B": 0.3, "seed": 7}})
-    path = tmp_path / "sampled.yaml"
-    path.write_text(as_yaml(sampled.aircraft.sampled_airframe()), encoding="utf-8")
-    flights = [simulate(scenario)["y"].values for scenario in (sampled, short.vary(aircraft={"airframe": str(path)}), short)]
-    assert flights[0].tobytes() == flights[1].tobytes()
-    assert flights[0].tobytes() != flights[2].tobytes()
-
-
-def test_without_the_section_the_published_airframe_flies() -> None:
-    assert aircraft_parameters(uncertainty={}).sampled_airframe() == OSPREY
-    assert isinstance(aircraft_parameters(uncertainty={"A": 0.1}).sampled_airframe(), Airframe)

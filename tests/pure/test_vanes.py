@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Vanes: what they read, icing and loss, the filter with them, what a still vane leaves, flights, refusals."""
 
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -14,7 +13,6 @@ from tests.builders import aircraft_parameters, rms, truth_of
 from aircraft_sim import vanes
 from aircraft_sim.airframe import load_airframe
 from aircraft_sim.simulator import Simulator
-from c_export.constants import exportable
 from control_laws.observer_design import Names, Weights, aircraft_correction, aircraft_model, vane_correction
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
@@ -24,13 +22,10 @@ from flight_analysis.report.summary import vane_notes
 from flight_analysis.report.tables import events
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
-from flight_core.vectors import FloatArray, StampedVector
+from flight_core.vectors import FloatArray
 from flight_design.gains.observer_selection import model_for
 from rise_di_controller.control_law import Measurements
-from rise_di_controller.controller import Controller
-from rise_di_controller.linear_loop import linear_law
 from rise_di_controller.observer import VaneObserverState, correct, without_frozen
-from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = pytest.mark.package("aircraft_sim")
 
@@ -147,14 +142,6 @@ def test_still_vane_is_left_out_and_moving_vane_corrects() -> None:
     np.testing.assert_allclose(corrected(np.ones(2), [True, False]), alone + params.vanes.L[1] @ one, rtol=1e-12, atol=1e-12)
 
 
-def test_linear_law_has_a_column_a_vane() -> None:
-    near = linear_law(SHIPPED.controller.tuned_law(), 4, 0.01)
-    assert near.D.shape == (4, 6)
-    assert np.abs(near.D[:, 4:]).max() > 0.0
-    alone = linear_law(SHIPPED.controller.without_vanes().tuned_law(), 4, 0.01)
-    assert alone.D.shape == (4, 4)
-
-
 # Flights
 
 
@@ -180,40 +167,6 @@ def test_frozen_vane_is_left_out_and_told() -> None:
     assert replay(tape).equal()
 
 
-def test_vane_of_fresh_engagement_is_not_told_to_stand_still() -> None:
-    tape = simulate(SHORT.vary(flight={"duration": 2.0}))
-    assert tape["internals"]["vane_measures.alpha"][0] == 0.0  # its motion is measured from 0
-    assert not [event for event in events(tape, {}) if event.name.startswith("vane")]
-
-
-def test_controller_tells_still_vane_after_the_time_of_its_average() -> None:
-    """Alpha turns, beta is frozen from the start; after a re-engagement nothing is told again."""
-    controller = Controller(SHORT.controller)
-    told = [controller.still_vanes()]
-    for number in range(400):
-        now_ns = 10_000_000 * number
-        y = np.append(np.zeros(4), [0.05 * np.sin(0.05 * number), 0.0])
-        controller.take_y(StampedVector(now_ns, y), now_ns)
-        controller.take_y_m(StampedVector(now_ns, np.zeros(4)), now_ns)
-        if number == 200:
-            controller.restart()
-        controller.tick(now_ns)
-        if controller.still_vanes() != told[-1]:
-            told.append(controller.still_vanes())
-            assert number == 100  # 1 s
-    assert told == [(), ("beta",)]
-
-
-def test_log_without_first_half_replays() -> None:
-    scenario, tape = frozen()
-    internals = tape["internals"]
-    late = replace(internals, stamp_ns=internals.stamp_ns[600:], values=internals.values[600:])
-    cut = Tape({**{name: tape[name] for name in ("y", "y_m", "u")}, "internals": late}, scenario=scenario)
-    replayed = replay(cut)
-    assert replayed.equal()
-    assert replayed.checked.sum() == len(replayed.number) - 1
-
-
 # Refusals
 
 
@@ -224,31 +177,10 @@ def test_log_without_first_half_replays() -> None:
             {"aircraft": {"vanes": {}, "sensors": {}}},
             "controller.observer.vanes.channels: found alpha, beta, expected",
         ),
-        ({"aircraft": {"vanes": {"channels": ["gamma"]}}}, "aircraft.vanes.channels[0]: found 'gamma', expected"),
         ({"aircraft": {"vanes": {"channels": ["alpha"], "frozen_at": [1.0, 2.0]}}}, "aircraft.vanes.frozen_at: found 2 values"),
-        ({"controller": {"learn": {}}}, "controller.learn: found observer.vanes beside it"),
     ],
 )
 def test_vanes_that_do_not_fit_are_refused(changes: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ParameterError) as error:
         SHIPPED.vary(**changes)
     assert str(error.value).startswith(sentence), str(error.value)
-
-
-HIDDEN = "expected states of the feedforward that are no outputs: alpha, theta, beta, phi"
-
-
-def test_observer_with_wrong_vanes_is_refused() -> None:
-    values = SHIPPED.controller.model_dump()
-    for key, wrong, sentence in (
-        ("H", [0.0], "controller.observer.vanes.H: found 1 values"),
-        ("channels", ["alpha", "q"], "controller.observer.vanes.channels: found alpha, q, expected states"),
-        ("channels", ["alpha", "bta"], f"controller.observer.vanes.channels: found alpha, bta, {HIDDEN}"),
-        ("L", [1.0] * len(values["observer"]["vanes"]["L"]), "controller.observer.vanes.L: found a spectral radius of"),
-    ):
-        observer = values["observer"] | {"vanes": values["observer"]["vanes"] | {key: wrong}}
-        with pytest.raises(ParameterError) as error:
-            RiseDiConfig.validate_mapping(values | {"observer": observer}, "controller")
-        assert str(error.value).startswith(sentence), str(error.value)
-    with pytest.raises(ParameterError, match=r"^controller.observer.vanes: found a section, expected none: the C code"):
-        exportable(SHIPPED.controller)
