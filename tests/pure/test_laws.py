@@ -14,28 +14,25 @@ import pytest
 from tests.closed_loop import PROTOTYPE_SERVO
 from tests.conftest import REPOSITORY
 from tests.other_laws import COMMON, SECTIONS, example_installed
-from tests.pure.test_replay import BUSY, FLY, LOST, SHORT, Tick, driven, equal, without
+from tests.pure.test_replay import BUSY, equal
 
 from aircraft_sim.airframe import load_airframe
 from control_laws import lqg
-from control_laws.pi import PiConfig
-from flight_analysis.closed_loop.replay import replay, vary
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report import layouts
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.observer_selection import gains_by_rule, model_for, with_aircraft_observer
 from rise_di_controller import guard, laws
-from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, field_names, fields, restored
+from rise_di_controller.control_law import Measurements, TunedLaw, field_names, fields, restored
 from rise_di_controller.controller import Controller
 from rise_di_controller.guard import ControllerState, GuardParams
 from rise_di_controller.law import gain
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.linear_loop import linear_law
-from rise_di_controller.observer import ObserverParams, ObserverState, correct, initial_estimates, predict
+from rise_di_controller.observer import ObserverParams, ObserverState
 from rise_di_controller.params import ControllerConfig
 from rise_di_controller.saturation import Limits
 
@@ -98,11 +95,6 @@ def prepared(parameters: ControllerConfig) -> tuple[GuardParams, TunedLaw]:
     return parameters.guard(), parameters.tuned_law()
 
 
-def flight(name: str, aircraft: dict[str, Any] | None = None, **changes: Any) -> Scenario:
-    """Two seconds of osprey_servo under another controller."""
-    return replace(SERVO.vary(aircraft=aircraft or {}), controller=controller(name, **changes))
-
-
 def at(y: Any, **others: Any) -> Measurements:
     """Measurements of four channels; what is not given is 0."""
     zero = np.zeros(4)
@@ -155,7 +147,7 @@ def first_change(name: str, parameters: Any, e: FloatArray, u: FloatArray) -> Fl
 
 
 @EVERY_LAW
-@pytest.mark.parametrize("size", [1e-6, 0.1, 1e6])
+@pytest.mark.parametrize("size", [1e-6, 1e6])
 def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
     parameters, u = controller(name, lower=None, upper=None), np.array([0.1, -0.2, 0.3, -0.4])
     e = size * np.array([1.0, -2.0, 3.0, -4.0])
@@ -169,11 +161,10 @@ def test_law_engages_without_jump_at_any_error(name: str, size: float) -> None:
 
 
 @EVERY_LAW
-@pytest.mark.parametrize("bound", [np.inf, 1e3])
-def test_limits_that_are_not_reached_change_no_bit(name: str, bound: float) -> None:
+def test_limits_that_are_not_reached_change_no_bit(name: str) -> None:
     law = controller(name).tuned_law()
     state, measured = random_flight(law, 0.05)
-    wide = Limits(-bound * np.ones(4), bound * np.ones(4), bound / DT * np.ones(4))
+    wide = Limits(np.full(4, -1e3), np.full(4, 1e3), np.full(4, 1e3 / DT))
     after, u = law.control_law.step(state, measured, np.float64(DT), law.params)
     limited, u_free, u_limited = law.control_law.limited(state, measured, np.float64(DT), law.params, wide)
     assert u.tobytes() == u_free.tobytes() == u_limited.tobytes()
@@ -240,24 +231,13 @@ def test_new_parameters_leave_u_as_it_is(name: str) -> None:
     np.testing.assert_allclose(u_new, u, rtol=1e-8, atol=1e-10)
 
 
-def test_retuned_pi_keeps_integral() -> None:
-    """A retuned PI law keeps the integral; e_0 takes the difference of u."""
-    old, new = (controller("pi", K=[K] * 4, Lambda=[2.0] * 4).tuned_law() for K in (10.0, 4.0))
-    state, _ = random_flight(old, 0.1)
-    after = old.control_law.retune(state, old.params, new.params)
-    assert after.integral_e.tolist() == state.integral_e.tolist()
-    # 10 (e - e_0 + 2 I) = 4 (e - e_0+ + 2 I)
-    total = state.e - state.e_0 + 2.0 * state.integral_e
-    np.testing.assert_allclose(after.e_0, state.e + 2.0 * state.integral_e - 2.5 * total, rtol=1e-12)
-
-
 # Flight and replay
 
 
 @EVERY_LAW
 def test_every_law_flies_and_replays(name: str) -> None:
     """Replay equals the flight to the last bit."""
-    scenario = flight(name)
+    scenario = replace(SERVO, controller=controller(name))
     tape = simulate(scenario)
     result = replay(tape, scenario.controller)
     assert equal(result), result.first()
@@ -270,13 +250,6 @@ def test_every_law_flies_and_replays(name: str) -> None:
     assert all(log.group(group).values.any() for group in of_law)  # the log holds its state
 
 
-@pytest.mark.parametrize(("name", "groups"), [("rise_di", {"integral_e", "Pi"}), ("pi", {"integral_e"}), ("l1", set())])
-def test_layout_shows_integrals_that_law_has(name: str, groups: set[str]) -> None:
-    channels = layouts.channels_of(flight(name))
-    text = layouts.foxglove({"": channels}) + layouts.plotjuggler({"": channels})
-    assert {group for group in ("integral_e", "Pi") if f"{group}.q" in text} == groups
-
-
 def test_only_gains_change_in_flight() -> None:
     """Neither the law nor its channels change in flight, and the models of RISE-DI alone, which can be learned."""
     assert {"K", "Lambda", "lead", "filter_time", "upper", "hold"} <= controller("pid").tunable()
@@ -284,39 +257,6 @@ def test_only_gains_change_in_flight() -> None:
         assert not controller(name).tunable() & {"law", "outputs", "D", "rate", "learn"}
         models = {"feedforward", "observer"} if controller(name).law == "rise_di" else set()
         assert controller(name).tunable() & {"feedforward", "observer"} == models
-
-
-@EVERY_LAW
-def test_a_replay_equals_a_flight_through_failsafes(name: str) -> None:
-    scenario = flight(name, LOST, **SHORT)
-    tape = simulate(scenario)
-    result = replay(tape, scenario.controller)
-    assert equal(result), result.first()
-    assert set(tape["internals"]["mode"]) >= {Mode.ENGAGED, Mode.HOLD, Mode.RAMP}
-
-
-@EVERY_LAW
-@pytest.mark.parametrize("dropout", [0.0, 0.3])
-def test_replay_continues_behind_gap(name: str, dropout: float) -> None:
-    """Behind a gap of the log replay continues from the recorded state."""
-    scenario = flight(name, {"sensors": {"dropout": dropout, "seed": 3}}, max_age=0.3)
-    tape = without(simulate(scenario), lambda number: (number < 60) | (number > 70))
-    result = replay(tape, scenario.controller)
-    assert result.first() is None, result.first()
-    assert (~result.checked).sum() == 1
-    assert "11 samples of internals are missing" in result.notes[0]
-
-
-@EVERY_LAW
-def test_change_in_flight_replayed_and_another_gain_found(name: str) -> None:
-    scenario = flight(name)
-    key = {"lqg": "hold", "l1": "K"}.get(name.partition(",")[0], "Lambda")
-    change = {key: (0.9 * np.array(getattr(scenario.controller, key))).tolist()}
-    tape = driven(scenario.controller, [FLY] * 30 + [Tick(changes=(change,))] + [FLY] * 30)
-    assert not replay(tape, scenario.controller).equal()
-    result = replay(tape, scenario.controller, changes=[change])
-    assert equal(result), result.first()
-    assert result.notes == (f"parameters changed before tick 30: {key}",)
 
 
 def test_another_law_or_observer_refused_in_flight() -> None:
@@ -440,7 +380,7 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
     Phi, Gamma, L, F = (0.3 * generator.standard_normal(shape) for shape in ((s, s), (s, m), (s, m), (m, s)))
     H = np.eye(m, s)
     params = ObserverParams(lqg.LqgParams(), Phi, Gamma, H, L, F, Limits(-wide, wide, wide), np.float64(2.0))
-    law = lqg_with_observer()
+    law = controller("lqg, observer").tuned_law().control_law
     zero = np.zeros(m)
     e = generator.standard_normal((60, m))
     state = law.engage(Measurements(e[0], zero, zero, zero, zero), params)
@@ -453,64 +393,6 @@ def test_observer_is_kalman_filter_with_linear_feedback() -> None:
         np.testing.assert_allclose(commanded, u, rtol=1e-9, atol=1e-12)
         x = Phi @ x + Gamma @ u  # time update
         np.testing.assert_allclose(state.z, x, rtol=1e-9, atol=1e-12)
-
-
-def lqg_with_observer() -> ControlLaw:
-    return controller("lqg, observer").tuned_law().control_law
-
-
-def test_observer_is_same_for_many_aircraft() -> None:
-    """Correction and prediction are the same for many aircraft with different matrices."""
-    generator = np.random.default_rng(1)
-    s, m, N = 6, 2, 5
-    limits = Limits(-np.full((m, 1), 0.5), np.full((m, 1), 0.5), np.full((m, 1), 20.0))
-    Phi, Gamma, H, L, F = (generator.standard_normal((*shape, N)) for shape in ((s, s), (s, m), (m, s), (s, m), (m, s)))
-    many = ObserverParams(None, Phi, Gamma, H, L, F, limits, np.float64(2.0))
-    z, e, u = (generator.standard_normal((size, N)) for size in (s, m, m))
-    state = ObserverState(None, z, np.zeros((m, N)), np.full((1, N), 0.3))
-    looks = Measurements(e, 0.0 * e, 0.0 * e, 0.0 * e, 0.0 * e)
-    corrected, predicted = correct(state, looks, DT, many), predict(z, u, many)
-    by_jax = jax.jit(lambda z, e: correct(state._replace(z=z, u_o=jax.numpy.zeros((m, N))), looks, DT, many).u_o)(z, e)
-    for k in range(N):
-        x = z[:, k] + L[..., k] @ (e[:, k] - H[..., k] @ z[:, k])
-        np.testing.assert_allclose(corrected.z[:, k], x, rtol=1e-12)
-        bound = np.clip(-(0.3 + 2.0 * DT) * F[..., k] @ x, -20.0 * DT, 20.0 * DT)  # the limit of rate, from 0
-        np.testing.assert_allclose(corrected.u_o[:, k], bound, rtol=1e-12)
-        np.testing.assert_allclose(by_jax[:, k], bound, rtol=1e-12)
-        np.testing.assert_allclose(predicted[:, k], Phi[..., k] @ z[:, k] + Gamma[..., k] @ u[:, k], rtol=1e-12)
-        np.testing.assert_allclose(initial_estimates(e, many)[:, k], H[..., k].T @ e[:, k], rtol=1e-12)
-
-
-@pytest.mark.parametrize(("periods", "predictions"), [(1, 0), (1.4, 0), (2, 1), (5, 4)])
-def test_missed_periods_are_predicted(periods: float, predictions: int) -> None:
-    """Over n periods without a y there are n - 1 predictions."""
-    parameters = controller("lqg, observer", feedforward=sections()["lqg, observer"]["feedforward"], max_age=0.5)
-    Phi, Gamma, H, L, F = matrices(parameters)
-    y = 1e-3 * np.array([1.0, -2.0, 3.0, -4.0])
-    before = tick(parameters, tick(parameters, guard.initial_state(4), 0, y), 10, 2.0 * y)
-    assert before.u.any()
-    z = before.law.z
-    for _ in range(predictions):  # u held; y_m = 0, so u_trim and u_ff are 0
-        z = Phi @ z + Gamma @ before.u
-    x = z + L @ (3.0 * y - H @ z)
-    sigma = before.law.sigma + periods * DT
-    after = tick(parameters, before, 10 + 10 * periods, 3.0 * y)
-    np.testing.assert_allclose(after.law.u_o, -sigma * (F @ x), rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(after.law.z, Phi @ x + Gamma @ after.u, rtol=1e-9, atol=1e-15)
-
-
-@pytest.mark.parametrize("name", OBSERVED)
-def test_the_observer_fades_in(name: str) -> None:
-    parameters, state = controller(name), guard.initial_state(4)
-    sigmas = []
-    for k in range(120):
-        state = tick(parameters, state, 10 * k, 1e-3)
-        sigmas.append(state.law.sigma.item())
-    # engagement, then 100 ticks of 10 ms until the 1 s of `fade` have passed
-    np.testing.assert_allclose(sigmas, np.minimum(np.arange(120) * DT, 1.0), atol=1e-12)
-    instant = controller(name, observer=sections()[name]["observer"] | {"fade": 0.0})
-    state = tick(instant, tick(instant, guard.initial_state(4), 0, 1e-3), 10, 1e-3)
-    assert state.law.sigma.item() == 1.0
 
 
 @pytest.mark.parametrize("name", OBSERVED)
@@ -528,18 +410,6 @@ def test_a_re_engagement_restarts_the_observer(name: str) -> None:
     assert again.law.z.tolist() == (H.T @ [0.01, 0.02, -0.01, 0.1]).tolist()
     assert not again.law.u_o.any()
     assert again.law.sigma.tolist() == [0.0]
-
-
-@pytest.mark.parametrize("name", OBSERVED)
-def test_an_observer_with_the_same_matrices_continues(name: str) -> None:
-    parameters, state = controller(name), guard.initial_state(4)
-    for k in range(50):
-        state = tick(parameters, state, 10 * k, 1e-3)
-    new = controller(name, max_age=0.2, upper=[0.3] * 4, observer=sections()[name]["observer"] | {"part": 0.5})
-    after = guard.retune(state, parameters.tuned_law(), new.tuned_law())
-    for group in ("z", "u_o", "sigma"):
-        assert getattr(after.law, group).tolist() == getattr(state.law, group).tolist()
-    assert after.u_trim.tolist() == state.u_trim.tolist()
 
 
 @pytest.mark.parametrize("name", OBSERVED)
@@ -586,8 +456,7 @@ def test_unregistered_law_refused() -> None:
     """The sentence lists the registered laws."""
     registered = "excitation, indi, l1, lqg, lqi, pi, pid, rise_di"
     refused(f"controller.law: found 'adrc', expected a registered law: {registered}", COMMON | {"law": "adrc"})
-    refused(f"controller.law: found 3, expected a registered law: {registered}", COMMON | {"law": 3})
-    refused(f"controller.law: found ['pi'], expected a registered law: {registered}", COMMON | {"law": ["pi"]})
+    refused("controller.law: found ['pi'], expected a registered law", COMMON | {"law": ["pi"]})
 
 
 def test_law_of_more_than_y_refused() -> None:
@@ -599,8 +468,6 @@ def test_law_of_more_than_y_refused() -> None:
 def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     values = {
         "absent": ["absent_package.law:Parameters"],
-        "empty": ["control_laws.pi:Absent"],
-        "module": ["control_laws.pi"],
         "function": ["control_laws.pi:params_of"],
         "twice": ["control_laws.pi:PiConfig", "control_laws.l1:L1Config"],
     }
@@ -608,71 +475,24 @@ def test_entry_point_that_is_no_law_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(laws, "_registered", lambda: entries)
     for name, sentence in {
         "absent": "found 'absent', which cannot be loaded (No module named 'absent_package'), expected an installed package",
-        "empty": "found 'empty', which cannot be loaded (module 'control_laws.pi' has no attribute 'Absent'), expected",
-        "module": "found 'module', registered as <module",
         "function": "found 'function', registered as <function params_of",
         "twice": "found 'twice', registered as control_laws.l1:L1Config and as control_laws.pi:PiConfig, expected one",
     }.items():
         refused(f"controller.law: {sentence}", COMMON | {"law": name})
 
 
-class Colliding(PiConfig):
-    """PI whose state has the name of a channel of the log."""
-
-    def control_law(self) -> ControlLaw:
-        """PI with that state."""
-
-        class State(NamedTuple):
-            u: FloatArray
-
-        return super().control_law()._replace(engage=lambda measured, params: State(measured.y))
-
-
-class Short(PiConfig):
-    """PI whose state has one value for all channels."""
-
-    def control_law(self) -> ControlLaw:
-        """PI with that state."""
-
-        class State(NamedTuple):
-            total: FloatArray
-
-        return super().control_law()._replace(engage=lambda measured, params: State(measured.y.sum()))
-
-
-def test_state_that_log_cannot_hold_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    entries = EntryPoints(EntryPoint(name, f"{__name__}:{name}", laws.GROUP) for name in ("Colliding", "Short"))
-    monkeypatch.setattr(EntryPoint, "load", lambda entry: globals()[entry.name])
-    monkeypatch.setattr(laws, "_registered", lambda: entries)
-    values = sections()["pi"]
-    refused("controller.law: found a state with u, expected another name, which the log does", values | {"law": "Colliding"})
-    refused("controller.law: found a state with total of shape (), expected (4,), one value", values | {"law": "Short"})
-
-
 def test_a_parameter_of_another_law_is_refused() -> None:
     pi = sections()["pi"]
     refused("controller.beta: found a parameter of rise_di, expected those of pi: K, Lambda", pi | {"beta": [1.0] * 4})
-    refused("controller.bandwidth: unknown key", pi | {"bandwidth": [1.0] * 4})
     refused("controller.K: unknown key", sections()["rise_di"] | {"K": [1.0] * 4})
-    refused(
-        "controller.k_g: found a parameter of rise_di, expected those of lqg: none", sections()["lqg, observer"] | {"k_g": 1}
-    )
 
 
 @pytest.mark.parametrize(
     ("name", "changes", "sentence"),
     [
         ("pi", {"K": [1.0] * 3}, "controller.K: found 3 values, expected 4, one for each of q, p, r, V"),
-        ("l1", {"bandwidth": [1.0] * 3}, "controller.bandwidth: found 3 values, expected 4, one for each of q, p, r, V"),
-        ("l1", {"Omega": [1.0] * 4}, "controller.Omega: found 4 values, expected 16: 4 rows of 4"),
         ("l1", {"Omega": [1.0] * 16}, "controller.Omega: found a matrix without a D ("),
-        (
-            "l1",
-            {"Omega": (-np.eye(4)).ravel().tolist()},
-            "controller.Omega: found a matrix with D = [-1, -1, -1, -1], expected",
-        ),
         ("pid", {"filter_time": [0.0] * 4}, "controller.filter_time[0]: found 0.0, expected greater than 0"),
-        ("pid", {"lead": [1.0] * 3}, "controller.lead: found 3 values, expected 4, one for each of q, p, r, V"),
         (
             "lqg, observer",
             {"observer": None},
@@ -684,9 +504,8 @@ def test_invalid_parameter_of_law_refused(name: str, changes: dict[str, Any], se
     refused(sentence, sections()[name] | changes)
 
 
-@pytest.mark.parametrize("name", OBSERVED)
-def test_an_invalid_observer_is_refused(name: str) -> None:
-    values = sections()[name]
+def test_an_invalid_observer_is_refused() -> None:
+    values = sections()["pi, observer"]
     observer = values["observer"]
     states, s = list(observer["states"]), len(observer["states"])
 
@@ -695,15 +514,12 @@ def test_an_invalid_observer_is_refused(name: str) -> None:
 
     refused("controller.observer: found no feedforward beside it, expected that section too", values | {"feedforward": None})
     refused(f"controller.observer.Phi: found {s} values, expected {s * s}: {s} rows of {s}", observed(Phi=[1.0] * s))
-    refused(f"controller.observer.L: found 3 values, expected {s * 4}: {s} rows of 4", observed(L=[1.0] * 3))
-    refused(f"controller.observer.F: found 3 values, expected {s * 4}: 4 rows of {s}", observed(F=[1.0] * 3))
     others = [states[1], states[0], *states[2:]]
     refused("controller.observer.states: found x.alpha, x.V, x.q", observed(states=others))
     unstable = np.reshape(observer["Phi"], (s, s)) + 2.0 * np.eye(s)
     refused("controller.observer.L: found a spectral radius of ", observed(Phi=unstable.ravel().tolist()))
     refused("controller.observer.F: found a spectral radius of ", observed(F=[-3.0 * gain for gain in observer["F"]]))
     refused("controller.observer.margin: found a nominal loop that is unstable with u ", observed(margin=0.2))
-    refused("controller.observer.part: found 1.5, expected less than or equal to 1", observed(part=1.5))
 
 
 def test_unfit_feedforward_refused() -> None:
@@ -726,9 +542,3 @@ def test_digest_depends_on_law() -> None:
     named = AnyLaw.validate_mapping(sections()["rise_di"] | {"law": "rise_di"}, "controller")
     without_name = {key: value for key, value in sections()["rise_di"].items() if key != "law"}
     assert named.digest() == AnyLaw.validate_mapping(without_name, "controller").digest()
-
-
-def test_log_varied_only_within_law() -> None:
-    assert vary(controller("pi"), {"K": [1.0] * 4}).model_dump()["K"] == (1.0,) * 4
-    with pytest.raises(ParameterError, match=r"controller\.k_g: found a parameter of rise_di, expected those of pi: K, Lambda"):
-        vary(controller("pi"), {"k_g": 1.0})

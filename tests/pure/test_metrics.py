@@ -12,8 +12,6 @@ from tests.recordings import EPOCH, MS, signal
 
 from flight_analysis import metrics
 from flight_analysis.metrics import Transient
-from flight_core.modes import Mode
-from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from rise_di_controller.internals import Saturation
 
@@ -28,10 +26,6 @@ def tape(**signals: Signal) -> Tape:
 def test_rms_and_max() -> None:
     # sqrt((9 + 16 + 0 + 0) / 4) = 2.5
     assert metrics.error_metrics(np.array([3.0, -4.0, 0.0, 0.0])) == (2.5, 4.0)
-
-
-def test_a_part_without_samples_has_nan_metrics() -> None:
-    assert all(math.isnan(metric) for metric in metrics.error_metrics(np.zeros(0)))
 
 
 def test_error_formed_at_stamps_of_y_by_name() -> None:
@@ -109,27 +103,6 @@ def test_errors_split_by_part_and_ultimate_bound_is_largest_undisturbed_error() 
     assert table["q"]["whole"].max == 4.0
 
 
-def test_engagements_are_changes_of_mode_to_engaged() -> None:
-    mode = [Mode.ENGAGED, Mode.ENGAGED, Mode.HOLD, Mode.RAMP, Mode.ENGAGED]
-    internals = signal([0, 10, 20, 30, 40], mode=mode)
-    assert [engagement.start for engagement in metrics.engagements(tape(internals=internals))] == [0.0, 0.04]
-
-
-def test_close_live_commands_are_one_transient() -> None:
-    stamps = [0.0, 500.0, 1000.0, 1500.0, 3000.0, 3500.0]
-    u_m = signal(stamps, q=[0.0, 0.1, 0.2, 0.2, 0.0, 0.0], V=1.0)
-    assert metrics.live_commands(tape(u_m=u_m)) == [
-        Transient("command", "V", 0.0, 0.0),  # a first value other than 0 is a change
-        Transient("command", "q", 0.5, 1.0),
-        Transient("command", "q", 3.0, 3.0),
-    ]
-
-
-def test_attitude_beside_live_commands_is_no_command() -> None:
-    u_m = signal([0.0, 500.0, 1000.0], q=[0.0, 0.1, 0.1], phi=[0.1, 0.2, 0.3], theta=0.1)
-    assert metrics.live_commands(tape(u_m=u_m, y_m=signal([0.0], q=[0.0]))) == [Transient("command", "q", 0.5, 0.5)]
-
-
 def test_settling_time_ends_where_error_begins_to_stay_in_band() -> None:
     t = np.arange(6.0) + 10.0
     for e, settling in (
@@ -142,12 +115,6 @@ def test_settling_time_ends_where_error_begins_to_stay_in_band() -> None:
     ):
         assert metrics.settling_time(t, np.array(e), band=1.0, leaves=2.0, dwell=3.0) == settling
     assert metrics.settling_time(np.zeros(0), np.zeros(0), band=1.0, leaves=2.0) is None
-
-
-def test_settling_band_is_fraction_of_reference_or_of_error_without_one() -> None:
-    y = signal([0, 10], q=[0.5, -3.0], p=[0.25, 0.0])
-    y_m = signal([0, 10], q=[0.0, -2.0], p=[0.0, 0.0])
-    assert metrics.settling_bands(tape(y=y, y_m=y_m)) == {"q": 0.02, "p": 0.0025}
 
 
 def test_settling_band_of_measured_error_is_at_least_four_noise_floors() -> None:
@@ -207,11 +174,6 @@ def test_sign_switches_counted_on_increments_of_pi() -> None:
     assert metrics.sign_switches(tape(internals=internals)) == {"q": pytest.approx(2 / 0.06)}
 
 
-def test_sign_switches_without_internals_are_those_of_error() -> None:
-    y, y_m = signal([0, 10, 20], q=[1.0, -1.0, 2.0]), signal([0, 20], q=[0.0, 0.0])
-    assert metrics.sign_switches(tape(y=y, y_m=y_m)) == {"q": pytest.approx(2 / 0.02)}
-
-
 def test_the_noise_floor_is_the_recorded_noise() -> None:
     flight = tape(y=signal([0, 10], q=[1.0, 2.0]), truth=signal([0, 10], **{"noise.q": [3.0, -4.0]}))
     assert metrics.noise_floor(flight) == {"q": pytest.approx(math.sqrt(12.5))}
@@ -223,12 +185,6 @@ def test_noise_floor_estimated_from_y_without_truth() -> None:
     y = np.sin(k / 2000.0) + 0.02 * np.random.default_rng(1).standard_normal(len(k))
     flight = tape(y=Signal(EPOCH + k * 2 * MS, ("q",), y[:, None]))
     assert metrics.noise_floor(flight)["q"] == pytest.approx(0.02, rel=0.05)
-
-
-def test_noise_floor_is_at_least_rounding_of_y() -> None:
-    constant = tape(y=signal([0, 10, 20, 30], q=[0.1] * 4, V=[0.0] * 4))
-    # 0.1 lies between 2^-4 and 2^-3, and 52 bits follow the first.
-    assert metrics.noise_floor(constant) == {"q": 2.0**-56, "V": 0.0}
 
 
 def test_spectrum_of_sine_peaks_at_frequency_and_has_variance() -> None:
@@ -250,13 +206,6 @@ def test_a_spectrum_is_that_of_scipy(samples: int) -> None:
         assert density[name] == pytest.approx(np.sqrt(column), rel=1e-9)  # rounding
 
 
-def test_a_spectrum_is_as_long_as_its_samples_over_a_gap_of_days() -> None:
-    """At 100 Hz: 64 samples, a gap of 1e6 s that counts for 1 s, and 64 samples: 227 instants in one window."""
-    stamps = np.concatenate([np.arange(64), 100_000_000 + np.arange(64)]) * 10 * MS
-    frequency, _ = metrics.spectra(Signal(EPOCH + stamps, ("u",), np.ones((128, 1))), 10 * MS)
-    assert len(frequency) == 227 // 2
-
-
 def test_a_spectrum_bridges_missing_samples() -> None:
     k = np.delete(np.arange(1000), [100, 101, 500])
     frequency, density = metrics.spectra(Signal(EPOCH + k * 10 * MS, ("u",), np.ones((len(k), 1))), 10 * MS)
@@ -272,36 +221,3 @@ def test_periods_without_a_tick_are_counted() -> None:
     assert (result.ticks, result.without_new_y, result.period_max, result.late_max) == (4, 1, 0.02, 3e-4)
     assert result.period_mean == pytest.approx(0.04 / 3, abs=1e-9)
     assert result.jitter == 0.0  # the last took two whole periods
-
-
-def test_jitter_is_deviation_from_whole_number_of_periods() -> None:
-    # 10 + 0.3, 10 - 0.4 and 20 ms: sqrt((0.09 + 0.16 + 0) / 3) ms
-    result = metrics.tick_metrics(tape(internals=signal([0, 10.3, 19.9, 39.9], late=0.0, age=0.0)), 10 * MS)
-    assert result is not None
-    assert result.jitter == pytest.approx(math.sqrt(0.25 / 3) * 1e-3)
-
-
-def test_latency_has_metrics_if_it_is_recorded() -> None:
-    result = metrics.latency_metrics(tape(latency=signal([0, 10, 20], y_to_u=[1e-3, 3e-3, 2e-3])))
-    assert result is not None
-    assert (result.median, result.max) == (2e-3, 3e-3)
-    assert metrics.latency_metrics(tape()) is None
-
-
-def test_flight_of_one_tick_has_no_tick_metrics() -> None:
-    assert metrics.tick_metrics(tape(internals=signal([0], late=[0.0], age=[0.0])), 10 * MS) is None
-
-
-def test_groups_of_channels_lose_their_prefix() -> None:
-    tape = signal([0], **{"e.q": [1.0], "Pi.q": [2.0], "e.V": [3.0]})
-    assert tape.group("e").names == ("q", "V")
-    assert tape.group("e").values.tolist() == [[1.0, 3.0]]
-    with pytest.raises(ParameterError, match=r"no channel x among e\.q, Pi\.q, e\.V"):
-        tape["x"]
-
-
-def test_lost_sample_counts_like_missed_tick() -> None:
-    # Ticks at 0, 10, 30 ms: at 20 ms there was no new y, and no tick was late.
-    result = metrics.tick_metrics(tape(internals=signal([0, 10, 30], late=0.0, age=0.0)), 10 * MS)
-    assert result is not None
-    assert (result.ticks, result.without_new_y, result.late_max) == (3, 1, 0.0)

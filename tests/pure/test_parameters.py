@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Invalid parameters: one sentence that names the key, what was found and what is expected."""
 
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -36,7 +35,6 @@ BAD = {
     ("D: [1, 1, 1, 1]", "D: [1, 1, 1]"): "controller.D: found 3 values, expected 4, one for each of q, p, r, V",
     ("D: [1, 1, 1, 1]", "D: 1"): "controller.D: found 1, expected a list of values",
     ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, .nan, 7.0]"): "controller.k_d[1]: found nan, expected a finite number",
-    ("k_d: [16.0, 16.0, 7.0]", "k_d: [16.0, 16.0]"): "controller.k_d: found 2 values, expected 3, one for each of q, p, r",
     ("damping: [0.9, 1.0,", "damping: [0.9, -1.0,"): "second_order.damping: found an eigenvalue of A_m with real part",
     ("rate: 100.0                # Hz\n    outputs", "rate: 300.0\n    outputs"): (
         "controller.rate: found 300 Hz, expected a rate whose period is a whole number of nanoseconds"
@@ -46,57 +44,23 @@ BAD = {
     ),
     ("step: 0.002", "step: 0.003"): "aircraft.step: found 0.003 s, expected a whole fraction of 1 / rate (0.002 s)",
     ("airframe: osprey", "airframe: ospray"): "aircraft.airframe: found 'ospray', expected one of",
-    (
-        "[q, p, r, V]",
-        "[q, p, r, W]",
-    ): "controller.outputs: found q, p, r, W, expected some of the outputs of the airframe",
     ("rudder, thrust]", "rudder, flaps]"): "controller.inputs: found elevator, aileron, rudder, flaps, expected the channels",
     ("sign: auto", "sign: smooth"): "controller.sign: found 'smooth', expected 'auto', 'literal', 'implicit' or 'soft'",
     ("vertical: {start", "upward: {start"): "gusts: found 'upward', expected a gust of the airframe osprey: vertical, lateral",
-    ("length: 15.24}   #", "length: 0.0}   #"): "aircraft.gusts.vertical.length: found 0.0, expected greater than 0",
     ("stop: [4.0, 8.0", "stop: [1.0, 8.0"): "reference_model.pulses.q.stop[0]: found 1.0, expected later than start[0] = 2 s",
-    ("rise: 0.1", "rise: 0.0"): "reference_model.rise: found 0.0, expected greater than 0",
     ("bank_rate: p", "bank_rate: roll"): "coordinated_turn.bank_rate: found channel 'roll', expected one of q, V, p, r",
-    ("duration: 60.0", "duration: long"): "flight.duration: found 'long', expected a number",
     ("/**/recorder", "/**/recoder"): "bad.yaml: recoder: found a section, expected only flight, aircraft,",
     ("/**/recorder:\n  ros__parameters:", "/**/recorder:\n  parameters:"): "recorder: found no parameters under",
-    ("duration: 60.0", "duration: [60.0"): "bad.yaml: not valid YAML",
-    ("duration: 60.0", "duration: 2001-99-99"): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 060"): "flight.duration: found '060', expected a number",
-    ("duration: 60.0", "duration: " + 5000 * "["): "bad.yaml: not valid YAML",
     ("duration: 60.0", "duration: 60.0\n    duration: 50.0"): "bad.yaml: not valid YAML (found the key duration twice",
-    ("duration: 60.0", "duration: 1.0e+7"): "flight.duration: found 10000000.0, expected less than or equal to 1000000",
     ("duration: 60.0", "duration: 60.0\n    2: 60.0"): "flight: found the key 2, expected a name",
-    ("rate: 500.0                # Hz, y and truth", "rate: 0.5"): (
-        "aircraft.rate: found 0.5, expected greater than or equal to 1"
-    ),
-    ("rate: 500.0                # Hz\n    outputs", "rate: 0.5\n    outputs"): (
-        "reference_model.rate: found 0.5, expected greater than or equal to 1"
-    ),
     ("step: 0.002", "sensors: {seed: 340282366920938463463374607431768211456}\n    step: 0.002"): (
         "aircraft.sensors.seed: found 340282366920938463463374607431768211456, expected less than"
     ),
-    ("step: 0.002", "step: 1.0e+308"): "aircraft.step: found 1e+308, expected less than or equal to 1",
     ("start: [10.0], stop: [30.0], value: [1.5]", "start: [], stop: [30.0], value: [1.5]"): (
         "reference_model.pulses.V.start: found 0 values, expected at least 1 value"
     ),
-    ("natural_frequency: [4.0,", "natural_frequency: [1.0e+200,"): (
-        "natural_frequency[0]: found 1e+200, expected less than or equal to 1000000000"
-    ),
-    # Values that take hours to integrate, or overflow in the law.
-    ("step: 0.002", "step: 1.0e-9"): "aircraft.step: found 1e-09, expected greater than or equal to 1e-05",
-    ("k_g: 1.0", "k_g: 1.0e+308"): "controller.k_g: found 1e+308, expected less than or equal to 1000000000",
-    ("omega: [1.0,", "omega: [5.0e-324,"): "controller.omega[0]: found 5e-324, expected greater than or equal to 1e-09",
-    ("delay: 0.003", "delay: 1.0e+9"): "controller.delay: found 1e+09 s, expected at most 1 s, 100 periods of rate",
     ("delay: 0.003", "delay: 1.01"): "controller.delay: found 1.01 s, expected at most 1 s",
-    (
-        "input_scale: [0.0178096,",
-        "input_scale: [5.0e-324,",
-    ): "controller.input_scale[0]: found 5e-324, expected greater",
-    (
-        "speed: 10.12",
-        "speed: 1.0e+308",
-    ): "aircraft.gusts.vertical.speed: found 1e+308, expected less than or equal to 1000000000",
 }
 
 
@@ -121,48 +85,24 @@ FOUR = "found 1 values, expected 4, one for each of"
 BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
     "actuators": [
         ({"lag": [0.02]}, rf"\.lag: {FOUR} elevator, thrust, aileron, rudder"),
-        ({"lag": [-0.02, 0.0, 0.0, 0.0]}, r"\.lag\[0\]: found -0.02, expected greater than or equal to 0"),
         ({"upper": [-0.1, 1.0, 1.0, 1.0]}, r"\.upper\[0\]: found -0.1, expected greater than or equal to 0"),
-        ({"lower": [0.1, -1.0, -1.0, -1.0]}, r"\.lower\[0\]: found 0.1, expected less than or equal to 0"),
-        ({"rate": [1.0, math.nan, 1.0, 1.0]}, r"\.rate\[1\]: found nan, expected greater than 0"),
-        ({"dead_zone": [0.1]}, rf"\.dead_zone: {FOUR} elevator, thrust"),
-        ({"dead_zone": [-0.1] * 4}, r"\.dead_zone\[0\]: found -0.1, expected greater than or equal to 0"),
-        ({"stuck_at": [-1.0] * 4}, r"\.stuck_at\[0\]: found -1.0, expected greater than or equal to 0"),
-        ({"lost_at": [math.nan] * 4}, r"\.lost_at\[0\]: found nan, expected greater than or equal to 0"),
         ({"weak_effect": [3.0] * 4}, r"\.weak_effect\[0\]: found 3.0, expected less than or equal to 2"),
-        ({"lags": [0.02]}, r"\.lags: unknown key, expected lag perhaps"),
     ],
     "sensors": [
         ({"delay": 0.003}, r"\.delay: found 0\.003 s, expected a whole multiple of 1 / rate \(0\.002 s\)"),
-        ({"delay": -0.002}, r"\.delay: found -0.002, expected greater than or equal to 0"),
-        ({"noise": [0.1]}, rf"\.noise: {FOUR} q, V, p, r"),
-        ({"noise": [0.1, -0.1, 0.1, 0.1]}, r"\.noise\[1\]: found -0.1, expected greater than or equal to 0"),
-        ({"dropout": 1.0}, r"\.dropout: found 1.0, expected less than 1"),
         ({"seed": 1.5}, r"\.seed: found 1.5, expected an? .*integer"),
-        ({"nois": [0.0017, 0.03, 0.0017, 0.0017]}, r"\.nois: unknown key, expected noise perhaps"),
-        ({"bias": [0.1]}, rf"\.bias: {FOUR} q, V, p, r"),
-        ({"drift": [0.1] * 3 + [-0.1]}, r"\.drift\[3\]: found -0.1, expected greater than or equal to 0"),
         ({"quantisation": [-0.1] * 4}, r"\.quantisation\[0\]: found -0.1, expected greater than or equal to 0"),
     ],
     "uncertainty": [
-        ({"A": 1.0}, r"\.A: found 1.0, expected less than 1"),
-        ({"B": -0.1}, r"\.B: found -0.1, expected greater than or equal to 0"),
-        ({"seed": -1}, r"\.seed: found -1, expected greater than or equal to 0"),
-        ({"C": 0.1}, r"\.C: unknown key, expected one of A, B, distribution, entries, number, parts, seed, wind"),
         ({"wind": "none"}, r"\.wind: found 'none', expected"),
         ({"entries": ["A[q,q]"] * 2, "parts": [0.1, 0.6]}, r"\.entries: found A\[q,q\], A\[q,q\], expected different ones"),
     ],
     "turbulence": [
         ({"altitude": 3.0, "wind": 7.7}, r"\.altitude: found 3\.0, expected greater than or equal to 3\.048"),
         ({"altitude": 100.0}, r"\.wind: found none, expected a value at 100 m: it acts below 609\.6 m"),
-        ({"altitude": 400.0, "wind": 7.7}, r"\.sigma: found none, expected a value at 400 m: it acts above 304\.8 m"),
         (AIR | {"altitude": 100.0}, r"\.sigma: found 1 m/s, expected none at 100 m: it acts above 304\.8 m"),
-        (AIR | {"altitude": 700.0}, r"\.wind: found 7\.7 m/s, expected none at 700 m"),
-        ({"altitude": 100.0, "wind": -1.0}, r"\.wind: found -1\.0, expected greater than or equal to 0"),
-        ({"altitude": 100.0, "winds": 1.0}, r"\.winds: unknown key, expected wind perhaps"),
     ],
     "gusts": [
-        ({"up": GUST}, ": found 'up', expected a gust of the airframe osprey: vertical, lateral, longitudinal"),
         # 2 H / V0 at 25 m/s
         (
             {"vertical": GUST | {"length": 30.0, "every": 2.3}},
@@ -171,11 +111,8 @@ BAD_AIRCRAFT: dict[str, list[tuple[Any, str]]] = {
     ],
     "bias": [
         ({"h": STEP}, r"\.h: found 'h', expected a state of osprey: V, alpha"),
-        ({"q": {"start": 0.0, "value": 1.0}}, r"\.q\.rise: missing, expected the rise time, s"),
-        ({"q": STEP | {"rise": -1.0}}, r"\.q\.rise: found -1\.0, expected greater than or equal to 0"),
     ],
     "sines": [
-        ({"y": SINE | {"frequency": 1.0}}, r"\.y: found 'y', expected a state of osprey: V, alpha"),
         ({"q": SINE | {"frequency": 0.0}}, r"\.q\.frequency: found 0\.0, expected greater than 0"),
     ],
     "inertial_coupling": [(1.5, r": found 1\.5, expected less than or equal to 1")],
@@ -191,7 +128,6 @@ def test_invalid_section_of_aircraft_refused_by_name(section: str, values: Any, 
 @pytest.mark.parametrize(
     ("section", "values", "sentence"),
     [
-        ("turbulence", {"altitude": 100.0, "wind": 7.7}, "found a section, expected none: the airframe f16_lateral has"),
         ("inertial_coupling", 0.5, r"found 0\.5, expected 0: the airframe f16_lateral has no inertial_coupling"),
     ],
 )
@@ -205,8 +141,6 @@ def test_section_without_data_in_airframe_refused(section: str, values: Any, sen
     [
         ("gusts", {"up": {"q": 1.0}}, r"\.up: found 'up', expected an axis of the wind: longitudinal, lateral, vert"),
         ("inertial_coupling", [PRODUCT | {"product": ["q"]}], r"\[0\]\.product: found 1 states, expected two of them"),
-        ("inertial_coupling", [PRODUCT | {"product": ["q", "w"]}], r"\[0\]\.product\[1\]: found 'w', expected a state"),
-        ("inertial_coupling", [PRODUCT | {"into": "w"}], r"\[0\]\.into: found 'w', expected a state"),
     ],
 )
 def test_invalid_section_of_airframe_refused_by_name(section: str, values: Any, sentence: str) -> None:

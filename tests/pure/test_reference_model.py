@@ -92,12 +92,6 @@ def test_step_is_one_runge_kutta_step_of_equation_2() -> None:
     assert model.step(x_m, u_m, model.stepper(dt, matrices)) == pytest.approx(one_step, rel=1e-14, abs=1e-15)
 
 
-def test_a_long_pulse_ends_at_its_value() -> None:
-    # Unit static gain: y_m -> u_m; exp(-0.9 4 10) is below 1e-15.
-    params = parameters(pulses={"q": {"start": [0.0], "stop": [100.0], "value": [0.1]}})
-    assert simulate(params, 10.0, 0.01)[-1] == pytest.approx([0.1, 0.0, 0.0], abs=1e-9)
-
-
 def test_general_form_and_second_order_form_are_same_model() -> None:
     same = parameters().model()
     A_m, B_m = same.A_m.ravel().tolist(), same.B_m.ravel().tolist()

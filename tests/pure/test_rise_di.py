@@ -3,7 +3,6 @@
 """The Python interface `rise_di`: its names, its laziness, its types, flights and logs, the sentences about wrong input."""
 
 import ast
-import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +15,6 @@ from tests.conftest import REPOSITORY
 from tests.pure.test_import_rule import modules_loaded_by
 
 import rise_di
-from rise_di_controller import law, laws
 
 pytestmark = [pytest.mark.package("rise_di"), pytest.mark.slow]
 
@@ -71,27 +69,14 @@ def test_the_interface_needs_no_ros() -> None:
     assert not modules_loaded_by("import rise_di\nfor name in dir(rise_di): getattr(rise_di, name)") & ros
 
 
-def test_completion_knows_every_name() -> None:
-    names = {name for _, _, name in type_checker_imports()}
-    assert {*names, "__version__"} == {*rise_di.__all__, "__version__"} == set(dir(rise_di))
-
-
 def test_an_unknown_name_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="module 'rise_di' has no attribute 'simulat'"):
         rise_di.simulat  # type: ignore[attr-defined]  # noqa: B018
 
 
-def test_the_version_is_that_of_the_package() -> None:
-    assert f"\n## {rise_di.__version__} - " in (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
-
-
 def test_the_page_of_the_interface_has_every_name() -> None:
     page = (REPOSITORY / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"^::: rise_di\.(\w+)$", page, re.MULTILINE)) == rise_di.__all__
-
-
-def test_the_law_is_that_of_the_controller() -> None:
-    assert (rise_di.engage, rise_di.step, rise_di.laws) == (law.engage, law.step, laws.names)
 
 
 # Old names
@@ -108,36 +93,13 @@ def test_a_flight_has_types(tape: rise_di.Tape) -> None:
     assert tape["y"]["q"].shape == tape.time("y").shape == (1001,)  # 2 s at 500 Hz
 
 
-def test_the_summary_of_a_tape_needs_nothing_else(tape: rise_di.Tape) -> None:
-    summary = rise_di.summarise(tape)
-    assert summary == rise_di.summarise(tape, SOFT, tape.outcome)
-    assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 2.0)
-    assert summary["errors"]["q"]["whole"] == rise_di.error_metrics(rise_di.best_error(tape)[1]["q"])._asdict()
-
-
 def test_a_data_frame_has_the_samples_of_the_tape(tape: rise_di.Tape) -> None:
     frame = rise_di.data_frame(tape)
     assert frame["y.q"].drop_nulls().to_list() == tape["y"]["q"].tolist()
     assert frame["u.elevator"].drop_nulls().to_list() == tape["u"]["elevator"].tolist()
 
 
-def test_a_simulated_tape_is_replayed() -> None:
-    """The scenario of the tape has the parameters, so that other parameters differ."""
-    tape = rise_di.simulate(SOFT)
-    result = rise_di.replay(tape)
-    assert result.equal()
-    assert result.checked.all()
-    assert not rise_di.replay(tape, SCENARIO.controller).equal()
-
-
 # A log
-
-
-def test_a_varied_flight_leaves_its_scenario_in_the_log(run: rise_di.RecordedRun) -> None:
-    scenario = rise_di.recorded_scenario(run)
-    assert (scenario.controller, scenario.flight, scenario.aircraft) == (SOFT.controller, SOFT.flight, SOFT.aircraft)
-    assert run.path is not None
-    assert rise_di.recorded_scenario(str(run.path)) == scenario == rise_di.recorded_scenario(run.scenario_file())
 
 
 def test_a_log_has_the_samples_of_the_flight(run: rise_di.RecordedRun, tape: rise_di.Tape) -> None:
@@ -146,31 +108,11 @@ def test_a_log_has_the_samples_of_the_flight(run: rise_di.RecordedRun, tape: ris
         assert np.ascontiguousarray(run.tape[topic].values).tobytes() == tape[topic].values.tobytes()
 
 
-@pytest.mark.parametrize("kind", [str, Path])
-def test_paths_are_texts_or_path_like(flown: rise_di.FlightResult, kind: Callable[[Path], Any]) -> None:
-    folder = flown.mcap.parent
-    assert rise_di.replay(kind(folder)).equal()
-    assert rise_di.read_run(kind(flown.mcap)).tape["u"].names == ("elevator", "aileron", "rudder", "thrust")
-    page, flights = rise_di.report(kind(folder))
-    assert (page, flights[0].summary) == (flown.report, flown.flight.summary)
-    assert rise_di.find_scenario(kind(folder / "osprey_gust.yaml")).controller == SOFT.controller
-
-
 def test_other_gains_on_the_recorded_inputs_are_an_open_loop(run: rise_di.RecordedRun) -> None:
     slower = SOFT.vary(controller={"Lambda": SOFT.rise_di().Lambda[0] * np.ones(4, dtype=np.float32)})
     again = rise_di.replay(run, others=slower.controller)
     assert not again.equal()
     assert again.notes[0].startswith("open loop")
-
-
-def test_a_report_writes_files_for_other_programs(flown: rise_di.FlightResult, tmp_path: Path) -> None:
-    folder = flown.mcap.parent
-    rise_di.report(folder, csv=tmp_path / "flight.csv", parquet=str(tmp_path / "flight.parquet"))
-    assert (tmp_path / "flight.csv").is_file()
-    assert pl.read_parquet(tmp_path / "flight.parquet").equals(rise_di.data_frame(flown.flight.tape))
-    page, flights = rise_di.report(folder, folder, html=tmp_path / "two.html")
-    assert page.is_file()
-    assert len(flights) == 2
 
 
 # Laws, gains, campaigns
@@ -185,63 +127,6 @@ def test_numpy_is_accepted_wherever_numbers_are() -> None:
     assert {type(value) for value in varied.rise_di().beta} == {float}
     assert rise_di.find_scenario("osprey_gust", duration=np.float64(2.0)) == SCENARIO
     assert rise_di.decompose(np.eye(2)).D.tolist() == rise_di.decompose([[1.0, 0.0], [0.0, 1.0]]).D.tolist()
-
-
-def test_another_law_leaves_the_gains_of_the_law_before() -> None:
-    fields = rise_di.law_schema("pi").model_fields
-    assert {"K", "Lambda"} <= fields.keys()
-    varied = SCENARIO.vary(controller={"law": "pi", "K": np.ones(4), "Lambda": np.ones(4)})
-    assert varied.controller.law == "pi"
-    assert varied.controller.rate == SCENARIO.controller.rate
-
-
-def test_selected_gains_fly() -> None:
-    selection = rise_di.select_gains("osprey", SCENARIO, samples=2, lag=np.zeros(4), delay=np.float64(0.0))
-    chosen = SCENARIO.vary(controller=selection.chosen)
-    assert chosen.controller == selection.chosen
-    assert rise_di.simulate(chosen).outcome == "completed"
-    assert "/**/controller" in rise_di.gains_yaml(selection)
-    checked = rise_di.check_gains(rise_di.load_airframe("osprey"), chosen, samples=2)
-    assert checked.controller == chosen.controller
-
-
-def test_a_campaign_is_resumed_with_the_same_figures(tmp_path: Path) -> None:
-    flights: list[tuple[int, int]] = []
-
-    def progress(flown: int, total: int) -> None:
-        flights.append((flown, total))
-
-    folder, report, figures = rise_di.fly_campaign(
-        "osprey_servo",
-        4,
-        duration=1.0,
-        chunk=2,
-        workers=1,
-        sweep={"beta": np.array([1.0, 2.0])},
-        runs=tmp_path,
-        progress=progress,
-    )
-    assert flights == [(2, 8), (4, 8), (6, 8), (8, 8)]
-    assert report.is_file()
-    assert figures == json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    assert [case["factor"] for case in figures["cases"]] == [1.0, 2.0]
-    assert rise_di.resume_campaign(str(folder)).figures == figures
-
-
-def test_margins_are_those_of_the_checked_gains() -> None:
-    """The same airframe, loop and gains, without uncertain aircraft, by two functions."""
-    servo = rise_di.find_scenario("osprey_servo")
-    margins, checked = rise_di.margins(servo), rise_di.check_gains("osprey", servo, samples=0)
-    assert checked.margins is not None
-    assert margins.delay == checked.margins.delay
-    assert margins.nominal.phase.tolist() == checked.margins.nominal.phase.tolist()
-
-
-def test_airframes_are_found_by_name() -> None:
-    assert "osprey" in rise_di.airframes()
-    facts = rise_di.airframe_facts("osprey")
-    assert facts.D is not None
-    assert facts.D.tolist() == rise_di.decompose(facts.Omega).D.tolist()
 
 
 # Wrong input
@@ -381,12 +266,3 @@ def test_wrong_input_is_one_sentence(call: str, request: pytest.FixtureRequest) 
     with pytest.raises(rise_di.ParameterError) as refused:
         wrong(*arguments)
     assert str(refused.value).startswith(sentence)
-
-
-def test_wrong_input_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(rise_di.ParameterError):
-        api.fly(SCENARIO, runs=tmp_path, progress=3)
-    for wrong in ({"progress": 3}, {"workers": 0}):
-        with pytest.raises(rise_di.ParameterError):
-            api.fly_campaign(SCENARIO, 2, runs=tmp_path, **wrong)
-    assert list(tmp_path.iterdir()) == []

@@ -3,7 +3,6 @@
 """Schedule of input_scale over dynamic pressure: its equation, bumpless, in flight with a delay, replayed."""
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
@@ -93,12 +91,6 @@ def test_change_of_scale_leaves_u_as_it_is() -> None:
     assert after == pytest.approx(u, rel=1e-6)
 
 
-def test_engagement_at_another_speed_starts_at_scale() -> None:
-    control_law, params = law()
-    state = control_law.engage(Measurements(y_at(FASTER), y_at(FASTER), *np.zeros((3, 4))), params)
-    assert state.scale == pytest.approx([(46.3 / 62.3) ** 2] * 3 + [1.0])
-
-
 def rms(tape: Tape) -> dict[str, float]:
     """Standard deviation of the rates over the last 5 s, mrad/s."""
     last = tape.time("y") > tape.time("y")[-1] - 5.0
@@ -122,20 +114,6 @@ def test_flight_with_schedule_replayed_to_last_bit() -> None:
     assert result.equal()
 
 
-def test_scale_restored_from_log_without_beginning() -> None:
-    tape = flown(True)
-    end = tape["internals"].stamp_ns[-1]
-    rest = {name: signal.within([(end - 10**9, end)]) for name, signal in tape.signals.items()}
-    result = replay(Tape(rest), flight(schedule=True, delay=0.03, duration=60.0).controller)
-    assert result.checked.sum() == 100  # ticks of the last second, less the first
-    assert result.equal()
-
-
-def test_without_section_nothing_logged_and_nothing_changes() -> None:
-    assert "scale.q" not in flown(False)["internals"].names
-    assert not hasattr(C172P.controller.tuned_law().params, "airspeed")
-
-
 @pytest.mark.parametrize("name", ["osprey_observer"])
 def test_model_of_trim_beside_schedule_refused(name: str) -> None:
     with pytest.raises(ParameterError, match=r"schedule: found a feedforward or an observer that holds at the trim speed"):
@@ -151,16 +129,3 @@ def test_schedule_of_airspeed_alone_refused() -> None:
         values[key] = () if key == "k_d" else None
     with pytest.raises(ParameterError, match=r"schedule: found the outputs V, expected V among them, and one that follows V"):
         C172P.rise_di().validate_mapping(values, "controller")
-
-
-def test_many_aircraft_have_each_their_scale() -> None:
-    control_law, params = law()
-    many, V = batch.shared(params), np.array([[-10.0, 0.0, FASTER]])
-    y: Any = np.concatenate([np.zeros((3, 3)), V])
-    found = target_scale(y, many)
-    assert found.shape == (4, 3)
-    assert found[0] == pytest.approx([target_scale(y_at(speed), params)[0] for speed in V[0]])
-    zero = np.zeros((4, 3))
-    state = control_law.engage(Measurements(y, y, zero, zero, zero), many)
-    _, u = control_law.step(state, Measurements(y + 0.01, y, zero, zero, zero), np.float64(0.01), many)
-    assert u.shape == (4, 3)
