@@ -12,8 +12,7 @@ import pytest
 from tests.conftest import REPOSITORY
 
 from flight_core import installation
-from flight_core.installation import EXTRAS, TARGETS, missing, require_package
-from flight_core.parameters import ParameterError
+from flight_core.installation import EXTRAS, TARGETS, missing
 
 pytestmark = pytest.mark.package("flight_core")
 
@@ -62,34 +61,8 @@ def test_workspace_names_a_checkout(monkeypatch: pytest.MonkeyPatch, tmp_path: P
     assert missing("jax").endswith(': pip install ".[campaign]" in a checkout of the stack')
 
 
-def test_messages_come_with_a_full_ros(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(installation, "CHECKOUT", tmp_path)
-    expected = (
-        "found no Python package px4_msgs, expected it: on a full ROS 2 install ros-jazzy-px4-msgs, or source a workspace"
-    )
-    assert missing("px4_msgs").startswith(expected)
-
-
-def test_common_messages_come_with_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(installation, "find_spec", lambda name: None)
-    assert missing("sensor_msgs") == "found no Python package sensor_msgs, expected it: make setup"
-
-
-def test_an_unknown_package_has_no_remedy() -> None:
-    with pytest.raises(ParameterError, match=r"^found no Python package no_such_package, expected it; a remark$"):
-        require_package("no_such_package", "; a remark")
-
-
 def test_targets_and_extras_exist() -> None:
     targets = re.findall(r"^([\w -]+):", (REPOSITORY / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     assert {target.removeprefix("make ") for target in TARGETS.values()} <= {word for line in targets for word in line.split()}
     extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
     assert {*TARGETS} == {*EXTRAS.values()} == extras.keys() - {"all"}
-
-
-@pytest.mark.parametrize(
-    "path", [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))], ids=lambda path: path.stem
-)
-def test_page_names_no_package_of_an_index(path: Path) -> None:
-    """The stack is installed from its checkout: it is not released, and a foreign package may have its name."""
-    assert not re.search(r"pip install[^\n`]*rise-di(\[| |$)|\"rise-di\[", path.read_text(encoding="utf-8"))

@@ -23,7 +23,11 @@ def test_profile_is_bound_to_own_address_and_knows_all_hosts() -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["10.0.0.1", "10.0.0.1,10.0.0.1", "a,b", "10.0.0.1,127.0.0.1", "10.0.0.1,224.0.0.1", "::1,::2"]
+    "text",
+    [
+        "10.0.0.1,10.0.0.1",
+        "10.0.0.1,127.0.0.1",
+    ],
 )
 def test_addresses_of_no_hosts_refused(text: str) -> None:
     with pytest.raises(ParameterError, match=r"^--peers: found "):

@@ -54,7 +54,12 @@ def test_shown_paths_are_printable() -> None:
     assert display_path(Path("/runs") / ESCAPES).isprintable()
 
 
-@pytest.mark.parametrize("command", ["report", "replay", "repair"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "report",
+    ],
+)
 def test_command_prints_names_of_files_as_escapes(command: str, run: Path) -> None:
     name = ESCAPES.replace("\n", "")
     folder = run.rename(run.with_name(name))

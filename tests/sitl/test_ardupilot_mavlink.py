@@ -271,28 +271,6 @@ def test_silent_ground_station_ends_the_engagement_and_the_aircraft_loiters(plan
         flight.end()
 
 
-@pytest.mark.parametrize("station", ["speaks", "is silent"])
-def test_end_of_a_dry_run_is_no_lost_ground_station_and_a_dry_run_does_not_hide_one(
-    plane: ArduPlane, failsafe: None, station: str
-) -> None:
-    plane.level()
-    with plane.shared_link() as link:
-        flight = plane.fly(SCENARIO.path, plane.shared_map(), 100.0)
-        try:
-            flight.wait_for("would refuse: dry_run is true: nothing is sent; the mode is not MANUAL")
-            plane.hand_over()
-            if station == "speaks":
-                modes = mode_after(plane, flight.interrupt, SILENT)
-            else:
-                modes = mode_after(plane, lambda: link("silence"), SILENT)
-            assert modes == ({"MANUAL"} if station == "speaks" else {"MANUAL", "RTL"})
-        finally:
-            link("speak")
-            flight.interrupt()
-            flight.end()
-            plane.level()
-
-
 @pytest.mark.parametrize(("how", "mode"), [("switch", "MANUAL"), ("engage --off", "MANUAL"), ("Ctrl-C", "LOITER")])
 def test_mode_after_a_release_is_the_pilots_or_one_that_flies(plane: ArduPlane, how: str, mode: str) -> None:
     with engaged(plane, 100.0) as flight:
