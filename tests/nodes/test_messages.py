@@ -13,6 +13,7 @@ from tests.joint_states import vector
 
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
+from flight_ros import rclpy_private
 from flight_ros.messages import NO_CHANNELS, Decoder, Encoder, instant, sender_of, stamp_of, to_message
 
 pytestmark = pytest.mark.package("flight_ros")
@@ -35,6 +36,11 @@ def test_sample_encoded_as_independent_library_encodes_it(
     encoder = Encoder(names, frame_id)
     encoder.encode(1, np.zeros(len(names)))  # an earlier sample leaves no trace
     assert encoder.encode(stamp_ns, np.array(values)) == vector(stamp_ns, names, values, frame_id)
+
+
+def test_bytes_that_are_no_message_raise_error_that_nodes_catch() -> None:
+    with pytest.raises(rclpy_private.DeserializationError):
+        deserialize_message(b"\x00", JointState)
 
 
 def test_the_middleware_reads_what_was_encoded() -> None:

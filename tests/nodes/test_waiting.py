@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
 import pytest
 from tests.conftest import REPOSITORY
 from tests.ros import waiting
@@ -87,3 +88,14 @@ def test_wait_is_longer_by_the_delays_of_the_host(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(AssertionError):
         until(lambda: False, "nothing", lambda: looks.append(1), timeout=0.0)
     assert len(looks) == 3
+
+
+def test_process_under_test_ends_with_process_that_runs_tests() -> None:
+    long = "Process('timeit', '-n', '1', 'import time; time.sleep(600)', cwd=Path())"
+    program = f"from pathlib import Path; from tests.ros.conftest import Process; print({long}.popen.pid, flush=True)"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True) as tests:
+        assert tests.stdout is not None
+        process = psutil.Process(int(tests.stdout.readline()))
+        until(lambda: "timeit" in process.cmdline()[:3], "the program: until then it is setpriv")
+        tests.kill()
+        process.wait(10.0)

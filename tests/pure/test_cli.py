@@ -94,9 +94,14 @@ def test_help_names_every_option() -> None:
         assert option in shown.stdout
 
 
-def test_a_scenario_file_may_lie_anywhere(tmp_path: Path, osprey_gust: Scenario) -> None:
-    (tmp_path / "mine.yaml").write_bytes(osprey_gust.path.read_bytes())
-    assert rise_di("fly", "mine.yaml", "--in-process", "--duration", "1", cwd=tmp_path).returncode == 0
+def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diverges(
+    tmp_path: Path, osprey_gust: Scenario
+) -> None:
+    text = osprey_gust.path.read_text(encoding="utf-8")
+    (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
+    flown = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
+    assert flown.returncode == 3
+    assert "outcome: diverged at t = " in flown.stdout
     assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
 
 

@@ -181,3 +181,16 @@ def test_node_loads_nothing_heavy_that_it_does_not_need(node: str) -> None:
 @pytest.mark.parametrize("module", ["flight_analysis.report.run_folder", "flight_analysis.closed_loop.simulate"])
 def test_flight_loads_no_library_of_report(module: str) -> None:
     assert not modules_loaded_by(f"import {module}") & {"scipy", "plotly", "jinja2", "polars", "matplotlib", "ruamel"}
+
+
+def test_private_names_of_rclpy_are_in_one_file() -> None:
+    files = [str(path.relative_to(SOURCES)) for path in FILES if path.name != "rclpy_private.py" and has_private_names(path)]
+    assert not files, "\n".join(files)
+
+
+def has_private_names(path: Path) -> bool:
+    """Whether a file imports rclpy.impl, or reads a `handle` beside an import of rclpy."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    modules = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    reads_handle = any(isinstance(node, ast.Attribute) and node.attr == "handle" for node in nodes)
+    return any(name.startswith("rclpy.impl") or (name.startswith("rclpy") and reads_handle) for name in modules)

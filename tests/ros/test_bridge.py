@@ -112,7 +112,10 @@ def setup(start: Start, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iter
 
 
 def test_command_engages_withdraws_and_says_what_still_releases(setup: BridgeSetup, start: Start) -> None:
-    """A map without a bound needs `--blind`; Ctrl-C withdraws a request that waits for a condition."""
+    """A map without a bound needs `--blind`; Ctrl-C withdraws a request that waits for a condition.
+
+    A bridge that ends releases, and one that is killed leaves it to the autopilot.
+    """
     condition = {
         "topic": "/ap/mode",
         "type": "std_msgs/msg/UInt8",
@@ -126,7 +129,7 @@ def test_command_engages_withdraws_and_says_what_still_releases(setup: BridgeSet
     qos = {"reliability": "reliable", "durability": "volatile", "depth": 1}
     setup.change_map(max_engaged=None, engage_timeout=1e3, topics={"/ap/mode": qos})
     setup.change_map(conditions={"guided": condition})
-    setup.autopilot()
+    autopilot = setup.autopilot()
     bridge = setup.bridge()
     mode = setup.peer.node.create_publisher(UInt8, "/ap/mode", 1)
 
@@ -154,22 +157,17 @@ def test_command_engages_withdraws_and_says_what_still_releases(setup: BridgeSet
     assert setup.command(guided, "--off").end() == 0
     assert bridge.has_logged("ENGAGED -> RELEASE: disengaged by request")
 
-
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_bridge_that_ends_releases_and_one_that_is_killed_leaves_it_to_the_autopilot(
-    number: signal.Signals, setup: BridgeSetup
-) -> None:
-    autopilot, bridge = setup.autopilot(), setup.bridge()
-    setup.peer.until(lambda: setup.peer.last("y") and setup.peer.last("bridge/would_send"), "y and u", each=setup.send)
-    setup.command(setup.send).succeed()
-    setup.peer.until(lambda: setup.sent > 5, "messages to the autopilot", each=setup.send)
+    setup.command(guided, "--blind").succeed()
+    setup.peer.until(lambda: setup.axes and not all(map(math.isnan, setup.axes)), "messages to the autopilot", each=guided)
+    bridge.popen.send_signal(signal.SIGHUP)  # a bridge that ends releases
+    bridge.succeed()
+    setup.peer.until(lambda: all(map(math.isnan, setup.axes)), "release values")
+    killed = setup.bridge()
+    setup.command(guided, "--blind").succeed()
+    setup.peer.until(lambda: not all(map(math.isnan, setup.axes)), "messages to the autopilot", each=guided)
     timeouts = autopilot.lines.count("timeout")
-    bridge.popen.send_signal(number)
-    if number is signal.SIGKILL:
-        setup.peer.until(lambda: autopilot.lines.count("timeout") > timeouts, "the autopilot's own timeout")
-    else:
-        bridge.succeed()
-        setup.peer.until(lambda: all(map(math.isnan, setup.axes)), "release values")
+    killed.popen.kill()  # one that is killed leaves it to the autopilot
+    setup.peer.until(lambda: autopilot.lines.count("timeout") > timeouts, "the autopilot's own timeout")
 
 
 def test_rise_di_fly_starts_bridge_and_logs_autopilot_topics(setup: BridgeSetup, start: Start, tmp_path: Path) -> None:

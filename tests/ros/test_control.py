@@ -4,32 +4,26 @@
 
 import json
 import re
-import time
 import urllib.request
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 from urllib.error import HTTPError
 
-import numpy as np
 import pytest
 from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer
 from tests.ros.test_lockstep import scenario_file
 from tests.ros.waiting import until
 
-from flight_core.parameters import ParameterError
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
-from flight_ros.messages import to_message
-from flight_view.control_client import ControlClient
 from flight_view.flight import Flight
 
 pytestmark = pytest.mark.package("flight_view")
 
-PEER_TOPICS = ("target", "truth")
+PEER_TOPICS = ("truth",)
 
 
 class Page:
@@ -74,20 +68,6 @@ class Page:
 
         flight.until(as_expected, "the state that the page expects")
         return found
-
-
-def test_target_not_taken_by_guidance_ends_when_cancelled(peer_node: Peer) -> None:
-    with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
-        sent = worker.submit(client.send_target, {"phi": 0.1})
-        guidance = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force
-        peer_node.until(
-            lambda: peer_node.received["target"],
-            "a target",
-            each=lambda: peer_node.publish("guidance", to_message(time.time_ns(), *guidance)),
-        )
-        client.cancel()
-        with pytest.raises(ParameterError, match="cancelled by a later request"):
-            sent.result()
 
 
 def test_flight_commanded_from_page_recorded_and_replayed(start: Start, tmp_path: Path, peer_node: Peer) -> None:

@@ -12,11 +12,9 @@ from pathlib import Path
 import psutil
 import pytest
 from rosbags.highlevel import AnyReader
-from tests.conftest import REPOSITORY
 from tests.ros.conftest import DEFAULT_SIGHUP, Process, Start
 from tests.ros.waiting import HANG, until
 
-from flight_analysis.closed_loop.scenario import Scenario
 from flight_log.tape_reader import read_run
 
 pytestmark = pytest.mark.package("flight_bringup")
@@ -39,13 +37,25 @@ def is_engaged(folder: Path) -> bool:
     return any("ENGAGED" in log.read_text(encoding="utf-8") for log in folder.glob("runs/*/log/controller.log"))
 
 
-def test_interrupt_ends_all_processes_and_keeps_log(engaged: Engaged, tmp_path: Path) -> None:
+def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start, engaged: Engaged, tmp_path: Path) -> None:
+    """The first by one interrupt, the one beside it by three: the further ones do not interrupt its shutdown."""
     flight, nodes = engaged
     assert len(nodes) == 4
+    refused = start("flight_cli.cli", "fly", "osprey_gust")
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
+    assert refused.end() == 2
+    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in refused.output
+    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
+    nodes_beside = beside.children()
     flight.interrupt()
-    assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
+    beside.interrupt()
+    beside.interrupt()
+    psutil.wait_procs(nodes_beside[:1], timeout=ENDED)
+    beside.interrupt()
+    assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
     assert flight.end() == 130, flight.output
-    assert "Traceback" not in flight.output
+    beside.end()
+    assert "Traceback" not in flight.output + beside.output
     assert "outcome: interrupted" in flight.output
     assert "q (mrad/s)" in flight.output
     run = (tmp_path / "runs" / "latest").resolve()
@@ -55,18 +65,10 @@ def test_interrupt_ends_all_processes_and_keeps_log(engaged: Engaged, tmp_path: 
         assert reader.message_count > 0
     for log in (run / "log").glob("*.log"):
         assert "Traceback" not in log.read_text(encoding="utf-8")
-
-
-def test_second_interrupt_does_not_interrupt_shutdown(engaged: Engaged, tmp_path: Path) -> None:
-    flight, nodes = engaged
-    flight.interrupt()
-    flight.interrupt()
-    psutil.wait_procs(nodes[:1], timeout=ENDED)
-    flight.interrupt()
-    assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
-    flight.end()
-    assert "Traceback" not in flight.output
-    assert read_run(next((tmp_path / "runs").glob("*-osprey_gust"))).tape.notes == ()  # the recorder closed its file
+    log_beside = read_run(next((tmp_path / "beside" / "runs").glob("*-osprey_gust")))
+    assert log_beside.tape.notes == ()  # the recorder closed its file
+    vectors = {name for name in log_beside.topics if name.endswith(("/y", "/y_m", "/u"))}
+    assert vectors == {"/uav2/y", "/uav2/y_m", "/uav2/u"}
 
 
 def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
@@ -86,64 +88,27 @@ def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
     assert (run / "report.html").is_file()
 
 
-@pytest.mark.parametrize("seconds", [0.3, 0.6])  # of processor time; an earlier interrupt stops the interpreter itself
-def test_an_early_interrupt_causes_no_traceback(seconds: float, start: Start) -> None:
-    flight = start("flight_cli.cli", "fly", "osprey_gust")
-    used = psutil.Process(flight.popen.pid).cpu_times
-    flight.until(lambda: used().user + used().system >= seconds, "the processor time of the interrupt")
-    nodes = flight.children()
-    flight.interrupt()
-    assert flight.end() in {130, -signal.SIGINT}, flight.output
-    assert "Traceback" not in flight.output
-    assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
+def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
+    for seconds in (0.3, 0.6):  # of processor time; an earlier interrupt stops the interpreter itself
+        flight = start("flight_cli.cli", "fly", "osprey_gust")
+        used = psutil.Process(flight.popen.pid).cpu_times
+        flight.until(lambda: used().user + used().system >= seconds, "the processor time of the interrupt")  # noqa: B023
+        nodes = flight.children()
+        flight.interrupt()
+        assert flight.end() in {130, -signal.SIGINT}, flight.output
+        assert "Traceback" not in flight.output
+        assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
 
 
-def test_two_flights_on_one_domain_do_not_mix(start: Start, engaged: Engaged, tmp_path: Path) -> None:
-    second = start("flight_cli.cli", "fly", "osprey_gust")
-    assert second.end() == 2
-    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in second.output
-    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--duration", "0.5", "--runs", "beside")
-    assert beside.end() in {0, 4}, beside.output  # 4: a busy host
-    topics = read_run(next((tmp_path / "beside").glob("*-osprey_gust"))).topics
-    assert {name for name in topics if name.endswith(("/y", "/y_m", "/u"))} == {"/uav2/y", "/uav2/y_m", "/uav2/u"}
-    first, _ = engaged
-    first.interrupt()
-    assert first.end() == 130
-
-
-def test_flight_in_one_process_with_wrong_sign_ends_when_it_diverges(
-    start: Start, osprey_gust: Scenario, tmp_path: Path
-) -> None:
-    wrong = tmp_path / "wrong.yaml"
-    text = osprey_gust.path.read_text(encoding="utf-8")
-    wrong.write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
-    flight = start("flight_cli.cli", "fly", str(wrong), "--in-process")
-    assert flight.end() == 3
-    assert "outcome: diverged at t = " in flight.output
-
-
-def test_killed_node_ends_flight_and_named(engaged: Engaged) -> None:
+def test_killed_node_ends_flight_and_killed_command_its_nodes(start: Start, engaged: Engaged, tmp_path: Path) -> None:
     flight, nodes = engaged
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
+    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
+    nodes_beside = beside.children()
     flight.child("rise_di_controller.main").kill()
+    beside.popen.kill()
+    assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
     assert flight.end() == 3
     assert "controller was killed by SIGKILL" in flight.output
-    assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
-
-
-def test_nodes_end_when_command_itself_killed(engaged: Engaged, tmp_path: Path) -> None:
-    flight, nodes = engaged
-    flight.popen.kill()
-    assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
     # and the recorder closed its file
-    assert read_run(next((tmp_path / "runs").glob("*-osprey_gust"))).tape.notes == ()
-
-
-def test_process_under_test_ends_with_process_that_runs_tests() -> None:
-    long = "Process('timeit', '-n', '1', 'import time; time.sleep(600)', cwd=Path())"
-    program = f"from pathlib import Path; from tests.ros.conftest import Process; print({long}.popen.pid, flush=True)"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, cwd=REPOSITORY, text=True) as tests:
-        assert tests.stdout is not None
-        process = psutil.Process(int(tests.stdout.readline()))
-        until(lambda: "timeit" in process.cmdline()[:3], "the program: until then it is setpriv")
-        tests.kill()
-        process.wait(ENDED)
+    assert read_run(next((tmp_path / "beside" / "runs").glob("*-osprey_gust"))).tape.notes == ()

@@ -35,7 +35,7 @@ from flight_view.control_client import ControlClient
 
 pytestmark = pytest.mark.package("flight_guidance")
 
-PEER_TOPICS = ("u_m", "guidance", "pose", "/diagnostics")
+PEER_TOPICS = ("u_m", "guidance", "target")
 ORIGIN = [47.38, 8.54, 400.0]  # deg, m above WGS84
 PATIENT = ("-p", "max_age:=1000.0")  # a delay of the host makes no sample stale
 ENU_OF_NED, FLU_OF_FRD = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1, -1, -1])
@@ -142,16 +142,9 @@ def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
     return made
 
 
-def test_route_to_stopped_guidance_ends_when_cancelled(flight: Flight) -> None:
-    with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker, flight.process.stopped():
-        sent = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
-        flight.until(lambda: flight.peer.node.count_publishers("route") == 1, "the publisher of the route")
-        client.cancel()
-        with pytest.raises(ParameterError, match="cancelled by a later request"):
-            sent.result()
-
-
-def test_command_target_says_what_is_in_force_and_what_refused(flight: Flight, start: Start) -> None:
+def test_command_and_page_say_what_guidance_took_and_refused(start: Start, peer_node: Peer, calm: Path) -> None:
+    flight = Flight(start, peer_node, calm)
+    flight.until(lambda: peer_node.received["u_m"], "a u_m")
     good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
     flight.until(lambda: good.popen.poll() is not None, "the end of the command")
     assert "in force: heading=90, altitude=60" in good.succeed().output
@@ -159,13 +152,11 @@ def test_command_target_says_what_is_in_force_and_what_refused(flight: Flight, s
         lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0),
         "both targets in force",
     )
-    refused = start("flight_cli.cli", "target", "phi=80")  # degrees
-    flight.until(lambda: refused.popen.poll() is not None, "the end of the command")
-    assert refused.end() == 1
-    assert "error: not in force: target.phi: found 80, expected -30 to 30 deg" in refused.output
+    rejected = start("flight_cli.cli", "target", "phi=80")  # degrees
+    flight.until(lambda: rejected.popen.poll() is not None, "the end of the command")
+    assert rejected.end() == 1
+    assert "error: not in force: target.phi: found 80, expected -30 to 30 deg" in rejected.output
 
-
-def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
     with ControlClient("") as client, ThreadPoolExecutor(max_workers=1) as worker:
 
         def answer(method: Callable[..., str], *arguments: object) -> str:
@@ -182,10 +173,29 @@ def test_the_client_of_a_page_commands_guidance(flight: Flight) -> None:
         assert answer(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0], [900.0, 900.0, 55.0]]) == ""
         flight.until(lambda: flight.last("mode.lateral") == Lateral.ROUTE, "a flown route")
         flight.until(
-            lambda: flight.peer.node.count_publishers("route") == 0, "a route that is withdrawn"
+            lambda: peer_node.node.count_publishers("route") == 0, "a route that is withdrawn"
         )  # a later guidance receives no route of before
         leg = flight.last("leg")
         assert answer(client.guide, "skip") == ""
         flight.until(lambda: flight.last("leg") > leg, "the next leg")
         assert answer(client.guide, "hold") == ""
         flight.until(lambda: flight.last("mode.lateral") == Lateral.HEADING, "the held heading")
+
+        with flight.process.stopped():  # it takes nothing: a later request ends the wait
+            pending = worker.submit(client.send_route, [[0.0, 0.0, 50.0], [900.0, 0.0, 55.0]])
+            flight.until(lambda: peer_node.node.count_publishers("route") == 1, "the publisher of the route")
+            client.cancel()
+            with pytest.raises(ParameterError, match="cancelled by a later request"):
+                pending.result()
+            client.resume()
+            before = len(peer_node.received["target"])
+            pending = worker.submit(client.send_target, {"phi": 0.1})
+            in_force = (["target.phi"], np.array([0.0]), "peer")  # another target stays in force
+            peer_node.until(
+                lambda: len(peer_node.received["target"]) > before,
+                "a target",
+                each=lambda: peer_node.publish("guidance", to_message(time.time_ns(), *in_force)),
+            )
+            client.cancel()
+            with pytest.raises(ParameterError, match="cancelled by a later request"):
+                pending.result()

@@ -57,7 +57,7 @@ def of(run: Path, topic: str) -> list[bytes]:
     return [message.data for message in read_playback(run, [topic]).messages]
 
 
-def test_flight_played_byte_by_byte_with_timing_and_clock(
+def test_flight_played_byte_by_byte_with_timing_and_clock_and_in_a_loop(
     run: Path, start: Start, peer_node: Peer, host_delays: HostDelays
 ) -> None:
     receiving = Receiver(peer_node.node, Y, Y_M, CLOCK)
@@ -74,45 +74,21 @@ def test_flight_played_byte_by_byte_with_timing_and_clock(
     late = (sent - sent[0]) / NANOSECONDS - np.arange(1001) * 0.001
     assert np.median(np.abs(late)) < 0.02 + host_delays.since(sent[0] / NANOSECONDS)
 
-
-def test_stamps_moved_to_now_and_all_other_bytes_unchanged(
-    run: Path, start: Start, peer_node: Peer, host_delays: HostDelays
-) -> None:
-    receiving = Receiver(peer_node.node, Y)
-    process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--rate", "2", "--start", "1.5")
-    receiving.until(Y, 251)
-    process.succeed()
-    stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
-    assert set(np.diff(stamps)) == {MS}  # 2 ms at twice the rate
-    late = np.median(np.abs(stamps - np.array(receiving.sent["y"]))) / NANOSECONDS
-    assert late < 0.05 + host_delays.since(stamps[0] / NANOSECONDS)  # as fresh as they were
-    received, recorded = ([payload[:4] + payload[12:] for payload in y] for y in (receiving.received["y"], of(run, "y")[-251:]))
-    assert received == recorded
-
-
-def test_domain_with_publisher_of_topic_is_error(run: Path, start: Start, domain: int, peer_node: Peer) -> None:
-    peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
-    process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
-    assert process.end() == 2
-    (message,) = process.lines
-    sentence = "found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
-    assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
-
-
-def test_a_loop_repeats_until_it_is_interrupted(run: Path, start: Start, peer_node: Peer, host_delays: HostDelays) -> None:
-    receiving = Receiver(peer_node.node, Y)
-    process = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
-    receiving.until(Y, 3 * 51 + 1)
-    process.interrupt()
+    looped = Receiver(peer_node.node, Y)
+    loop = start("flight_cli.cli", "play", str(run), "--topics", "y", "--start", "1.9", "--loop")
+    looped.until(Y, 3 * 51 + 1)
+    loop.interrupt()
     begin = time.time()
-    assert process.end() == 130
+    assert loop.end() == 130
     assert time.time() - begin < 3.0 + host_delays.since(begin)
-    assert "Traceback" not in process.output
-    stamps = [stamp_of(message) for message in receiving.received["y"]]
+    assert "Traceback" not in loop.output
+    stamps = [stamp_of(message) for message in looped.received["y"]]
     assert stamps == sorted(stamps)  # also from one pass to the next
 
 
-def test_topics_that_cannot_be_sent_are_skipped_with_one_warning(start: Start, tmp_path: Path, peer_node: Peer) -> None:
+def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refused(
+    start: Start, tmp_path: Path, domain: int, peer_node: Peer
+) -> None:
     """A type that is not installed, a name that no topic of ROS may have, and JSON, beside a y."""
     y, log = serialize_message(to_message(1, ("q",), np.zeros(1), "peer")), tmp_path / "mixed.mcap"
     with log.open("wb") as stream:
@@ -139,6 +115,13 @@ def test_topics_that_cannot_be_sent_are_skipped_with_one_warning(start: Start, t
         "/json",
     ]
 
+    peer_node.publish("y", to_message(0, ("q",), np.zeros(1), "peer"))
+    refused = start("flight_cli.cli", "play", str(log))
+    assert refused.end() == 2
+    (message,) = [line for line in refused.lines if line.startswith("error:")]
+    sentence = "found 1 publishers of /y already, expected no publisher: set ROS_DOMAIN"
+    assert message.startswith(f"error: ROS_DOMAIN_ID {domain}: {sentence}")
+
 
 def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
     flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(tmp_path))
@@ -155,7 +138,7 @@ def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, t
     assert receiving.received["internals"] == internals
 
 
-def test_controller_in_real_time_follows_recorded_flight(
+def test_controller_in_real_time_follows_flight_with_stamps_moved_to_now(
     run: Path, start: Start, start_node: Start, host_delays: HostDelays
 ) -> None:
     # The recorded aircraft does not respond to this u, and these ticks use other samples of y than the recorded ones. So
@@ -164,14 +147,22 @@ def test_controller_in_real_time_follows_recorded_flight(
     for _ in range(3):  # again where the host did not run: the controller held u, or ramped it to trim
         begin = time.time()
         with peer() as peer_node:
+            receiving = Receiver(peer_node.node, Y)
             node = start_node("rise_di_controller").wait_for("ready")
             process = start("flight_cli.cli", "play", str(run), "--topics", "y,y_m")
             node.wait_for("WAITING -> ENGAGED")
             peer_node.until(lambda: process.popen.poll() is not None, "the end of the player")  # noqa: B023 - of this flight
             process.succeed()
+            receiving.until(Y, 1001)
             u = peer_node.u()
         node.interrupt().succeed()
         if host_delays.since(begin) < 0.1 or np.abs(u).max() == pytest.approx(largest, rel=0.3):
             break
     assert len(u) > 50
     assert np.abs(u).max() == pytest.approx(largest, rel=0.3)
+    stamps = np.array([stamp_of(message) for message in receiving.received["y"]])
+    assert set(np.diff(stamps)) == {2 * MS}
+    late = np.median(np.abs(stamps - np.array(receiving.sent["y"]))) / NANOSECONDS
+    assert late < 0.05 + host_delays.since(stamps[0] / NANOSECONDS)  # as fresh as they were
+    received, recorded = ([payload[:4] + payload[12:] for payload in y] for y in (receiving.received["y"], of(run, "y")))
+    assert received == recorded

@@ -11,13 +11,13 @@ from xml.etree import ElementTree
 import pytest
 from tests.conftest import REPOSITORY
 from tests.maps import MAP_FILES, named_map
-from tests.ros.conftest import Start
+from tests.ros.conftest import Process, Start
 from tests.ros.peer import Peer
 
 from autopilot_bridge.params import MAVLINK
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
-from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, NodeSpec, parameter_overrides
+from flight_bringup.graph import GUIDANCE, LEARNER, ON_START, parameter_overrides
 from flight_bringup.monitor import FlightMonitor
 
 pytestmark = pytest.mark.package("flight_bringup")
@@ -91,75 +91,59 @@ def discovered(peer_node: Peer, nodes: tuple[str, ...]) -> dict[str, Access]:
 
 
 ROLES = ("aircraft", "reference_model", "controller", "recorder")
+FURTHER = {"guidance": (GUIDANCE, "osprey_route"), "learner": (LEARNER, "osprey_learn")}  # nodes that few scenarios have
 
 
-def test_policy_allows_exactly_topics_and_services_of_nodes(start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
-    policy, packages = allowed(), ("rise_di_controller", "reference_model", "aircraft_sim", "flight_recorder")
-    processes = [start_node(package, "-p", "start_time:=-1.0") for package in packages[1:3]]
-    processes += [start_node(package) for package in (packages[0], packages[3])]
-    for process in processes:
-        process.wait_for("ready")
-    real_time = discovered(peer_node, ROLES)
+def start_further(start: Start, run: Path, *, lockstep: bool) -> list[Process]:
+    """Start the nodes that few scenarios have, and the bridge in a flight in real time."""
+    processes = []
+    for spec, name in FURTHER.values():
+        scenario = find_scenario(name)
+        overrides = parameter_overrides(spec, scenario, run, ON_START, lockstep=lockstep)
+        words = (word for key, value in overrides.items() for word in ("-p", f"{key}:={json.dumps(value)}"))
+        processes.append(start(spec.module, "--ros-args", "--params-file", str(scenario.path), *words))
+    if not lockstep:
+        processes.append(start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}"))
+    return processes
+
+
+def test_policy_allows_exactly_topics_and_services_of_nodes(
+    start: Start, start_node: Start, osprey_gust: Scenario, tmp_path: Path, peer_node: Peer
+) -> None:
+    """In a flight in real time with a learner, and in one in lockstep without."""
+    policy, learning = allowed(), str(find_scenario("osprey_learn").path)
+    processes = [start_node(package, "-p", "start_time:=-1.0") for package in ("reference_model", "aircraft_sim")]
+    processes += [start("rise_di_controller.main", "--ros-args", "--params-file", learning), start_node("flight_recorder")]
+    processes += start_further(start, tmp_path, lockstep=False)
+    with FlightMonitor(osprey_gust.controller.outputs, lockstep=False, learns=True):
+        real_time = discovered(peer_node, (*ROLES, *FURTHER, "bridge", "monitor"))
+    assert real_time["monitor"] == policy["monitor"]
+    check_bridge(real_time["bridge"], policy["bridge"])
     for process in processes:
         process.interrupt()
+    for process in processes:
         process.end()
+    peer_node.until(lambda: peer_node.node.get_node_names() == ["peer"], "the end of the nodes")
+
     overrides = [f"{role}:lockstep:=true" for role in ROLES] + ["aircraft:control_rate:=100.0", "controller:y_rate:=500.0"]
     overrides.append(f"recorder:directory:={tmp_path / 'run'}")
     start_node("flight_bringup", *(word for override in overrides for word in ("-p", override)))
-    lockstep = discovered(peer_node, ROLES)
-    beside_learner = {
-        "controller": Access(frozenset({"/learning", "/authority"}), frozenset({"/proposal"}), frozenset(), frozenset())
-    }
-    for role in ROLES:
-        further = beside_learner.get(role, real_time[role])
-        assert real_time[role].merged(lockstep[role]).merged(further) == policy[role], role
+    start_further(start, tmp_path, lockstep=True)
+    lockstep = discovered(peer_node, (*ROLES, *FURTHER))
+    further = {"guidance": Access(frozenset({"/tf"}), *[frozenset()] * 3)}  # where tf2_msgs is installed
+    for role in lockstep:
+        assert real_time[role].merged(lockstep[role]).merged(further.get(role, lockstep[role])) == policy[role], role
 
 
-def test_the_policy_allows_exactly_those_of_guidance(start: Start, tmp_path: Path, peer_node: Peer) -> None:
-    found = optional_node(GUIDANCE, "osprey_route", start, tmp_path, peer_node)
-    transforms = Access(frozenset({"/tf"}), *[frozenset()] * 3)  # where tf2_msgs is installed
-    assert found.merged(transforms) == allowed()["guidance"]
-
-
-def test_policy_allows_exactly_those_of_learner(start: Start, tmp_path: Path, peer_node: Peer) -> None:
-    scenario = find_scenario("osprey_learn")
-    start("rise_di_controller.main", "--ros-args", "--params-file", str(scenario.path)).wait_for("ready")
-    controller = discovered(peer_node, ("controller",))["controller"]
-    assert {"/learning", "/authority"} <= controller.publish
-    assert {"/proposal"} <= controller.subscribe
-    assert optional_node(LEARNER, "osprey_learn", start, tmp_path, peer_node) == allowed()["learner"]
-
-
-def optional_node(spec: NodeSpec, name: str, start: Start, run: Path, peer_node: Peer) -> Access:
-    """The topics and services of a node that few scenarios have, in real time and in lockstep."""
-    scenario, found = find_scenario(name), Access(*[frozenset()] * 4)
-    for lockstep in (False, True):
-        overrides = parameter_overrides(spec, scenario, run, ON_START, lockstep=lockstep)
-        words = (word for key, value in overrides.items() for word in ("-p", f"{key}:={json.dumps(value)}"))
-        node = start(spec.module, "--ros-args", "--params-file", str(scenario.path), *words).wait_for("ready")
-        found = found.merged(discovered(peer_node, (spec.executable,))[spec.executable])
-        node.interrupt()
-        node.end()
-    return found
-
-
-def test_policy_allows_exactly_those_of_flight_monitor(osprey_gust: Scenario, peer_node: Peer) -> None:
-    with FlightMonitor(osprey_gust.controller.outputs, lockstep=False, learns=True):
-        assert discovered(peer_node, ("monitor",))["monitor"] == allowed()["monitor"]
-
-
-def test_policy_allows_exactly_those_of_bridge_with_every_map(start: Start, peer_node: Peer) -> None:
-    maps = [named_map(name) for name in MAP_FILES]
-    used = [row for channel_map in maps for row in channel_map.used_topics()]
+def check_bridge(own: Access, policy: Access) -> None:
+    """Check the policy of the bridge: what it has with one map, and what the other maps add."""
+    used = [row for name in MAP_FILES for row in named_map(name).used_topics()]
     sent, received = ([row for row in used if row[0].startswith("messages.") is is_sent] for is_sent in (True, False))
     # what comes over MAVLink is published for the recorder, and what goes over MAVLink is no topic
     requested = {topic for _, topic, kind in sent if "/srv/" in kind}
     published = {in_full(topic, "bridge") for _, topic, kind in sent if not kind.startswith(f"{MAVLINK}/")} - requested
     published |= {in_full(topic, "bridge") for _, topic, kind in received if kind.startswith(f"{MAVLINK}/")}
     subscribed = {in_full(topic, "bridge") for _, topic, kind in received if not kind.startswith(f"{MAVLINK}/")}
-    policy = allowed()["bridge"]
-    start("autopilot_bridge.main", "--ros-args", "-p", f"map:={MAP_FILES['ardupilot_2024']}").wait_for("dry run")
-    own = discovered(peer_node, ("bridge",))["bridge"]
     assert own.publish | published == policy.publish
     assert own.subscribe | subscribed == policy.subscribe
     assert (own.reply, own.request | requested) == (policy.reply, policy.request)

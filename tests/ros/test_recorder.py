@@ -10,6 +10,7 @@ import socket
 import struct
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
-from tests.recordings import count_messages, messages
-from tests.ros.conftest import Process, Recorder
+from tests.ros.conftest import Recorder
 from tests.ros.peer import OUTPUTS, Peer
 from tests.ros.waiting import HostDelays
 
@@ -47,67 +47,44 @@ def recorded(peer_node: Peer, topic: str) -> int:
     return int(diagnostics(peer_node)[2].get(f"messages {topic}", 0))
 
 
-def errors(process: Process) -> list[str]:
-    return [line for line in process.lines if "[ERROR]" in line or line.startswith("error:")]
+def test_topics_of_ros_and_further_ones_recorded_with_any_offered_qos(
+    recorder: Recorder, peer_node: Peer, tmp_path: Path
+) -> None:
+    node = peer_node.node
+    node.get_logger().info("logged before the recorder started")
+    for topic in ("/latched", "/mixed"):
+        node.create_publisher(String, topic, LATCHED).publish(String(data="before"))
+    process = recorder("run", "topics:=[/latched, relative/pressure, /late, /y, /mixed]").wait_for("ready")
+    weak = node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
+    late = node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
+    peer_node.until(lambda: recorded(peer_node, "/mixed") == 1, "the strong message")
+    weaker = node.create_publisher(String, "/mixed", BEST_EFFORT)
+    node.declare_parameter("gain", 3.0)
+    process.wait_for("/mixed: now recorded with best_effort")
 
+    def publish() -> None:
+        weak.publish(FluidPressure())
+        late.publish(Temperature(temperature=1.0))
+        weaker.publish(String(data="weak"))
 
-# Recorded topics
-
-
-def test_rosout_and_parameter_events_are_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
-    peer_node.node.get_logger().info("logged before the recorder started")
-    process = recorder("run")
-    peer_node.until(lambda: recorded(peer_node, "/rosout") > 1, "a line of the log")
-    peer_node.node.declare_parameter("gain", 3.0)
-    peer_node.until(lambda: recorded(peer_node, "/parameter_events") > 0, "a parameter event")
+    least = {"/relative/pressure": 3, "/late": 3, "/mixed": 4, "/latched": 1, "/rosout": 2, "/parameter_events": 1}
+    peer_node.until(
+        lambda: all(recorded(peer_node, topic) >= count for topic, count in least.items()), "each topic", each=publish
+    )
     process.interrupt().succeed()
+    assert [line for line in process.lines if "[ERROR]" in line or line.startswith("error:")] == []
+    by_topic: dict[str, list[Any]] = {topic: [] for topic in least}
     with AnyReader([tmp_path / "run"]) as reader:
-        recorded_messages = [
-            (connection.topic, reader.deserialize(data, connection.msgtype)) for connection, _, data in reader.messages()
-        ]
-    texts = [message.msg for topic, message in recorded_messages if topic == "/rosout"]  # type: ignore[attr-defined]
+        for connection, _, data in reader.messages():
+            by_topic.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
+    assert {topic for topic, count in least.items() if len(by_topic[topic]) < count} == set()
+    assert [message.data for message in by_topic["/latched"]] == ["before"]  # published before the recorder started
+    assert sum(message.data == "before" for message in by_topic["/mixed"]) == 1
+    texts = [message.msg for message in by_topic["/rosout"]]
     assert "logged before the recorder started" in texts
     assert any("recording to" in text for text in texts)
-    events = [message for topic, message in recorded_messages if topic == "/parameter_events"]
-    assert [parameter.name for event in events for parameter in event.new_parameters if event.node == "/peer"] == ["gain"]  # type: ignore[attr-defined]
-
-
-def test_further_topics_recorded_with_any_offered_qos(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
-    latched = peer_node.node.create_publisher(String, "/latched", LATCHED)
-    latched.publish(String(data="before"))
-    process = recorder("run", "topics:=[/latched, relative/pressure, /late, /y]")
-    process.wait_for("ready")
-    weak = peer_node.node.create_publisher(FluidPressure, "/relative/pressure", BEST_EFFORT)
-    peer_node.until(
-        lambda: recorded(peer_node, "/relative/pressure") > 2, "the pressure", each=lambda: weak.publish(FluidPressure())
-    )
-    late = peer_node.node.create_publisher(Temperature, "/late", QoSProfile(depth=5))
-    peer_node.until(
-        lambda: recorded(peer_node, "/late") > 2, "the late topic", each=lambda: late.publish(Temperature(temperature=1.0))
-    )
-    peer_node.until(lambda: recorded(peer_node, "/latched") > 0, "the latched message")
-    process.interrupt().succeed()
-    counts = count_messages(tmp_path / "run")
-    assert counts["/latched"] == 1  # published before the recorder started
-    assert counts["/relative/pressure"] > 2
-    assert counts["/late"] > 2
-    assert errors(process) == []
-
-
-def test_later_publisher_with_weaker_qos_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
-    strong = peer_node.node.create_publisher(String, "/mixed", LATCHED)
-    strong.publish(String(data="strong"))
-    process = recorder("run", "topics:=[/mixed]")
-    peer_node.until(lambda: recorded(peer_node, "/mixed") == 1, "the strong message")
-    weak = peer_node.node.create_publisher(String, "/mixed", BEST_EFFORT)
-    process.wait_for("/mixed: now recorded with best_effort")
-    peer_node.until(
-        lambda: recorded(peer_node, "/mixed") > 3, "the weak messages", each=lambda: weak.publish(String(data="weak"))
-    )
-    process.interrupt().succeed()
-    texts = [data for topic, _, data in messages(tmp_path / "run") if topic == "/mixed"]
-    assert sum(b"strong" in text for text in texts) == 1
-    assert sum(b"weak" in text for text in texts) > 2
+    events = [event for event in by_topic["/parameter_events"] if event.node == "/peer"]
+    assert [parameter.name for event in events for parameter in event.new_parameters] == ["gain"]
 
 
 def forge_gap(domain: int, writer: bytes) -> None:

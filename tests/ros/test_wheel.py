@@ -28,10 +28,10 @@ def write_package(folder: Path, name: str) -> None:
         (folder / path).write_text(text, encoding="utf-8")
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
     """The folder that holds the installed wheel, and a foreign package of the name guidance, as on PyPI."""
-    built, target = tmp_path_factory.mktemp("built"), tmp_path_factory.mktemp("installed")
+    built, target = tmp_path / "built", tmp_path / "installed"
     build = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(built))
     subprocess.run(build, cwd=REPOSITORY, check=True, capture_output=True, timeout=HANG)
     (wheel,) = built.glob("*.whl")
@@ -59,16 +59,13 @@ def run(installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run
     return run_python
 
 
-def test_every_package_comes_from_the_wheel(installed: Path, run: Run) -> None:
+def test_the_wheel_flies_beside_strangers(installed: Path, run: Run) -> None:
+    """Every package is that of the wheel. In one process, and as four processes over DDS, the replay is equal to the bit."""
     code = f"import importlib\nfor name in {PACKAGES}: print(importlib.import_module(name).__file__)"
     assert run("-P", "-c", code).split() == [str(installed / name / "__init__.py") for name in PACKAGES]
     assert [path.name for path in (installed / "bin").iterdir()] == ["rise-di"]
-
-
-@pytest.mark.parametrize("options", [["--in-process"], ["--lockstep"]], ids=" ".join)
-def test_the_wheel_flies_beside_strangers(options: list[str], installed: Path, run: Run) -> None:
-    """In one process, and as four processes over DDS; the replay is equal to the bit."""
     rise_di = str(installed / "bin" / "rise-di")
-    assert "outcome: completed" in run(rise_di, "fly", "osprey_gust", "--duration", "2", *options)
+    for option in ("--in-process", "--lockstep"):
+        assert "outcome: completed" in run(rise_di, "fly", "osprey_gust", "--duration", "2", option)
+        assert run(rise_di, "replay", "runs/latest") == "201 ticks, every bit equal\n"
     assert "outcome: completed" in run(rise_di, "report", "runs/latest")
-    assert run(rise_di, "replay", "runs/latest") == "201 ticks, every bit equal\n"

@@ -78,6 +78,20 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         metafunc.parametrize("case", chosen, ids=[case.name for case in chosen])
 
 
+CAMPAIGNS = {
+    "test_random_faults_detected_contained_and_recovered_from": "--faults-random",
+    "test_random_faults_of_lockstep_flights": "--faults-lockstep",
+}
+"""The tests of benchmarks/random_faults.py, with the options that ask for them."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the random faults that nobody asks for."""
+    left = [item for item in items if item.name in CAMPAIGNS and not config.getoption(CAMPAIGNS[item.name], 0)]
+    config.hook.pytest_deselected(items=left)
+    items[:] = [item for item in items if item not in left]
+
+
 @pytest.fixture(scope="session")
 def record(pytestconfig: pytest.Config) -> Callable[[Row], None]:
     """Append a row to the table of `--faults-table`."""

@@ -41,8 +41,6 @@ LONGEST_STOP = 0.4  # s; liveliness is never lost in a stop of 0.6 s, a third of
 def test_random_faults_of_lockstep_flights(
     start: Start, tmp_path: Path, lockstep_seeds: range, record: Callable[[Row], None]
 ) -> None:
-    if not lockstep_seeds:
-        pytest.skip("the benchmark injects them")
     scenario = scenario_file(tmp_path, DURATION, "osprey_route", aircraft=ROUGH)
     expected = simulate(load_scenario(scenario))
     failed = []
