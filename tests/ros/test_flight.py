@@ -41,10 +41,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start
     """The first by one interrupt, the one beside it by three: the further ones do not interrupt its shutdown."""
     flight, nodes = engaged
     assert len(nodes) == 4
-    refused = start("flight_cli.cli", "fly", "osprey_gust")
     beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
-    assert refused.end() == 2
-    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in refused.output
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
     flight.interrupt()
@@ -100,11 +97,16 @@ def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
         assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
 
 
-def test_killed_node_ends_flight_and_killed_command_its_nodes(start: Start, engaged: Engaged, tmp_path: Path) -> None:
+def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command_its_nodes(
+    start: Start, engaged: Engaged, tmp_path: Path
+) -> None:
     flight, nodes = engaged
     beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
+    refused = start("flight_cli.cli", "fly", "osprey_gust")
+    assert refused.end() == 2
+    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in refused.output
     flight.child("rise_di_controller.main").kill()
     beside.popen.kill()
     assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
