@@ -29,6 +29,7 @@ from flight_core.units import GRAVITY
 from flight_design.identification import open_loop_fit
 from flight_design.identification.bridge_identification import (
     Channels,
+    Flyable,
     channel_models,
     channel_pairs,
     experiment,
@@ -67,6 +68,8 @@ class Identified(NamedTuple):
     response: Response
     models: list[ChannelModel | None]
     channels: Channels
+    flying: Flyable
+    folder: Path
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +80,9 @@ def identified(tmp_path_factory: pytest.TempPathFactory) -> Identified:
     pairing, _ = channel_pairs(MAP)
     response = identify_response(tape["y"], tape["u"], pairing.outputs, pairing.inputs)
     models = channel_models(MAP, tape, [(0, 10**18)], SPEED)
-    return Identified(response, models, join(MAP, response, models))
+    channels = join(MAP, response, models)
+    flying = flying_scenario(MAP, channels, SPEED, str(folder / "flight_airframe.yaml"))
+    return Identified(response, models, channels, flying, folder)
 
 
 def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None:
@@ -94,10 +99,10 @@ def test_channels_of_unknown_aircraft_identified(identified: Identified) -> None
     assert (np.abs(channels.lag + channels.delay - expected) < np.where(lag > 0.05, 0.05, 0.02)).all()
 
 
-def test_written_scenario_flies_aircraft_and_tracks(identified: Identified, tmp_path: Path) -> None:
-    found = flying_scenario(MAP, identified.channels, SPEED, str(tmp_path / "flight_airframe.yaml"))
+def test_written_scenario_flies_aircraft_and_tracks(identified: Identified) -> None:
+    found = identified.flying
     assert found.controller.D == (1, 1, 1, 1)
-    tape = simulate(loaded(tmp_path, "flight", found.airframe, found.scenario))
+    tape = simulate(loaded(identified.folder, "flight", found.airframe, found.scenario))
     _, error = best_error(tape)
     rms = {name: error_metrics(error[name]).rms for name in error.names}
     # the figures that a first flight of an autopilot is asked for: 10, 20, 15 mrad/s in q, p, r and 0.05 m/s
@@ -107,30 +112,34 @@ def test_written_scenario_flies_aircraft_and_tracks(identified: Identified, tmp_
     assert rms["V"] < 0.05
 
 
-def channels_of_first_order(stiff: str, damping: float, stiffness: float, zero: float) -> Channels:
-    """Channels y_dot = Omega u, all but one."""
-    one = np.array([1.0 if name == stiff else 0.0 for name in MAP.outputs])
-    Omega = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs])
-    return Channels(
-        Omega, 0.0 * one, 0.0 * one + 0.02, 0.0 * one + 0.1, damping * one, stiffness * one, zero * one, 0.0 * one
-    )  # fmt: skip
+@pytest.fixture(scope="module")
+def of_second_order(tmp_path_factory: pytest.TempPathFactory) -> tuple[Channels, Flyable]:
+    """Channels that are known, and their flight: q stiff, r and V damped, p with y_dot = Omega u."""
+    damping, stiffness, zero = (
+        np.array([values.get(name, 0.0) for name in MAP.outputs])
+        for values in ({"q": 39.0, "r": 22.0, "V": 2.0}, {"q": 1000.0, "r": 470.0}, {"q": 25.0, "r": 2.0})
+    )
+    Omega, none = np.diag([5.0 if name == "V" else 80.0 for name in MAP.outputs]), 0.0 * damping
+    found = Channels(Omega, none, none + 0.02, none + 0.1, damping, stiffness, zero, none)
+    return found, flying_scenario(MAP, found, SPEED, str(tmp_path_factory.mktemp("known") / "airframe.yaml"))
 
 
-def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(tmp_path: Path) -> None:
+def test_stiff_channel_gets_integral_by_which_loop_crosses_one_at_bandwidth(
+    of_second_order: tuple[Channels, Flyable],
+) -> None:
     # a light airplane: below 30 rad/s it answers the elevator with a pitch rate, not with its derivative
-    damping, stiffness, zero = 39.0, 1000.0, 25.0
-    found = channels_of_first_order(stiff="q", damping=damping, stiffness=stiffness, zero=zero)
-    controller, k = flying_scenario(MAP, found, SPEED, str(tmp_path / "airframe.yaml")).controller, list(MAP.outputs).index("q")
+    found, flying = of_second_order
+    controller, k = flying.controller, list(MAP.outputs).index("q")
     params, i = controller.law_params(), controller.outputs.index("q")
     gain = params.K[i] * params.input_scale[i] * found.Omega[k, k]
     integral = params.Lambda[i] + params.beta[i] / (params.K[i] * params.eps[i])  # the softened sign is one too
     s = 1j * gain
-    loop = gain * (s + integral) / s * (s + zero) / (s**2 + damping * s + stiffness)
+    loop = gain * (s + integral) / s * (s + found.zero[k]) / (s**2 + found.damping[k] * s + found.stiffness[k])
     assert abs(loop) == pytest.approx(1.0, rel=1e-6)
 
 
 def test_channel_of_which_nothing_is_certain_refused(identified: Identified) -> None:
-    response, models, _ = identified
+    response, models = identified.response, identified.models
     refused = response._replace(refusal=("", "V by thrust: found no movement, expected one", "", ""))
     unusable = [*models[:1], None, *models[2:]]
     with pytest.raises(ParameterError, match=r"^V by thrust: found no movement, expected one$"):

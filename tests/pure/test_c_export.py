@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,9 +106,15 @@ def any_numbers(sets: list[RiseDiConfig]) -> Recording:
     return recorder.recording("any numbers")
 
 
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Case]:
+    """The case of a scenario, made once."""
+    return cache(lambda name: export_case(name, tmp_path_factory.mktemp("code")))
+
+
 @pytest.fixture(scope="module", params=list(SCENARIOS))
-def case(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    return export_case(str(request.param), tmp_path_factory.mktemp("code"))
+def case(request: pytest.FixtureRequest, exported: Callable[[str], Case]) -> Case:
+    return exported(str(request.param))
 
 
 def test_every_bit_is_equal(case: Case) -> None:

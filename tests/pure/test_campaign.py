@@ -462,16 +462,16 @@ def wait_for_chunks(runs: Path, count: int, process: "subprocess.Popen[str]") ->
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
-    """The figures of an uninterrupted campaign of 20 chunks."""
-    return figures(command(*new(400), cwd=tmp_path_factory.mktemp("whole")))
+    """The figures of an uninterrupted campaign of 10 chunks."""
+    return figures(command(*new(200), cwd=tmp_path_factory.mktemp("whole")))
 
 
 def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
-    stopped = command(*new(400, "--runs", "part", "--workers", "1"), cwd=tmp_path)
+    stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
-    assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 20, "the campaign ended before the kill"
+    assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10, "the campaign ended before the kill"
     assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
 
 
@@ -513,10 +513,10 @@ def test_chunk_beyond_memory_is_one_sentence(error: Exception, monkeypatch: pyte
 
 
 def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:
-    spread = command(*new(400, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
+    spread = command(*new(200, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)
     workers = [process for process in psutil.Process(spread.pid).children(recursive=True) if process.cpu_times().user > 0.5]
     assert workers, "no worker of dask found"
     workers[0].kill()
     assert figures(spread) == whole
-    assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.parquet"))) == 20
+    assert len(list(tmp_path.glob(f"spread/*/{CHUNKS}/*.parquet"))) == 10

@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 from autopilot_bridge.params import ChannelMap
 from flight_cli.cli import COMMANDS, application
 from flight_cli.log_options import warn_of_lacks_in
+from flight_core import isolated
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.identification.log_import import require_map_of_import
@@ -49,6 +50,12 @@ class Flight(NamedTuple):
     stamp_us: list[int]
     y: FloatArray  # (N, 4)
     u: FloatArray
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Decode logs in this process; test_foreign_logs.py has the process of their own."""
+    monkeypatch.setattr(isolated, "call", lambda function, *arguments, **_: function(*arguments))
 
 
 @pytest.fixture(scope="module")
