@@ -86,7 +86,7 @@ CAMPAIGNS = {
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out the random faults that nobody asks for."""
+    """Leave out the random faults where no option asks for them."""
     left = [item for item in items if item.name in CAMPAIGNS and not config.getoption(CAMPAIGNS[item.name], 0)]
     config.hook.pytest_deselected(items=left)
     items[:] = [item for item in items if item not in left]
