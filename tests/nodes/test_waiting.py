@@ -30,18 +30,19 @@ sys.exit(pytest.main(["-q", "-rs", "-c", "pytest.ini", {folder!r}], plugins=[con
 """
 TESTS = """
 import pytest
-attempts = []
-def test_passes_at_attempt():
-    attempts.append(1)
-    assert len(attempts) == {passes_at}
+attempts = dict.fromkeys((1, 2, 3, 4), 0)
+@pytest.mark.parametrize("attempt", attempts)
+def test_passes_at(attempt):
+    attempts[attempt] += 1
+    assert attempts[attempt] == attempt
 @pytest.mark.longest_pause(5.0)
-def test_bears_more(): assert {bears}
+def test_bears_more(): assert False
 """
 
 
-def outcome(folder: Path, pause: float, passes_at: int, *, bears: bool = True) -> str:
-    """What pytest prints of two tests of which one fails before an attempt, and one fails where it does not bear the pause."""
-    (folder / "test_it.py").write_text(TESTS.format(passes_at=passes_at, bears=bears), encoding="utf-8")
+def printed(folder: Path, pause: float) -> str:
+    """What pytest prints of tests that pass at an attempt, and of one that bears a longer pause and fails."""
+    (folder / "test_it.py").write_text(TESTS, encoding="utf-8")
     (folder / "pytest.ini").write_text("[pytest]\nmarkers =\n  longest_pause(s): a test\n", encoding="utf-8")
     program = PLUGIN.format(pause=pause, folder=str(folder))
     options = {"cwd": folder, "env": {"PYTHONPATH": str(REPOSITORY)}}
@@ -49,25 +50,18 @@ def outcome(folder: Path, pause: float, passes_at: int, *, bears: bool = True) -
     return str(done.stdout) + str(done.stderr)
 
 
-@pytest.mark.parametrize(
-    ("pause", "passes_at", "bears", "summary", "attempts"),
-    [
-        (0.3, 1, True, "2 passed", 0),
-        (0.3, 2, True, "2 passed", 1),
-        (0.3, 3, True, "2 passed", 2),
-        (0.3, 4, True, "1 passed, 1 skipped", 3),
-        (0.05, 2, True, "1 failed, 1 passed", 0),
-        (0.3, 1, False, "1 failed, 1 passed", 0),
-    ],
-)
-def test_failure_beside_a_pause_is_run_again_at_most_twice(
-    pause: float, passes_at: int, bears: bool, summary: str, attempts: int, tmp_path: Path
-) -> None:
-    printed = outcome(tmp_path, pause, passes_at, bears=bears)
-    assert summary in printed
-    sentence = "test_it.py::test_passes_at_attempt: the host paused for 0.30 s, the test bears 0.1 s, in attempt"
-    assert printed.count(sentence) == attempts
-    assert ("inconclusive: the host paused for 0.30 s" in printed) is (attempts == 3)
+def test_failure_beside_a_pause_is_run_again_at_most_twice(tmp_path: Path) -> None:
+    shown = printed(tmp_path, pause=0.3)
+    assert "1 failed, 3 passed, 1 skipped" in shown
+    sentence = "test_it.py::test_passes_at[{}]: the host paused for 0.30 s, the test bears 0.1 s, in attempt"
+    assert [shown.count(sentence.format(attempt)) for attempt in (1, 2, 3, 4)] == [0, 1, 2, 3]
+    assert shown.count("inconclusive: the host paused for 0.30 s") == 1
+
+
+def test_failure_without_a_pause_is_a_failure(tmp_path: Path) -> None:
+    shown = printed(tmp_path, pause=0.05)
+    assert "4 failed, 1 passed" in shown
+    assert "inconclusive" not in shown
 
 
 def test_until_returns_what_it_waited_for() -> None:
