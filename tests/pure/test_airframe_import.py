@@ -284,6 +284,7 @@ def test_wrong_file_is_told_in_one_sentence(tmp_path: Path, name: str, text: str
     assert words in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_new_airframe_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     made = new_airframe(SYSTEM, thrust=True, **NAMES)
@@ -296,6 +297,7 @@ def test_new_airframe_flies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         new_airframe(SYSTEM, thrust=True, **NAMES)
 
 
+@pytest.mark.slow
 def test_command_writes_airframe_and_scenario(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scipy.io.savemat("navion.mat", {"A": A, "B": B})

@@ -53,7 +53,8 @@ def resolve(name: str) -> Any:
 
 def marked() -> set[int | str]:
     """The arguments of all marks `equation` of the tests."""
-    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in TESTS.rglob("test_*.py"))
+    texts = (path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
+    trees = (ast.parse(text) for text in texts if "mark.equation" in text)
     calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call)]
     marks = [call for call in calls if ast.unparse(call.func) == "pytest.mark.equation"]
     return {ast.literal_eval(argument) for mark in marks for argument in mark.args}
