@@ -82,7 +82,7 @@ def with_limits(path: Path) -> Path:
 
 
 def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are_replayed(start: Start, tmp_path: Path) -> None:
-    scenario = with_limits(scenario_file(tmp_path, 4.0, aircraft=ROUGH))
+    scenario = with_limits(scenario_file(tmp_path, 2.5, aircraft=ROUGH))
     with both_cores_busy():
         busy = tmp_path / "busy"  # without the command, in the process of its caller
         assert fly_over_topics(load_scenario(scenario), busy, lambda t, shown: None, lockstep=True) == "completed"
@@ -91,10 +91,10 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     for topic in TOPICS:
         assert all(first[topic] == payload[topic] for payload in others), topic
     assert "airframe.yaml" in [path.name for path in runs[1].iterdir()]  # the sampled matrices
-    assert len(first["/y"]) == 2000 + 1  # one at each instant, also without a sample
-    assert len(first["/u"]) == 400 + 1
+    assert len(first["/y"]) == 1250 + 1  # one at each instant, also without a sample
+    assert len(first["/u"]) == 250 + 1
     tape, recorded = simulate(load_scenario(scenario)), read_run(runs[1]).tape
-    assert len(tape["y"].stamp_ns) < 2000  # samples were lost
+    assert len(tape["y"].stamp_ns) < 1250  # samples were lost
     for name, signal_ in tape.signals.items():
         assert signal_.names == recorded[name].names
         assert signal_.stamp_ns.tobytes() == recorded[name].stamp_ns.tobytes(), name
@@ -104,7 +104,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     for run in runs[1:]:
         result = replay(run)
         assert result.equal()
-        assert result.whole.sum() == len(result.whole) > 300
+        assert result.whole.sum() == len(result.whole) > 200
         assert not result.notes
 
 
