@@ -667,6 +667,13 @@ def test_problem_of_the_link_refuses_an_engagement_is_said_while_engaged_and_sta
     assert bridge.reason.endswith("s old (mavlink/VFR_HUD); ATTITUDE comes at 4 Hz")
 
 
+def test_engagement_needs_sources_of_trims() -> None:
+    bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1450.0})
+    receive_outputs(bridge, 0.6, tuple(bridge.outputs))
+    receive_u(bridge, 0.6)
+    assert bridge.engage(at(0.6)).startswith("trim of elevator, trim of thrust, trim of aileron, trim of rudder are 0.60 s")
+
+
 def test_engagement_whose_limits_leave_range_around_trim_refused() -> None:
     bridge = ardupilot_bridge(sticks=STICKS | {"thrust": 1900.0})  # 90 % of throttle, upper limit 30 % above
     assert bridge.engage(at(0.0)) == "thrust: its trim is 0.9 now, and the limits [-0.2, 0.3] around it leave its range"

@@ -3,6 +3,7 @@
 """`rise-di export`: C code beside the Python controller, bit by bit; mutants of the C code, sanitizers, refusals."""
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
@@ -40,14 +41,12 @@ from flight_analysis.closed_loop.replay import vary
 from flight_analysis.closed_loop.scenario import Scenario, scenario_yaml
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_analysis.report.run_folder import attachments_for
 from flight_cli.export import export
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import ChannelError, StampedVector
 from flight_log.tape_reader import RecordedRun, StoredFile, read_run
-from flight_log.tape_writer import write_run
 from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
@@ -154,6 +153,115 @@ def test_contraction_does_not_start(case: Case, tmp_path: Path) -> None:
         program.compare(case.recordings[0])
 
 
+MUTANTS: dict[str, tuple[str, str]] = {
+    "lesser": ("return (a < b) ? a : b;", "return (a > b) ? a : b;"),
+    "greater": ("return (a > b) ? a : b;", "return a;"),
+    "clipped": ("(value <= low) ? low : value", "value"),
+    "is_equal": ("(a <= b) && (a >= b)", "(a <= b)"),
+    "magnitude": ("(a < ZERO) ? -a : a", "a"),
+    "rounded": ("(a + ROUNDING) - ROUNDING", "(a + (ONE / TWO) + ROUNDING) - ROUNDING"),
+    "seconds": ("(rise_di_real)time_ns / NANOSECONDS", "(rise_di_real)time_ns * (ONE / NANOSECONDS)"),
+    "elapsed_ns": ("(later_ns > earlier_ns) ?", "(later_ns < earlier_ns) ?"),
+    "copy": ("to[i] = from[i];", "to[i] = from[0];"),
+    "fill": ("values[i] = value;", "values[i] = value + ONE;"),
+    "is_finite": ("bool finite = true;", "bool finite = false;"),
+    "product": ("int32_t j = 1; j < columns; j++", "int32_t j = columns - 1; j > 0; j--"),
+    "product_transposed": ("(j * columns) + i", "(j * columns) + (columns - 1 - i)"),
+    "least": ("before - reach);", "before + reach);"),
+    "largest": ("before + reach);", "upper);"),
+    "saturate": ("largest(limits->upper[i], before, reach)", "limits->upper[i]"),
+    "control": ("(after->e[i] - after->e_0[i]) + integral", "(after->e[i] + integral) - after->e_0[i]"),
+    "engage_law": ("law->Pi[i] = ZERO;", "law->Pi[i] = law->e[i];"),
+    "step_law": ("(dt * (e + before->e[i])) / TWO", "dt * e"),
+    "limit_law": ("magnitude(beyond) - (outward ? magnitude(change) : ZERO)", "magnitude(beyond)"),
+    "retune_law": ("control(old, old_scale, law, law, i)", "control(next, next_scale, law, law, i)"),
+    "target_scale": ("(ratio * ratio)", "ratio"),
+    "scheduled": ("p->input_scale[i] * law->scale[i]", "p->input_scale[i]"),
+    "follow_schedule": ("lesser(dt / p->time, ONE)", "(dt / p->time)"),
+    "predict": ("u[i] - u_trim[i]", "u[i]"),
+    "start_estimates": ("law->sigma = ZERO;", "law->sigma = ONE;"),
+    "correct": ("lesser(law->sigma + (dt * p->fade_rate), ONE)", "ONE"),
+    "same_values": ("same && is_equal(a[i], b[i])", "same"),
+    "same_model": ("same_values(a->F, b->F", "same_values(a->F, a->F"),
+    "sine": ("(k * RISE_DI_PI_HIGH)) - (k * RISE_DI_PI_LOW)", "(k * (RISE_DI_PI_HIGH + RISE_DI_PI_LOW)))"),
+    "sines": ("sine(x[i]) : ZERO", "x[i] : ZERO"),
+    "drift": ("linear[i] + pulled[i]", "linear[i] - pulled[i]"),
+    "slope": ("x_dot[i] + forced[i]", "x_dot[i]"),
+    "stage": ("x[i] + (dt * k[i])", "x[i]"),
+    "engage_feedforward": ("state->ticks = ZERO;", "state->ticks = ONE;"),
+    "step_feedforward": ("(k1[i] + (TWO * k2[i])) + (TWO * k3[i])", "k1[i] + (TWO * (k2[i] + k3[i]))"),
+    "engage_all": ("engage_law(law, y, y_m);", "engage_law(law, y_m, y);"),
+    "tick_law": ("u_trim[i] + begin.u_o[i]", "u_trim[i] - begin.u_o[i]"),
+    "is_inside": ("inside && (u[j] >= low[j])", "(u[j] >= low[j])"),
+    "pass_on": ("inside = false;\n                for", "for"),
+    "moved": ("(part * move[j])", "move[j]"),
+    "towards": ("(step > ZERO) ?", "(step < ZERO) ?"),
+    "add_by_priority": ("(int32_t)p->order[k]", "k"),
+    "allocate": ("product(p->exchange, RISE_DI_P, RISE_DI_P, change, rest);", "copy(change, rest, RISE_DI_P);"),
+    "reached": ("(u_free[i] < u[i]) ? u[i] : -REAL_MAX", "-REAL_MAX"),
+    "sample_at": ("samples->newest - back", "samples->newest"),
+    "rise_di_append": ("samples->newest + 1)", "samples->newest + 2)"),
+    "align": (">= (uint64_t)p->slope_ns", ">= 1U"),
+    "failsafe_scale": ("silence_ns <= hold_ns", "silence_ns < ((hold_ns * 9) / 10)"),
+    "log_inputs": ("output->dt = dt;", "output->dt = offset;"),
+    "failsafe": ("c->hold_ns = active ? p->hold_ns : 0;", "c->hold_ns = p->hold_ns;"),
+    "engage": ("copy(c->u, c->u_trim, RISE_DI_M);", "fill(c->u_trim, RISE_DI_M, ZERO);"),
+    "step": ("clipped(measured, p->dt_least, p->dt_largest)", "lesser(measured, p->dt_largest)"),
+    "is_fresh": ("elapsed_ns(stamp_ns, now_ns) <= (uint64_t)max_age_ns", "elapsed_ns(stamp_ns, now_ns) == 0U"),
+    "are_numbers": ("return is_finite(sum, RISE_DI_M);", "return true;"),
+    "any": ("bool result = false;", "bool result = true;"),
+    "rise_di_guard_tick": ("y->stamp_ns <= c->y_stamp_ns", "y->stamp_ns < c->y_stamp_ns"),
+    "rise_di_start": ("fill(controller->u, RISE_DI_M, ZERO);", ""),
+    "from_bits": ("(rise_di_real)number.value", "ZERO"),
+    "is_rounded_once": ("is_equal(rounded(ONE - (rise_di_real)part), ONE)", "is_equal(rounded((rise_di_real)part), ONE)"),
+    "is_nan_told": ("(!is_finite(special, 3))", "is_finite(special, 3)"),
+    "checked": ("(uint64_t)c->parameters->max_age_ns", "0U"),
+    "is_near": ("greater(RISE_DI_TIMES * c->change[i], p->y_reach[i])", "p->y_reach[i]"),
+    "compared": ("c->agreeing + 1", "c->agreeing + 2"),
+    "rise_di_take_y": ("&controller->y_samples", "&controller->y_m_samples"),
+    "rise_di_take_y_m": ("&controller->y_m_samples", "&controller->y_samples"),
+    "rise_di_tick": ("<= period_ns", "== 0U"),
+    "rise_di_command": ("controller->effectors", "controller->effectors_failsafe"),
+    "rise_di_retune": ("c->parameters = parameters;", "(void)parameters;"),
+    "rise_di_restart": ("controller->mode = RISE_DI_WAITING;", ""),
+}
+"""Of each function of rise_di.c: a text of its body and what a mutant has instead."""
+
+FUNCTION = re.compile(r"^(?:static )?(?:const )?\w+ \*?(\w+)\([^;{]*\) \{(?:[^\n]*\}\n|\n.*?^\}\n)", re.MULTILINE | re.DOTALL)
+
+
+def bodies(source: str) -> dict[str, tuple[int, int]]:
+    """Begin and end of each function."""
+    return {match[1]: match.span() for match in FUNCTION.finditer(source)}
+
+
+def test_proof_finds_a_mutant_of_each_function(
+    exported: Callable[[str], Case], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    cases = [exported(name) for name in ("observer", "schedule and allocation")]
+    source = (SOURCE / "rise_di.c").read_text(encoding="utf-8")
+    places = bodies(source)
+    assert set(places) == set(MUTANTS)
+    survivors = []
+    for name, (old, new) in MUTANTS.items():
+        begin, end = places[name]
+        body = source[begin:end]
+        assert old in body, name
+        mutant = source[:begin] + body.replace(old, new, 1) + source[end:]
+        if not any(is_found(case, mutant, tmp_path_factory.mktemp("mutant")) for case in cases):
+            survivors.append(name)
+    assert not survivors
+
+
+def is_found(case: Case, mutant: str, folder: Path) -> bool:
+    """Whether the proof tells a mutant from the code."""
+    flags = ["-std=c99", "-O0", "-w", "-ffp-contract=off"]
+    program = Program(case.code, ["gcc"], case.sets, folder, flags=flags, source=mutant)
+    with suppress(ParameterError):  # rise_di_start refuses what is not computed as written
+        return any(program.compare(recording).differing for recording in case.recordings)
+    return True
+
+
 POSITIVE = st.floats(1e-3, 1e3)
 FOUR = st.tuples(POSITIVE, POSITIVE, POSITIVE, POSITIVE)
 
@@ -207,11 +315,12 @@ def test_float32_is_within_its_bound(tmp_path: Path) -> None:
         assert all(0.0 < comparison.deviation < FLOAT32_BOUND for comparison in proof.comparisons)
 
 
-def test_log_is_replayed_by_c(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["osprey_servo", "osprey_gust"])
+def test_log_is_replayed_by_c(name: str, tmp_path: Path) -> None:
     """C gives every u of a log of an earlier version without feedforward, to the bit."""
-    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_servo.tar.xz", tmp_path, filter="data")
-    sets, recording, as_logged = run_recording(read_run(tmp_path / "osprey_servo"))
-    write_code(sets[0], "osprey_servo", tmp_path / "code", float32=False)
+    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / f"{name}.tar.xz", tmp_path, filter="data")
+    sets, recording, as_logged = run_recording(read_run(tmp_path / name))
+    write_code(sets[0], name, tmp_path / "code", float32=False)
     program = Program(tmp_path / "code", ["gcc"], sets, tmp_path / "program")
     assert program.compare(recording).differing == 0
     assert as_logged == recording.ticks > 30
@@ -227,13 +336,12 @@ def test_command_writes_code_and_report(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_command_proves_with_a_recorded_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (run := tmp_path / "run").mkdir()
-    scenario = find_scenario("osprey_gust", 0.5)
-    write_run(simulate(scenario), run, attachments_for(scenario, run))
+    shutil.unpack_archive(REPOSITORY / "tests" / "recorded" / "osprey_gust.tar.xz", tmp_path, filter="data")
+    run = tmp_path / "osprey_gust"
     with pytest.raises(typer.Exit) as status:
         export("osprey_gust", tmp_path / "c", run=run, compiler=["gcc"])
     assert status.value.exit_code == 0
-    assert "51 of 51 ticks have the u of the log to the bit" in capsys.readouterr().out  # the ticks of the log
+    assert "52 of 52 ticks have the u of the log to the bit" in capsys.readouterr().out  # the ticks of the log
     with pytest.raises(ParameterError, match="--run: found a flight with other parameters, expected those of osprey_servo"):
         export("osprey_servo", tmp_path / "c", run=run, compiler=["gcc"])
 
@@ -271,6 +379,12 @@ def test_refusals_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ParameterError, match="compiler: found none of gcc, clang on the PATH, expected one for the proof; --no-proof"
     ):
         export("osprey_servo", tmp_path)
+    with pytest.raises(ParameterError, match="--compiler: found no program 'tcc', expected the command of a C compiler"):
+        export("osprey_servo", tmp_path, compiler=["tcc"])
+    with pytest.raises(
+        ParameterError, match=r"--compiler: found .gcc '. \(No closing quotation\), expected the command of a C"
+    ):
+        export("osprey_servo", tmp_path, compiler=["gcc '"])
     (tmp_path / "file").touch()
     with pytest.raises(ParameterError, match=r"--c: .*file"):
         export("osprey_servo", tmp_path / "file", without_proof=True)

@@ -19,13 +19,14 @@ from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import guidance_notices, unflown_legs
 from flight_campaign import batch, missions
 from flight_campaign.benchmark_course import build_course
+from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
-from flight_guidance.fence import HOME, LEFT, RIGHT, SHARES, Motion, last_safe_turn, turn_clearance
+from flight_guidance.fence import BACK, HOME, LEFT, RIGHT, SHARES, Escape, Motion, last_safe_turn, turn_clearance
 from flight_guidance.guidance import Guidance, GuidanceOutput
-from flight_guidance.modes import Lateral
+from flight_guidance.modes import Lateral, holding, motion_of
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.ways import ways
 from flight_guidance.zones import Fence, Zone, clearance
@@ -97,6 +98,26 @@ def test_predicted_turn_drifts_with_wind_across(side: float, wind: float) -> Non
     assert float(right if side > 0.0 else left) == pytest.approx(nearest, abs=0.5)
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("phi", [0.0, -0.3])
+def test_predicted_turn_ends_after_lag_and_roll(side: float, phi: float) -> None:
+    """The course points home all the time, 15 deg to the side: the turn is flown until the bank is there, no longer.
+
+    That is the lag and the time of the roll, in which a level aircraft turns by 7 deg, within a step of the prediction.
+    """
+    speed, bank, lag, roll_rate = 25.0, math.radians(30.0), 3.0, 0.35
+    edge = Zone((-1000.0, 1000.0, 1000.0, -1000.0), (-2000.0, -2000.0, 2000.0, 2000.0))
+    bearing = math.radians(15.0) if phi == 0.0 else math.radians(4.0)  # the bank to the other side turns by 10 deg before
+    home = (900.0, side * 900.0 * math.tan(bearing))
+    motion = Motion(np.float64(0.0), np.float64(0.0), np.float64(side * phi), 0.0, speed, (0.0, 0.0), bank, roll_rate, lag)
+    right, left = turn_clearance(Fence((edge,), home), motion)
+    rolled = lag + (bank - phi) / roll_rate
+    longest = lag + 2.0 * bank / roll_rate + 1.95 * math.pi / (min(SHARES) * GRAVITY * math.tan(bank) / speed)
+    ahead = 1000.0 - float(right if side > 0.0 else left)
+    slowed = 0.97  # the cosine of the course on the way, at least
+    assert slowed * speed * rolled < ahead < speed * (rolled + longest / 63.0)
+
+
 def test_turn_begins_at_last_moment() -> None:
     fence, bank = Fence((FIELD,), (200.0, 0.0)), math.radians(30.0)
 
@@ -116,6 +137,17 @@ def test_turn_begins_at_last_moment() -> None:
     assert left > right
     right, left = turn_clearance(fence, motion(1000.0, -350.0))
     assert right > left
+
+
+def test_turn_is_predicted_from_the_end_of_a_roll() -> None:
+    """A roll of the reference model, second order, gains p 2 zeta / w once p = 0 is commanded."""
+    scenario = find_scenario("osprey_route")
+    assert scenario.guidance is not None
+    params = scenario.guidance.params()
+    pose, y = dict.fromkeys(POSE, 0.0), {"q": 0.0, "V": 0.0, "p": 0.3, "r": 0.0}
+    level = holding(0, pose, 25.0, params)
+    assert motion_of(level, pose, y, 25.0, params).phi == pytest.approx(0.3 * 2.0 * 0.9 / 5.0, rel=0.15)
+    assert motion_of(level, pose, y | {"p": 9.0}, 25.0, params).phi <= params.limits.bank
 
 
 def calm(duration: float, wind: tuple[float, float] = (0.0, 0.0), **section: Any) -> Scenario:
@@ -159,6 +191,32 @@ def test_aircraft_outside_flies_home_in_wind(name: str) -> None:
     assert (np.hypot(north - fence.home[0], east - fence.home[1]) < benchmark.HOME_RADII * LEAST_RADIUS).all()
 
 
+def test_outside_is_a_state_of_its_own() -> None:
+    """Outside the aircraft flies the course of the shortest way inside, until it is half a second of flight inside."""
+    fence, bank = Fence((FIELD,), (0.0, 0.0)), math.radians(30.0)
+
+    def escape(north: float, before: float, heading: float = 0.0) -> Escape:
+        motion = Motion(np.float64(north), np.float64(0.0), np.float64(0.0), heading, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
+        return last_safe_turn(fence, before, motion)
+
+    assert (float(escape(1400.0, 0.0).action), bool(escape(1400.0, 0.0).begins)) == (BACK, True)
+    assert abs(math.remainder(float(escape(1400.0, BACK).course) - math.pi, 2.0 * math.pi)) < 0.2  # south
+    assert float(escape(1400.0, HOME).action) == BACK
+    assert float(escape(1290.0, BACK, math.pi).action) == BACK  # 10 m inside: less than 12.5 m
+    assert float(escape(1280.0, BACK, math.pi).action) == HOME
+    assert float(escape(1290.0, HOME, math.pi).action) == HOME  # on the way home the clearance of now is enough
+
+
+def test_no_turn_begins_that_is_worse_than_the_way_home() -> None:
+    """In a funnel of 80 to 18 m, home at its narrow end: the way keeps 9 m, less than 12.5 m, and a turn leaves by 200 m."""
+    funnel = Zone((-1000.0, 1600.0, 1600.0, -1000.0), (-40.0, -9.0, 9.0, 40.0))
+    phi, bank = np.float64(0.0), math.radians(30.0)
+    motion = Motion(np.float64(0.0), np.float64(0.0), phi, 0.0, 25.0, (0.0, 0.0), bank, 0.35, 0.4)
+    escape = last_safe_turn(Fence((funnel,), (1500.0, 0.0)), HOME, motion)
+    assert 5.0 < float(escape.predicted) < 12.5
+    assert float(escape.action) == HOME
+
+
 def test_way_home_leads_round_a_zone() -> None:
     """A slot of a U between the aircraft and home: the way leads to the closed end, and has a turn's room there."""
     arms = Zone(
@@ -176,6 +234,20 @@ def test_way_home_leads_round_a_zone() -> None:
     assert least > 75.0  # half of a radius
 
 
+def test_aircraft_without_a_way_home_holds_over_the_roomiest_place() -> None:
+    """Two zones with a gap between: from the one without home no way leads out."""
+    fence = Fence(
+        (SQUARE, SQUARE._replace(north=(150.0, 750.0, 750.0, 150.0), east=(-300.0, -300.0, 300.0, 300.0))), (0.0, 0.0), 30.0
+    )
+    chart, place = ways(fence), np.array([200.0, -200.0])
+    for _ in range(60):
+        north, east, straight = chart.aim(fence, *place)
+        assert not straight
+        off = np.array([north - place[0], east - place[1]])
+        place = place + 20.0 * off / max(math.hypot(*off), 20.0)
+    assert math.dist(place, (450.0, 0.0)) < 2.0 * chart.cell  # the centre of its zone
+
+
 def test_zones_that_touch_are_one_region() -> None:
     """A shared edge is no border, where one zone is larger too; a gap is one."""
     north_of = SQUARE._replace(north=(100.0, 300.0, 300.0, 100.0), east=(-50.0, -50.0, 100.0, 100.0))
@@ -185,6 +257,15 @@ def test_zones_that_touch_are_one_region() -> None:
     disc = Zone((100.0,), (0.0,), 80.0)
     # The circle of 180 chords: 0.15 thousandths of the radius. At the centre of the edge the corners of the square are nearer.
     assert at((SQUARE, disc), (100.0, 0.0), (170.0, 0.0), (185.0, 0.0)) == pytest.approx([80.0, 10.0, -5.0], abs=0.02)
+
+
+def test_aircraft_stays_inside_every_zone_of_one_group() -> None:
+    """MAVLink: inside all zones of a group, and of at least one group."""
+    half = Zone((-100.0, 0.0, 0.0, -100.0), (-100.0, -100.0, 100.0, 100.0), group=0)
+    both = (SQUARE._replace(group=0), half)
+    assert at(both, (50.0, 0.0), (-50.0, 0.0), (-10.0, 0.0)) == pytest.approx([-50.0, 50.0, 10.0])
+    third = Zone((200.0,), (0.0,), 60.0, group=1)
+    assert at((*both, third), (-50.0, 0.0), (200.0, 0.0), (50.0, 0.0)) == pytest.approx([50.0, 60.0, -50.0], abs=0.02)
 
 
 def commanded(course: float) -> dict[str, Any]:
@@ -271,6 +352,11 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
         (
             {"home": {"north": 1200.0}},
             r"guidance.home: found home 100 m inside of the fence, expected at least 15. m",
+        ),
+        ({"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0]}}}, r"fence.a.north: found 2 points without a radius"),
+        (
+            {"fence": {"a": {"north": [0.0, 1.0], "east": [0.0, 1.0], "radius": 9.0}}},
+            r"found 2 points with a radius",
         ),
         ({"fence": {"a": {"north": [0.0, 0.0, 9.0], "east": [1.0, 1.0, 9.0]}}}, r"found the corner .* twice in succession"),
     ],

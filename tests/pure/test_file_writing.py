@@ -79,6 +79,20 @@ def test_failed_write_keeps_old_content(tmp_path: Path) -> None:
     assert files_in(tmp_path) == {"page": b"old"}
 
 
+@pytest.mark.parametrize("target", ["file", "nothing"])
+def test_link_is_replaced_not_followed(tmp_path: Path, target: str) -> None:
+    elsewhere, path = tmp_path / "elsewhere", tmp_path / "page"
+    if target == "file":
+        elsewhere.write_text("precious", encoding="utf-8")
+    path.symlink_to(elsewhere)
+    write_file(path, "page")
+    assert not path.is_symlink()
+    assert path.read_text(encoding="utf-8") == "page"
+    assert elsewhere.exists() == (target == "file")
+    if target == "file":
+        assert elsewhere.read_text(encoding="utf-8") == "precious"
+
+
 @pytest.mark.parametrize("kind", ["folder", "pipe", "link to a device"])
 def test_folders_and_devices_are_refused(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "page"
@@ -130,6 +144,19 @@ def test_dying_report_loses_no_file(run: Path, monkeypatch: pytest.MonkeyPatch, 
         survived += 1
     assert survived == 2  # summary and page; the scenario is written once, by the flight
     assert (run / REPORT).stat().st_size > 100_000
+
+
+def test_report_of_links_writes_nothing_elsewhere(run: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    precious = outside / "precious"
+    precious.write_text("precious", encoding="utf-8")
+    (run / "osprey_gust.yaml").unlink(missing_ok=True)
+    (run / "osprey_gust.yaml").symlink_to(outside / "dangling")
+    (run / SUMMARY).symlink_to(precious)
+    (run / REPORT).symlink_to(precious)
+    write_report(run)
+    assert files_in(outside) == {"precious": b"precious"}
 
 
 def test_report_of_read_only_archive_goes_to_output(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

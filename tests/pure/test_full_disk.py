@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A full disk: the log is finished from the reserve, or stays readable up to its last complete chunk."""
 
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,8 +16,8 @@ from tests.small_disk import fill, small_disk
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
-from flight_log.bag import BagChannel, BagWriter, LogAttachments
-from flight_log.disk import ReservedFile
+from flight_log.bag import END_BYTES, BagChannel, BagWriter, LogAttachments
+from flight_log.disk import ReservedFile, free_bytes
 from flight_log.tape_reader import read_run
 from flight_log.tape_writer import write_run
 
@@ -91,6 +92,12 @@ def test_log_closes_where_last_chunk_would_need_larger_reserve(
     assert len(read_run(tmp_path / "run").tape["y"].stamp_ns) == chunks
 
 
+def test_end_of_file_has_reserve_until_it_closed(disk: Path) -> None:
+    with BagWriter(disk / "run"):
+        assert SIZE - free_bytes(disk) >= END_BYTES
+    assert SIZE - free_bytes(disk) < 50_000  # freed; a file without messages and metadata.yaml remain
+
+
 def test_log_finished_when_another_process_fills_disk(disk: Path) -> None:
     bag = BagWriter(disk / "run")
     channel = bag.add_topic("/y", JOINT_STATE, "")
@@ -116,6 +123,34 @@ def test_log_without_reserve_stays_readable_to_last_complete_chunk(disk: Path) -
     assert len(back["y"].stamp_ns) >= written - 10
     assert back["y"].stamp_ns.tolist() == [1_000_000 * (k + 1) for k in range(len(back["y"].stamp_ns))]
     assert "run_0.mcap is truncated: read up to its last complete chunk" in back.notes[0]
+
+
+def test_input_output_error_is_not_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = ReservedFile(tmp_path / "file")
+
+    def fails(descriptor: int, data: bytes) -> int:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "write", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        file.write(b"x")
+    assert not file.full
+    file.close()
+
+
+def test_what_kept_for_end_survives_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = ReservedFile(tmp_path / "file")
+    file.keep(b"reserve")
+
+    def fails(descriptor: int, data: bytes, position: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", fails)
+    file.keep(b", memory")
+    assert file.full
+    file.keep(b", too")
+    assert file.kept() == b"reserve, memory, too"
+    file.close()
 
 
 def test_short_writes_are_completed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from tests.maps import named_map
 
 from autopilot_bridge.channel_map import set_field
-from autopilot_bridge.mavlink_link import Link, message_type
-from autopilot_bridge.params import LinkConfig
+from autopilot_bridge.mavlink_link import COMPANION, Link, message_type
+from autopilot_bridge.params import ChannelMap, LinkConfig
+from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError
 
 pytestmark = pytest.mark.package("autopilot_bridge")
 
@@ -212,6 +214,36 @@ def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> 
     assert second.received() == []  # neither overrides nor heartbeats nor requests
 
 
+def test_next_sender_gets_the_messages_once_the_first_one_is_silent(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
+    made, port = ends.link(HEARTBEAT=5.0)
+    made.start()
+    first, second = ends.peer(port), ends.peer(port)
+    until(first.received, first.beat)
+    until(second.received, second.beat)
+    first.received()
+    sent: list[Any] = []
+
+    def send() -> None:
+        second.beat()
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        sent.extend(second.received())
+
+    until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in sent], send)
+    assert first.received() == []
+
+
+def test_conflict_of_second_sender_ends_after_its_last_message(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, port = ends.link()
+    made.start()
+    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot.beat()
+    until(lambda: made.conflict, second.beat)
+    now = time.monotonic
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: now() + 3.1)
+    assert made.conflict == ""
+
+
 def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
     """Two autopilots with one number behind a router have one address, and times since boot of their own."""
     made, port = ends.link()
@@ -260,6 +292,15 @@ def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
     until(lambda: "RC_CHANNELS_OVERRIDE" in received, send)
 
 
+def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    other = ends.peer(port, system=255)
+    until(lambda: made.conflict, other.beat)
+    assert "another sender" in made.conflict
+    assert "system 255 too" in made.conflict
+
+
 @pytest.mark.parametrize("name", ["RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"])
 def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(ends: Ends, name: str) -> None:
     made, _ = ends.link()
@@ -274,6 +315,15 @@ def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(
     made._take(received(sticks[name], system=255, component=190), SENDER, 0)
     assert "has system 255 too" in made.conflict
     assert "switch the joystick of a ground station off" in made.conflict
+
+
+def test_other_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    second = ends.peer(port, system=1)
+    second.connection.mav.srcComponent = COMPANION
+    until(lambda: made.conflict, second.beat)
+    assert made.conflict == f"another bridge is on udpin:127.0.0.1:{port}: end it"
 
 
 def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
@@ -343,6 +393,21 @@ def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_m
     assert made.refusal() == ""
 
 
+def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Clock) -> None:
+    """A request of 50 Hz is denied, and the 40 Hz of an earlier one stay: 80 % of it."""
+    made, _ = ends.link(ATTITUDE=50.0)
+    attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    made._take(attitude, SENDER, 0)
+    made._requested = "ATTITUDE", clock.now
+    made._take(received(mavlink.MAVLink_command_ack_message(511, DENIED)), SENDER, 0)
+    assert made.problem().startswith("the autopilot denied 50 Hz of ATTITUDE")
+    for _ in range(120):
+        clock.now += 0.025
+        made._take(attitude, SENDER, 0)
+        made._rates.step(clock.now)
+    assert made.problem() == ""
+
+
 def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock: Clock) -> None:
     """Overrides hide its silence from the autopilot. One that was never heard is not missed."""
     made, _ = ends.link()
@@ -362,6 +427,15 @@ def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock:
     assert made.lost() == "ground station 255 is silent for 5 s"
     made._take(received(station, system=255, component=190), SENDER, 0)
     assert made.lost() == ""
+
+
+def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    station = ends.peer(port, system=254)
+    until(lambda: made.stations, lambda: station.connection.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4))
+    assert made.stations == {254}
+    assert made.conflict == ""
 
 
 def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(ends: Ends, tmp_path: Path) -> None:
@@ -389,6 +463,19 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(e
     assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
 
 
+def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
+    ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier one has set this variable."""
+    monkeypatch.delenv("MAVLINK20", raising=False)
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    until(lambda: made._refused, ends.peer(port).beat)
+    assert not queue
+
+
 def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
     made, port = ends.link()
     now = time.monotonic
@@ -405,3 +492,24 @@ def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requeste
     if name == "ardupilot_mavlink":
         assert row.values["command"] == mavlink.MAV_CMD_DO_SET_MODE
         assert row.values["param1"] == mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+def test_wrong_map_or_message_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"):
+        message_type("ALTITUD")
+    with pytest.raises(ChannelError, match="chan1_raw cannot be 70000"):
+        set_field(message_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
+    content = named_map("ardupilot_mavlink").model_dump()
+    for changes, sentence in (
+        ({"link": None}, "link: found none, expected one, for outputs.q of type mavlink/msg/ATTITUDE"),
+        ({"link": {**content["link"], "url": "serial"}}, "link.url: found 'serial'"),
+        ({"link": {**content["link"], "rates": {"ATTITUD": 40.0}}}, r"link\.rates\.ATTITUD: found a message"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            ChannelMap.validate_mapping(content | changes, "map")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves its socket open
+def test_address_that_cannot_be_opened_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match=r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"):
+        Link(LinkConfig(url="udpin:192.0.2.1:14550"))  # an address of documentation, RFC 5737

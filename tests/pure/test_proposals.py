@@ -23,6 +23,7 @@ from rise_di_controller.proposals import (
     Event,
     Learning,
     Proposal,
+    Updates,
     acting_inputs,
     authority,
     authority_names,
@@ -34,7 +35,7 @@ from rise_di_controller.proposals import (
     outputs_without,
     with_channels_of,
 )
-from rise_di_controller.rise_di_config import RiseDiConfig
+from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
 pytestmark = pytest.mark.package("rise_di_controller")
 
@@ -93,6 +94,20 @@ def test_proposal_flies_after_certificate_in_parts() -> None:
     assert flight.events[0].change == changes(START, expected)
 
 
+def test_part_that_is_learned_later_gets_its_feedforward() -> None:
+    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    lateral = RiseDiConfig.validate_mapping(whole.changed({"feedforward.inputs": ["aileron", "rudder"]}), "lateral")
+    flight, acting = Flight(), []
+    for model in (lateral, whole):
+        flight.receive(designed(START, model))
+        flight.step()
+        flight.now_ns += 10 * NANOSECONDS
+        flown = flight.controller.parameters.feedforward
+        assert flown is not None
+        acting.append(flown.inputs)
+    assert acting == [("aileron", "rudder"), None]
+
+
 def test_authority_is_what_the_model_leaves_at_its_lower_bound() -> None:
     def of(flown: RiseDiConfig) -> dict[str, float]:
         return dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
@@ -121,14 +136,21 @@ def scaled(name: str, factor: float) -> dict[str, Any]:
     [
         (scaled("feedforward.B", -1.0), r"^refused: controller\.feedforward\.B: found a C B with D = \[-1, -1, -1, -1\]"),
         (scaled("observer.F", -1.0), r"^refused: controller\.observer\.F: found a spectral radius"),
+        (scaled("observer.L", -1.0), r"^refused: controller\.observer\.L: found a spectral"),
         (scaled("observer.F", 8.0), r"late, expected a delay margin of at"),
         (
             scaled("observer.Phi", math.nan),
             r"^refused: controller\.observer\.Phi.*found nan",
         ),
+        (
+            scaled("observer.Phi", 1e7),
+            r"^refused: controller\.observer\.L: found a spectral",
+        ),
         (CHANGE | {"observer.margin": 0.0}, r"^refused: controller\.observer\.margin: found 0 s, expected at least 0\.03 s"),
         (CHANGE | {"D": [-1, 1, 1, 1]}, r"^refused: proposal: found a change of D, expected changes of"),
+        (CHANGE | {"observer.states": ["x.q"]}, r"^refused: controller\.observer\.states: found x\.q"),
         (CHANGE | {"feedforward": 1.0}, r"^refused: feedforward.*: found both a value and a group"),
+        ({"observer": None}, r"^refused: proposal: found no observer, expected one"),
     ],
 )
 def test_lie_is_refused_with_a_sentence(change: dict[str, Any], sentence: str) -> None:
@@ -139,6 +161,12 @@ def test_lie_is_refused_with_a_sentence(change: dict[str, Any], sentence: str) -
     (event,) = flight.events
     assert not event.change
     assert re.search(sentence, event.sentence), event.sentence
+
+
+def test_model_that_is_not_proposed_is_said() -> None:
+    flight = Flight()
+    flight.receive({}, sentence="innovations of q: not white")
+    assert flight.sentences == ["no model: innovations of q: not white"]
 
 
 def test_proposal_for_other_parameters_or_beside_changed_ones_is_refused() -> None:
@@ -224,6 +252,37 @@ def test_simulated_time_waits_for_each_proposal_that_is_due_and_takes_it_after_l
     assert not flight.learning.waits(acts_ns)
     assert flight.learning.step(flight.controller, acts_ns) is not None
     assert flight.sentences[1:] == ["flies model"]
+
+
+def test_simulated_time_waits_for_no_proposal_of_a_deactivated_law() -> None:
+    flight = Flight(simulated=True)
+    flight.learning.ticked(flight.controller, 0)
+    flight.controller.tick(flight.now_ns, active=False)
+    assert not flight.learning.ticked(flight.controller, flight.now_ns)  # an identification is due
+    assert not flight.learning.waits(flight.now_ns + nanoseconds(60.0))
+
+
+def test_identifications_begin_at_their_times_and_then_tests_at_theirs() -> None:
+    updates = Updates(LearnConfig(window=30.0, updates=(10.0, 15.0), check=12.0))
+    ticks = [7 * NANOSECONDS + nanoseconds(0.011 * k) for k in range(5_000)]  # 55 s of late ticks from 7 s on
+    begins = [(now_ns / NANOSECONDS - 7.0) for now_ns in ticks if updates.due(now_ns)]
+    assert begins == pytest.approx([10.0, 15.0, 27.0, 39.0, 51.0], abs=0.011)
+
+
+def test_latency_above_shortest_spacing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"learn\.latency: found 6 s, expected at most 5 s"):
+        find_scenario("osprey_learn").vary(controller={"learn": {"latency": 6.0}})
+
+
+def test_stale_law_takes_no_model() -> None:
+    flight = Flight()
+    flight.receive()
+    flight.step(3)
+    flight.now_ns += nanoseconds(START.max_age) + 1
+    flight.controller.tick(flight.now_ns)
+    flight.step()
+    assert flight.sentences == ["refused: found the mode HOLD, expected a model only while the law is engaged"]
+    assert flight.controller.digest == START.digest()
 
 
 def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagement_alone() -> None:
@@ -403,3 +462,20 @@ def test_margin_of_a_proposal_is_certified_to_its_end() -> None:
     flight.step()
     assert re.search(r"unstable with u 50 ms late, expected a delay margin of at least 50 ms", flight.sentences[0])
     assert flight.controller.digest == START.digest()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_authority_towards_each_limit_is_that_of_the_limit(sign: float) -> None:
+    """An elevator of -0.1 and +0.4 rad: with an effect B of 56.15 / s^2 it has 5.615 rad/s^2 down and 22.46 up."""
+    whole = RiseDiConfig.validate_mapping(START.changed(CHANGE), "whole")
+    assert whole.feedforward is not None
+    B = tuple(sign * value for value in whole.feedforward.B)
+    model = whole.feedforward.model_copy(update={"B": B, "deviation": None})
+    limits = {"lower": (-0.1, -0.2, -0.3, -0.1), "upper": (0.4, 0.5, 0.6, 0.7)}
+    flown = whole.model_copy(update=limits | {"feedforward": model})
+    least = dict(zip(authority_names(START.outputs), authority(flown, START).tolist(), strict=True))
+    lower, upper = ("down", "up") if sign > 0.0 else ("up", "down")
+    assert least[f"{lower}.q"] == pytest.approx(56.1499 * 0.1)
+    assert least[f"{upper}.q"] == pytest.approx(56.1499 * 0.4)
+    assert least[f"{lower}.V"] == pytest.approx(6.0 * 0.1)  # 0.06 m/s^2 per %
+    assert least[f"{upper}.V"] == pytest.approx(6.0 * 0.7)

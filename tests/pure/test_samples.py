@@ -15,6 +15,7 @@ from tests.other_laws import SECTIONS
 import rise_di
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.modes import Mode
+from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
 from rise_di_controller import guard
 from rise_di_controller.controller import Controller
@@ -59,7 +60,7 @@ def without_sample(observed: bool) -> FloatArray:
 
 @pytest.mark.parametrize("observed", [False, True], ids=["law alone", "observer"])
 @pytest.mark.parametrize("channel", [0, 3])
-@pytest.mark.parametrize("size", [35.0, np.nan])
+@pytest.mark.parametrize("size", [3.0, 35.0, -1e3, 1e6, -1e307, np.nan])
 def test_wrong_sample_is_as_one_that_did_not_arrive(observed: bool, channel: int, size: float) -> None:
     """To the bit. Twice the change that full inputs make in a period is 0.7 rad/s and 4 m/s: 3 rad/s and 30 m/s are above."""
     config, unit = OBSERVER if observed else SERVO, np.array([1.0, 1.0, 1.0, 10.0])
@@ -83,6 +84,15 @@ def test_bounds_hold_from_the_first_sample_on(channel: int, bound: float) -> Non
         assert sentence.endswith(f", the bound of {name} (controller.y_max)")
         assert take(StampedVector(0, np.nan * unit), 0)
         assert take(StampedVector(0, 0.999 * bound * unit), 0) == ""
+
+
+def test_bound_is_a_parameter() -> None:
+    config = AnyLaw.validate_mapping(SERVO.model_dump() | {"y_max": [1.0, 2.0, 3.0, 4.0]}, "controller")
+    controller = Controller(config)
+    assert controller.take_y(StampedVector(0, np.array([0.9, 1.9, 2.9, -4.1])), 0).startswith("V = -4.1 is beyond 4")
+    assert controller.take_y(StampedVector(0, np.array([0.9, -1.9, 2.9, 3.9])), 0) == ""
+    with pytest.raises(ParameterError, match="y_max"):
+        AnyLaw.validate_mapping(SERVO.model_dump() | {"y_max": [1.0]}, "controller")
 
 
 def test_jump_that_stays_is_taken_at_its_third_sample() -> None:
@@ -140,12 +150,7 @@ def test_abrupt_motion_within_the_power_of_the_inputs_is_taken() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        "osprey_vanes",
-    ],
-)
+@pytest.mark.parametrize("name", ["osprey_turbulence", "osprey_vanes", "x8_elevons"])
 def test_flights_lose_no_sample(name: str) -> None:
     """Every sample of y after the first tick becomes a tick: gusts, turbulence, commands and engagement are possible motion."""
     scenario = find_scenario(name, 4.0).vary(aircraft={"rate": 100.0, "step": 0.005}, reference_model={"rate": 100.0})
@@ -156,7 +161,7 @@ def test_flights_lose_no_sample(name: str) -> None:
     assert ticks["dt"][1:] == pytest.approx(0.01, rel=1e-9)
 
 
-@pytest.mark.parametrize("reading", [-4.0, np.nan])
+@pytest.mark.parametrize("reading", [1e308, -4.0, np.nan])
 def test_reading_beyond_half_a_turn_is_that_of_the_tick_before(reading: float) -> None:
     """A vane alone does not take y from the law: it stands still, and a vane that stands still is left out."""
     config = find_scenario("osprey_vanes").controller
@@ -187,6 +192,23 @@ def test_state_that_is_not_finite_begins_again() -> None:
     assert set(modes) == {Mode.ENGAGED}
     assert np.isfinite(later).all()
     assert controller.restarted() == ""
+
+
+def test_loop_warns_of_a_lost_sample_and_of_a_new_engagement() -> None:
+    loop, zero = rise_di.Loop(SERVO), np.zeros(4)
+    for k in range(SPIKE):
+        loop.step(k / 100.0, y=zero, y_m=zero)
+    with pytest.warns(RuntimeWarning, match=r"^sample lost at t = 1.2 s: q = 1e\+308 is beyond 34\.9"):
+        loop.step(1.2, y=1e308 * np.eye(4)[0], y_m=zero)
+    assert loop.lost
+    loop.step(1.21, y=zero, y_m=zero)
+    assert not loop.lost
+    jumped = np.array([3.0, 0.0, 0.0, 0.0])
+    with pytest.warns(RuntimeWarning, match="sample lost at t = 1.22 s: a jump of y in 0.01 s: q from 0 to 3"):
+        loop.step(1.22, y=jumped, y_m=zero)
+    loop.step(1.23, y=jumped, y_m=zero)  # the second of a row: no further warning, which a test makes an error
+    with pytest.warns(RuntimeWarning, match="the law engages again at t = 1.24 s: a jump of y"):
+        loop.step(1.24, y=jumped, y_m=zero)
 
 
 LIMITS = {"lower": (-0.3,) * 4, "upper": (0.2,) * 4}
