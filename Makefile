@@ -64,7 +64,7 @@ test-sitl: setup-all
 mutants: setup-all
 	@rm -rf build/mutants && mkdir -p build/mutants
 	@cp -r ros_ws/src/rise_di_controller/rise_di_controller ros_ws/src/flight_analysis/flight_analysis benchmarks docs examples tests pyproject.toml build/mutants
-	cd build/mutants && OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run $(ARGS) && $(BIN)/mutmut results
+	cd build/mutants && OPENBLAS_NUM_THREADS=1 $(BIN)/mutmut run $(ARGS) && { $(BIN)/mutmut results | grep ": survived" || echo "no change survived"; }
 
 foxglove autopilot: setup
 	$(INSTALL) --extra $@
