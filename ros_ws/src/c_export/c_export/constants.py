@@ -70,9 +70,9 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     """Members of struct rise_di_parameters in the order of rise_di.h; infinite where there is no limit."""
     guard = controller.guard()
     law = controller.law_params()
-    of_law = controller.tuned_law().params
+    law_params = controller.tuned_law().params
     period = seconds(guard.period_ns)
-    whole: dict[str, int | tuple[int, ...]] = {
+    integers: dict[str, int | tuple[int, ...]] = {
         "digest": controller.digest(),
         "period_ns": guard.period_ns,
         "max_age_ns": guard.max_age_ns,
@@ -87,22 +87,22 @@ def constants(controller: RiseDiConfig) -> list[Constant]:
     reals |= {"y_max": guard.samples.largest, "y_reach": guard.samples.reach}
     reals |= _limits("limits", guard.limits)
     if (allocation := guard.allocation) is not None:
-        whole["order"] = allocation.order
+        integers["order"] = allocation.order
         reals |= {name: getattr(allocation, name) for name in ("T", "effect", "exchange")}
         reals |= _limits("stops", allocation.limits)
-    if isinstance(of_law, ScheduleParams):
-        least, largest = airspeed_range(of_law)
-        reals |= {"speed": of_law.speed, "airspeed": of_law.airspeed, "time": of_law.time}
+    if isinstance(law_params, ScheduleParams):
+        least, largest = airspeed_range(law_params)
+        reals |= {"speed": law_params.speed, "airspeed": law_params.airspeed, "time": law_params.time}
         reals |= {"V_least": least, "V_largest": largest}
     if guard.nominal is not None:
         names = ("A", "B", "C", "gravity", "inverse", "path_A", "path_gravity", "lead")
         reals |= {name: getattr(guard.nominal, name) for name in names}
         reals["has_sine"] = guard.nominal.gravity.any(axis=0)
-    if isinstance(of_law, ObserverParams):
-        reals |= {name: getattr(of_law, name) for name in ("Phi", "Gamma", "H", "L", "F")}
-        reals |= _limits("observer_limits", of_law.limits) | {"fade_rate": of_law.fade_rate}
+    if isinstance(law_params, ObserverParams):
+        reals |= {name: getattr(law_params, name) for name in ("Phi", "Gamma", "H", "L", "F")}
+        reals |= _limits("observer_limits", law_params.limits) | {"fade_rate": law_params.fade_rate}
     arrays = [Constant(name, np.array(value, dtype=np.float64).ravel()) for name, value in reals.items()]
-    return [*(Constant(name, value) for name, value in whole.items()), *arrays]
+    return [*(Constant(name, value) for name, value in integers.items()), *arrays]
 
 
 def _limits(name: str, limits: Limits) -> dict[str, FloatArray]:

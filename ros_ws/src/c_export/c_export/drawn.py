@@ -99,7 +99,6 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     dt_ns = np.round(period_ns * factor).astype(np.int64)
     before, y, y_m = _drawn_states(sets[index], rng, dt_ns)
     after = _stepped(sets[index], before, y, y_m, dt_ns)
-    groups = list(real_groups(sets[index]))
     zero = np.zeros((steps, 9), dtype=np.int64)
     integers = zero + np.array([1, 0, Mode.ENGAGED, 1, 0, 0, 0, 0, 0])
     integers[:, 4] = integers[:, 8] = EPOCH_NS + dt_ns
@@ -115,8 +114,15 @@ def drawn_steps(sets: Sequence[RiseDiConfig], index: int, steps: int, seed: int)
     tick["y"] = y.T
     tick["y_m"] = y_m.T
     tick["now_ns"] = tick["stamp_ns"] = EPOCH_NS + dt_ns
-    reals, loaded = (np.ascontiguousarray(np.vstack([values[name] for name in groups]).T) for values in (after, before))
+    groups = list(real_groups(sets[index]))
+    reals = _rows(after, groups)
+    loaded = _rows(before, groups)
     return Recording(f"drawn steps, parameters {index}", events, integers, reals, loaded)
+
+
+def _rows(values: Mapping[str, FloatArray], groups: Sequence[str]) -> FloatArray:
+    """The values of groups (values, steps) as rows (steps, w) in the order of the groups."""
+    return np.ascontiguousarray(np.vstack([values[name] for name in groups]).T)
 
 
 def _drawn_states(
@@ -129,17 +135,15 @@ def _drawn_states(
     scale = np.array(controller.input_scale)[:, None]
     size = eps * 10.0 ** rng.uniform(-3.0, 2.5, (1, steps)) * 10.0 ** rng.uniform(-1.0, 0.0, (m, steps))
     u_size = 10.0 * scale * size
-    of_groups = {
+    sizes = {
         "u": u_size, "u_free": u_size, "u_trim": 0.1 * u_size, "y": eps, "y_m": eps, "e_0": size, "e": size, "integral_e": size,
         "Pi": 10.0 * size, "u_o": 0.1 * u_size, "z": size[:1], "feedforward.x": size[:1], "feedforward.u": u_size,
         "feedforward.u_0": u_size, "u_ff": 0.3 * u_size * (controller.feedforward is not None),
     }  # fmt: skip
     if controller.allocation is not None:
         stops = controller.effector_limits()
-        of_groups["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
-    drawn = {
-        name: of_groups.get(name, 0.0) * rng.normal(size=(count, steps)) for name, count in real_groups(controller).items()
-    }
+        sizes["effectors"] = 0.3 * (stops.upper - stops.lower)[:, None]
+    drawn = {name: sizes.get(name, 0.0) * rng.normal(size=(count, steps)) for name, count in real_groups(controller).items()}
     drawn |= {"sigma": rng.random((1, steps)), "scale": rng.uniform(0.3, 3.0, (m, steps))}
     drawn |= {"feedforward.dt": dt_ns[None] / NANOSECONDS * rng.random((1, steps))}
     drawn |= {"feedforward.ticks": rng.integers(0, 5, (1, steps)).astype(np.float64)}
@@ -170,19 +174,19 @@ def _stepped(
         state = _chosen(k < missed, law.control_law.missed(state, held, params), state)
     u_trim = before["u_trim"]
     u_ff = before["u_ff"]
-    of_model = {}
+    model_state = {}
     if guard.nominal is not None:
         x, u, dt_before, ticks, u_0 = (before[f"feedforward.{name}"] for name in FeedforwardState._fields)
         now, u_ff = feedforward.step(FeedforwardState(x, u, dt_before[0], ticks[0], u_0), y_m, dt, _columns(guard.nominal))
         u_trim = u_trim + u_ff
-        of_model = {f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()}
+        model_state = {f"feedforward.{name}": np.atleast_2d(value) for name, value in now._asdict().items()}
     measured = Measurements(y, y_m, zero, u_trim, u_before)
-    of_step, u_free = law.control_law.step(state, measured, dt, params)
+    stepped, u_free = law.control_law.step(state, measured, dt, params)
     last = before.get("effectors")
     u, _ = _given(saturate(u_free, u_before, dt, limits), last, dt, guard.allocation)
     limited = (u != u_free).any(axis=0)
     limits = limits if guard.allocation is None else reached(u_free, u)
-    of_limits, u_free_limited, u_limited = law.control_law.limited(state, measured, dt, params, limits)
+    stepped_limited, u_free_limited, u_limited = law.control_law.limited(state, measured, dt, params, limits)
     u, effectors = _given(np.where(limited, u_limited, u), last, dt, guard.allocation)
     after = {
         **before,
@@ -190,11 +194,11 @@ def _stepped(
         "u_free": np.where(limited, u_free_limited, u_free),
         "u_ff": u_ff,
         **({} if effectors is None else {"effectors": effectors}),
-        **fields(_chosen(limited, of_limits, of_step)),
-        **of_model,
+        **fields(_chosen(limited, stepped_limited, stepped)),
+        **model_state,
     }
-    of_output = {"output.y": y, "output.y_m": y_m, "output.y_m_offset": np.zeros((1, len(dt))), "output.dt": dt[None]}
-    return after | {"y": y, "y_m": y_m} | of_output
+    output = {"output.y": y, "output.y_m": y_m, "output.y_m_offset": np.zeros((1, len(dt))), "output.dt": dt[None]}
+    return after | {"y": y, "y_m": y_m} | output
 
 
 def _given(

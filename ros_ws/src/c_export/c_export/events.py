@@ -50,8 +50,8 @@ class Recording(NamedTuple):
 
 def event_type(m: int) -> np.dtype[np.void]:
     """The struct `event` of proof.c."""
-    whole = [(name, np.int64) for name in ("kind", "now_ns", "stamp_ns", "flag", "offset_ns")]
-    return np.dtype([*whole, ("y", np.float64, m), ("y_m", np.float64, m)])
+    integers = [(name, np.int64) for name in ("kind", "now_ns", "stamp_ns", "flag", "offset_ns")]
+    return np.dtype([*integers, ("y", np.float64, m), ("y_m", np.float64, m)])
 
 
 def real_groups(controller: RiseDiConfig) -> dict[str, int]:
@@ -69,7 +69,10 @@ def real_groups(controller: RiseDiConfig) -> dict[str, int]:
 
 def real_names(controller: RiseDiConfig) -> list[str]:
     """Names of the reals in a state."""
-    return [f"{name}[{i}]" for name, count in real_groups(controller).items() for i in range(count)]
+    names: list[str] = []
+    for group, count in real_groups(controller).items():
+        names += [f"{group}[{i}]" for i in range(count)]
+    return names
 
 
 class Recorder(Controller):
@@ -167,9 +170,9 @@ class Recorder(Controller):
         state = self.state
         y_stamp_ns = 0 if state.y is None else state.y.stamp_ns
         stamp_ns = 0 if inputs is None else inputs.stamp_ns
-        whole = (inputs is not None, self._refused, state.mode, state.law is not None, y_stamp_ns)
+        integers = (inputs is not None, self._refused, state.mode, state.law is not None, y_stamp_ns)
         times = (state.failsafe_start_ns, state.hold_ns, state.ramp_ns, stamp_ns)
-        self._integers.append((*map(int, whole), *times))
+        self._integers.append((*map(int, integers), *times))
         self._refused = 0
         row = np.zeros(self._width)
         parts = [state.u, state.u_free, state.u_trim, state.u_ff, state.u_failsafe]
@@ -248,21 +251,21 @@ def _faults(duration: float, sets: Sequence[RiseDiConfig]) -> Callable[[Recorder
     controller = sets[0]
     within_hold = controller.max_age + 0.5 * controller.hold
     in_ramp = controller.max_age + controller.hold + 0.5 * controller.ramp
-    beyond = controller.max_age + controller.hold + controller.ramp + 0.2
-    lost = {0.25: ({"y"}, within_hold), 0.35: ({"y_m"}, in_ramp), 0.5: ({"y"}, beyond), 0.7: ({"y", "y_m"}, in_ramp)}
+    past_ramp = controller.max_age + controller.hold + controller.ramp + 0.2
+    lost = {0.25: ({"y"}, within_hold), 0.35: ({"y_m"}, in_ramp), 0.5: ({"y"}, past_ramp), 0.7: ({"y", "y_m"}, in_ramp)}
     retuned = {0.05 + 0.9 * k / len(sets): k for k in range(1, len(sets))}
-    done: set[float] = set()
+    applied: set[float] = set()
 
     def before(recorder: Recorder, now_ns: int) -> bool:
         t = now_ns / NANOSECONDS
         silent = [names for part, (names, length) in lost.items() if part * duration <= t < part * duration + length]
         recorder.silent = frozenset().union(*silent)
         for part, index in retuned.items():
-            if t >= part * duration and part not in done:
-                done.add(part)
+            if t >= part * duration and part not in applied:
+                applied.add(part)
                 recorder.retune_to(index)
-        if t >= 0.97 * duration and 1.0 not in done:
-            done.add(1.0)
+        if t >= 0.97 * duration and 1.0 not in applied:
+            applied.add(1.0)
             recorder.restart()
         return not 0.8 * duration <= t < 0.8 * duration + 0.7
 
@@ -277,8 +280,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
     sets = [exportable(recorded_parameters(run.scenario_file()))]
     changes = [*recorded_changes(run, sets[0])]
     log = run.tape["internals"]
-    of_command = "u" if sets[0].allocation is None else internals.EFFECTOR
-    groups = {name: log.group(name).values for name in ("y", "y_m", of_command)}
+    command = "u" if sets[0].allocation is None else internals.EFFECTOR
+    groups = {name: log.group(name).values for name in ("y", "y_m", command)}
     recorder = Recorder(sets)
     equal = 0
     now_ns = log.stamp_ns + np.round(log["age"] * NANOSECONDS).astype(np.int64)
@@ -287,8 +290,8 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
             recorder.begin()
         in_force = int(log["parameters"][k])
         while recorder.digest != in_force:
-            found = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
-            require(bool(changes), "run", found, "a log with all changes of the parameters")
+            unexplained = f"parameters before tick {log['number'][k]:g} that no change of the log leads to"
+            require(bool(changes), "run", unexplained, "a log with all changes of the parameters")
             sets.append(exportable(vary(recorder.parameters, changes.pop(0))))
             recorder.retune_to(len(sets) - 1)
         sample = None
@@ -298,5 +301,5 @@ def run_recording(run: RecordedRun) -> tuple[list[RiseDiConfig], Recording, int]
                 recorder.restart()
             sample = (int(log.stamp_ns[k]), groups["y"][k], groups["y_m"][k], offset_ns)
         recorder.guard_tick(int(now_ns[k]), sample, active=log["mode"][k] != Mode.INACTIVE)
-        equal += recorder.state.command.tobytes() == groups[of_command][k].tobytes()
+        equal += recorder.state.command.tobytes() == groups[command][k].tobytes()
     return sets, recorder.recording(f"the log {printable(str(run.path))}"), equal

@@ -46,8 +46,8 @@ class CController:
 
     def _take(self, is_y: int, stamp_ns: int, value: FloatArray, now_ns: int) -> int:
         sample = np.ascontiguousarray(value, dtype=np.float64)
-        whole = (ctypes.c_int64(number) for number in (is_y, stamp_ns, now_ns))
-        return int(self._library.library_take(self._memory, *whole, _POINTER(sample.ctypes.data)))
+        integers = (ctypes.c_int64(number) for number in (is_y, stamp_ns, now_ns))
+        return int(self._library.library_take(self._memory, *integers, _POINTER(sample.ctypes.data)))
 
     def tick(self, now_ns: int, *, active: bool = True) -> tuple[FloatArray, int]:
         """A tick: u, and the mode, -1 where no u is to be sent."""
@@ -62,10 +62,10 @@ class CController:
         before = np.zeros(len(events), dtype=np.int64)  # what the event before a tick is
         before[1:] = 4 * (events["kind"] == START)[:-1] + 8 * (events["kind"] == RESTART)[:-1]
         flags = ticks["flag"] + before[events["kind"] == GUARD_TICK]
-        whole = [np.ascontiguousarray(values) for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])]
+        integers = [np.ascontiguousarray(values) for values in (ticks["now_ns"], ticks["stamp_ns"], flags, ticks["offset_ns"])]
         reals = [np.ascontiguousarray(ticks[name]) for name in ("y", "y_m")]
         u = np.zeros((len(ticks), self._p))
-        addresses = (_POINTER(values.ctypes.data) for values in (*whole, *reals, u))
+        addresses = (_POINTER(values.ctypes.data) for values in (*integers, *reals, u))
         self._library.library_replay(self._memory, ctypes.c_int64(len(ticks)), *addresses)
         return u
 
@@ -94,27 +94,29 @@ def model_description(controller: RiseDiConfig, scenario: str) -> str:
     variables = []
     for group, names in groups.items():
         for i, name in enumerate(names):
-            of = f'name={quoteattr(printable(f"{group}.{name}"))} valueReference="{VALUE_REFERENCES[group] + i}"'
+            attributes = f'name={quoteattr(printable(f"{group}.{name}"))} valueReference="{VALUE_REFERENCES[group] + i}"'
             if group == "u":
-                variables.append(f'<ScalarVariable {of} causality="output" variability="discrete"><Real/></ScalarVariable>')
+                variables.append(
+                    f'<ScalarVariable {attributes} causality="output" variability="discrete"><Real/></ScalarVariable>'
+                )
             else:
                 kind = 'causality="input" variability="discrete"'
-                variables.append(f'<ScalarVariable {of} {kind}><Real start="0"/></ScalarVariable>')
+                variables.append(f'<ScalarVariable {attributes} {kind}><Real start="0"/></ScalarVariable>')
     for name in ("active", "y_new", "y_m_new"):
-        of = f'name="{name}" valueReference="{VALUE_REFERENCES[name]}" causality="input" variability="discrete"'
-        variables.append(f'<ScalarVariable {of}><Boolean start="true"/></ScalarVariable>')
-    of = f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" variability="discrete"'
-    variables.append(f"<ScalarVariable {of}><Integer/></ScalarVariable>")
+        attributes = f'name="{name}" valueReference="{VALUE_REFERENCES[name]}" causality="input" variability="discrete"'
+        variables.append(f'<ScalarVariable {attributes}><Boolean start="true"/></ScalarVariable>')
+    attributes = f'name="mode" valueReference="{VALUE_REFERENCES["mode"]}" causality="output" variability="discrete"'
+    variables.append(f"<ScalarVariable {attributes}><Integer/></ScalarVariable>")
     begin = 2 * len(controller.outputs) + 1
     outputs = [*range(begin, begin + len(controller.effectors)), len(variables)]
     unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
-    of_model = (
+    model_attributes = (
         f'modelName={quoteattr(printable(f"RISE-DI {scenario}"))} guid="{controller.digest():012x}" '
         'generationTool="rise-di export" variableNamingConvention="structured"'
     )
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<fmiModelDescription fmiVersion="2.0" {of_model}>',
+        f'<fmiModelDescription fmiVersion="2.0" {model_attributes}>',
         '<CoSimulation modelIdentifier="rise_di" canHandleVariableCommunicationStepSize="true"/>',
         f'<DefaultExperiment startTime="0" stepSize="{1.0 / controller.rate!r}"/>',
         "<ModelVariables>",

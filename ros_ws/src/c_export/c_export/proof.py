@@ -126,16 +126,16 @@ class Program:
         (self._folder / "loaded").write_bytes(recording.loaded.tobytes())
         command = ["./proof", "sets", "events", "loaded", "states"]
         try:
-            done = subprocess.run(command, cwd=self._folder, capture_output=True, text=True, check=False)  # noqa: S603 - built here
+            process = subprocess.run(command, cwd=self._folder, capture_output=True, text=True, check=False)  # noqa: S603 - built here
         except OSError as error:
-            found = f"found a program that does not start here ({error.strerror})"
-            raise ParameterError(f"compiler: {found}, expected a compiler for this machine") from None
-        if done.returncode:
-            raise ParameterError(f"the exported code: {(done.stderr or 'the program failed').strip()[-2000:]}")
-        whole = len(INTEGERS)
+            failure = f"found a program that does not start here ({error.strerror})"
+            raise ParameterError(f"compiler: {failure}, expected a compiler for this machine") from None
+        if process.returncode:
+            raise ParameterError(f"the exported code: {(process.stderr or 'the program failed').strip()[-2000:]}")
+        integers = len(INTEGERS)
         reals = len(real_names(self._sets[0]))
-        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, whole + reals)
-        return words[:, :whole], words[:, whole:].view(np.float64), json.loads(done.stdout)
+        words = np.fromfile(self._folder / "states", dtype=np.int64).reshape(-1, integers + reals)
+        return words[:, :integers], words[:, integers:].view(np.float64), json.loads(process.stdout)
 
     def compare(self, recording: Recording) -> Comparison:
         """The states of C beside the states of Python."""
@@ -222,18 +222,18 @@ def report(proof: Proof, scenario: str) -> str:
     lines.append("")
     several = len(proof.compilers) > 1
     for k, comparison in enumerate(proof.comparisons):
-        by = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
-        of = f"{comparison.name}{by}: {comparison.ticks} ticks, {comparison.values} values"
+        compiler = f", {proof.compilers[k % len(proof.compilers)]}" if several else ""
+        counts = f"{comparison.name}{compiler}: {comparison.ticks} ticks, {comparison.values} values"
         if proof.float32:
-            lines.append(f"{of}; u within {comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}")
+            lines.append(f"{counts}; u within {comparison.deviation:.2g} of its range, bound {FLOAT32_BOUND:.2g}")
         else:
-            lines.append(f"{of}, {comparison.differing} differ")
+            lines.append(f"{counts}, {comparison.differing} differ")
         if comparison.first is not None and not comparison.holds(float32=proof.float32):
             tick, channel, python, c = comparison.first
             lines.append(f"    first in tick {tick}: {channel} is {python!r} in Python, {c!r} in C")
     lines += ["", *(f"{FIGURES[name]}: {value}" for name, value in sorted(proof.figures.items(), key=_place))]
-    within = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range" if proof.float32 else "every bit is equal"
-    lines += ["", f"PROVED: {within}" if proof.holds else "NOT PROVED"]
+    result = f"every mode is equal and u is within {FLOAT32_BOUND:.2g} of its range" if proof.float32 else "every bit is equal"
+    lines += ["", f"PROVED: {result}" if proof.holds else "NOT PROVED"]
     return "\n".join(lines) + "\n"
 
 
@@ -243,16 +243,16 @@ def _place(figure: tuple[str, int]) -> int:
 
 def build(command: Sequence[str], folder: Path) -> None:
     """Run a compiler in a folder. Raises ParameterError with what it says."""
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
-    if done.returncode:
-        said = (done.stderr or done.stdout).strip()[-2000:] or f"exit status {done.returncode}"
+    process = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - the user's compiler
+    if process.returncode:
+        said = (process.stderr or process.stdout).strip()[-2000:] or f"exit status {process.returncode}"
         raise ParameterError(f"{shlex.join(command)}: {said}")
 
 
 def version(compiler: Sequence[str]) -> str:
     """The first line of what a compiler says of itself."""
-    done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)  # noqa: S603 - as above
-    return (done.stdout or done.stderr).partition("\n")[0].strip()
+    process = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)  # noqa: S603 - as above
+    return (process.stdout or process.stderr).partition("\n")[0].strip()
 
 
 def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, int]:
@@ -272,7 +272,7 @@ def footprint(code: Path, compiler: Sequence[str], folder: Path) -> dict[str, in
         lines = [line.split("\t") for line in usage.read_text(encoding="utf-8").splitlines()]
         known["stack_bytes"] = sum(int(line[1]) for line in lines)
     if (size := shutil.which("size")) is not None:
-        done = subprocess.run([size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - of binutils
-        text, data, bss = (int(word) for word in done.stdout.splitlines()[1].split()[:3])
+        process = subprocess.run([size, "rise_di.o"], cwd=folder, capture_output=True, text=True, check=True)  # noqa: S603 - of binutils
+        text, data, bss = (int(word) for word in process.stdout.splitlines()[1].split()[:3])
         known |= {"code_bytes": text, "data_bytes": data + bss}
     return known
