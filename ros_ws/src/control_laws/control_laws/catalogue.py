@@ -87,15 +87,28 @@ def initial_gains(law: Law, model: NominalModel) -> Gains:
     return {name: gains[name] for name in law.tuned}
 
 
+def _full_state_laws() -> dict[str, Law]:
+    """Each law of FULL_STATE with the measured state, and with the state relative to the air, from vanes."""
+    entries: dict[str, Law] = {}
+    for name, (title, control_law, params, tuned) in FULL_STATE.items():
+        measured = partial(control_law, vanes=False)
+        relative = partial(control_law, vanes=True)
+        entries[name] = Law(title, "full state", _model, measured, params, tuned)
+        entries[f"{name}_vanes"] = Law(title, "full state, vanes", _model, relative, params, tuned)
+    return entries
+
+
 def _over(
-    of_law: Callable[[Gains, NominalModel], Any], part: float = observed.PART
+    law_params: Callable[[Gains, NominalModel], Any], part: float = observed.PART
 ) -> Callable[[Gains, NominalModel], ObserverParams]:
     """Parameters of an observer with the aircraft's model over a law, from the function for the law's own parameters."""
-    return lambda gains, model: observed.of_design(observed.aircraft_design(gains, model), of_law(gains, model), model, part)
+    return lambda gains, model: observed.observer_params(
+        observed.aircraft_design(gains, model), law_params(gains, model), model, part
+    )
 
 
 def _extended_state(gains: Gains, model: NominalModel) -> ObserverParams:
-    return observed.of_design(observed.extended_state_design(gains, model), pi.params_of(gains, model), model)
+    return observed.observer_params(observed.extended_state_design(gains, model), pi.params_of(gains, model), model)
 
 
 def _fixed(law: ControlLaw) -> Callable[[NominalModel], ControlLaw]:
@@ -194,10 +207,4 @@ LAWS: dict[str, Law] = {
         linear=False,
     ),
     "indi": Law("INDI", "y, actuators", "Omega", indi.control_law, indi.indi_params, ("K", "bandwidth", "share")),
-} | {
-    f"{name}_vanes" if vanes else name: Law(
-        title, "full state, vanes" if vanes else "full state", _model, partial(control_law, vanes=vanes), params, tuned
-    )
-    for name, (title, control_law, params, tuned) in FULL_STATE.items()
-    for vanes in (False, True)
-}
+} | _full_state_laws()

@@ -49,9 +49,9 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         model_part = drift @ x + gravity @ array_namespace(e).sin(x)
         nu = measured.y_m_dot - model_part - params.K * (e + params.Lambda * integral_e)
         u_free = measured.u_trim + inverse @ nu
-        u, beyond = saturate(u_free, measured, dt, limits)
+        u, excess = saturate(u_free, measured, dt, limits)
         effect = -params.K * params.Lambda * increment
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ beyond)), u_free, u
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, Omega @ excess)), u_free, u
 
     return campaign_law(ErrorIntegral, start_integral, limited)
 

@@ -49,10 +49,14 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         none = xp.zeros_like(e)
         z = xp.concat([state_of(measured, vanes=vanes), measured.y_m + none, measured.y_m_dot + none, integral_e])
         u_free = measured.u_trim - xp.sum(params.gain * z[None, :, :], axis=1)
-        u, beyond = saturate(u_free, measured, dt, limits)
+        u, excess = saturate(u_free, measured, dt, limits)
         m = e.shape[0]
-        own = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
-        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -own * increment, beyond)), u_free, u
+        integral_gain = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
+        return (
+            ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -integral_gain * increment, excess)),
+            u_free,
+            u,
+        )
 
     return campaign_law(ErrorIntegral, start_integral, limited)
 

@@ -64,10 +64,10 @@ def control_law(model: NominalModel, *, ideal: bool) -> ControlLaw:
         Pi = state.Pi + Pi_step
         nu = -params.K * (e - state.e_0 + params.Lambda * integral_e) - Pi
         u_free = measured.u_trim + inverse @ nu
-        u, beyond = saturate(u_free, measured, dt, limits)
-        excess = Omega @ beyond
-        integral_e = conditional_integration(state.integral_e, integral_e, -increment, excess)
-        Pi = conditional_integration(state.Pi, Pi, -Pi_step, excess)
+        u, excess = saturate(u_free, measured, dt, limits)
+        y_dot_excess = Omega @ excess
+        integral_e = conditional_integration(state.integral_e, integral_e, -increment, y_dot_excess)
+        Pi = conditional_integration(state.Pi, Pi, -Pi_step, y_dot_excess)
         return MacKunisState(state.e_0, e, e_dot, integral_e, Pi), u_free, u
 
     return campaign_law(MacKunisState, engage, limited)

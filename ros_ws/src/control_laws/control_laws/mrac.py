@@ -56,10 +56,10 @@ def control_law(model: NominalModel, *, vanes: bool) -> ControlLaw:
         phi = xp.concat([x / size, xp.ones_like(x[:1])])
         nu = measured.y_m_dot - drift @ x - gravity @ xp.sin(x) - params.K * e - xp.sum(state.W * phi[None, :, :], axis=1)
         u_free = measured.u_trim + inverse @ nu
-        u, beyond = saturate(u_free, measured, dt, limits)
-        free = xp.where(beyond == 0.0, xp.ones_like(e), xp.zeros_like(e))
-        of_states = (params.adaptation * e * free)[:, None, :] * phi[None, :-1, :]
-        update = xp.concat([of_states, (params.bias * e * free)[:, None, :]], axis=1)
+        u, excess = saturate(u_free, measured, dt, limits)
+        free = xp.where(excess == 0.0, xp.ones_like(e), xp.zeros_like(e))
+        state_update = (params.adaptation * e * free)[:, None, :] * phi[None, :-1, :]
+        update = xp.concat([state_update, (params.bias * e * free)[:, None, :]], axis=1)
         return MracState(state.W + dt * (update - params.leak[None, :, :] * state.W)), u_free, u
 
     return campaign_law(MracState, engage, limited)

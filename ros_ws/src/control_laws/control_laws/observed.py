@@ -26,17 +26,17 @@ FADE = 1.0
 `ObserverConfig`."""
 
 
-def of_design(design: ObserverDesign, of_law: Any, model: NominalModel, part: float = PART) -> ObserverParams:
-    """Parameters of an observer over a law with the parameters `of_law`, from N designs; u_o within `part` of the limits."""
+def observer_params(design: ObserverDesign, law_params: Any, model: NominalModel, part: float = PART) -> ObserverParams:
+    """Parameters of an observer over the law of `law_params`, from N designs; u_o within `part` of the limits."""
 
-    def last(matrices: FloatArray) -> FloatArray:
+    def aircraft_last(matrices: FloatArray) -> FloatArray:
         return np.moveaxis(matrices, 0, -1) if matrices.ndim > 2 else matrices
 
     lower = part * model.lower[:, None]
     upper = part * model.upper[:, None]
     limits = Limits(lower, upper, (upper - lower) / 2.0 / WITHIN)
-    Phi, Gamma, H, L, F = (last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F))
-    return ObserverParams(of_law, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
+    Phi, Gamma, H, L, F = (aircraft_last(matrix) for matrix in (design.Phi, design.Gamma, design.H, design.L, design.F))
+    return ObserverParams(law_params, Phi, Gamma, H, L, F, limits, np.array(1.0 / FADE))
 
 
 def aircraft_design(gains: dict[str, FloatArray], model: NominalModel, names: Names | None = None) -> ObserverDesign:
@@ -54,4 +54,5 @@ def extended_state_design(gains: dict[str, FloatArray], model: NominalModel, nam
 def unnamed(model: NominalModel) -> Names:
     """Numbers as names, for designs not written to a file."""
     (n, m), G = model.B.shape[-2:], model.wind.shape[-1]
-    return Names(*(tuple(str(k) for k in range(count)) for count in (n, m, m, G)))
+    numbers = [tuple(map(str, range(count))) for count in (n, m, m, G)]
+    return Names(*numbers)

@@ -128,8 +128,10 @@ def _sampled(
     motion[..., p, p] = -1.0 / lag
     drive[p, np.arange(m)] = 1.0 / lag
     H[:, :n] = C
-    states = tuple(f"{group}.{name}" for group, members in groups.items() for name in members)
-    return ObserverModel(states, *zero_order_hold(motion, drive, model.period), H)
+    states: list[str] = []
+    for group, members in groups.items():
+        states += [f"{group}.{name}" for name in members]
+    return ObserverModel(tuple(states), *zero_order_hold(motion, drive, model.period), H)
 
 
 def aircraft_observer(model: NominalModel, names: Names, weights: Weights) -> ObserverDesign:

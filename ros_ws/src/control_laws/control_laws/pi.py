@@ -48,9 +48,9 @@ def _limited(
     """U = u_trim - input_scale D K (e - e_0 + Lambda integral of e), a trapezoid with anti-windup (`limited_integral`)."""
     e = measured.y - measured.y_m
     after = PiState(state.e_0, e, state.integral_e + dt * (e + state.e) / 2.0)
-    _, beyond = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
+    _, excess = saturate(measured.u_trim + _u(after, params), measured, dt, limits)
     change = -params.input_scale * params.D * params.K * params.Lambda * (after.integral_e - state.integral_e)
-    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, beyond))
+    after = after._replace(integral_e=limited_integral(state.integral_e, after.integral_e, change, excess))
     u_free = measured.u_trim + _u(after, params)
     u, _ = saturate(u_free, measured, dt, limits)
     return after, u_free, u

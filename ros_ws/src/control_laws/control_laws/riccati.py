@@ -77,9 +77,9 @@ def corrections_near(F: FloatArray, H: FloatArray, process: FloatArray, noise: F
     """
     S = riccati(transpose(F[:1]), transpose(H), process[:1], noise)
     K = transpose(np.asarray(np.linalg.solve(H @ S @ transpose(H) + noise, H @ S)))
-    kept = np.eye(F.shape[-1]) - K @ H
-    change = F @ (kept @ S @ transpose(kept) + K @ noise @ transpose(K)) @ transpose(F) + process - S
-    A = F[:1] @ kept
+    uncorrected = np.eye(F.shape[-1]) - K @ H
+    change = F @ (uncorrected @ S @ transpose(uncorrected) + K @ noise @ transpose(K)) @ transpose(F) + process - S
+    A = F[:1] @ uncorrected
     for _ in range(MAX_DOUBLINGS):
         more = A @ change @ transpose(A)
         change = change + more

@@ -90,10 +90,10 @@ def control_law(model: NominalModel) -> ControlLaw:
         u_f = state.u_f + a * (u_late - state.u_f)
         y_dot = a * (measured.y - state.y_f) / dt / size
         phi = xp.concat([state.y_f / size, u_f / unit, xp.ones_like(e[:1])])
-        kept = xp.exp(-dt / params.memory)[None, :, :]
+        remembered = xp.exp(-dt / params.memory)[None, :, :]
         P_0 = covariance(params)
-        theta = nominal + kept * (state.theta - nominal)
-        P = P_0 + kept**2 * (state.P - P_0)
+        theta = nominal + remembered * (state.theta - nominal)
+        P = P_0 + remembered**2 * (state.P - P_0)
         P_phi = xp.sum(P * phi[None, :, :], axis=1)
         gain = dt * P_phi / (1.0 + dt * xp.sum(phi * P_phi, axis=0))
         theta = theta + (y_dot - xp.sum(theta * phi[None, :, :], axis=1))[:, None, :] * gain[None, :, :]
@@ -103,9 +103,9 @@ def control_law(model: NominalModel) -> ControlLaw:
         nu = measured.y_m_dot - params.K * (e + params.Lambda * integral_e)
         drift = xp.sum(theta[:, :m, :] * (measured.y / size)[None, :, :], axis=1)
         u_free = measured.u_trim + unit * solve(theta[:, m : 2 * m, :], nu / size - drift, model.D)
-        u, beyond = saturate(u_free, measured, dt, limits)
+        u, excess = saturate(u_free, measured, dt, limits)
         effect = -params.K * params.Lambda * increment
-        integral_e = conditional_integration(state.integral_e, integral_e, effect, model.Omega @ beyond)
+        integral_e = conditional_integration(state.integral_e, integral_e, effect, model.Omega @ excess)
         return SelfTunerState(e, integral_e, u_late, u_f, state.y_f + a * (measured.y - state.y_f), theta, P), u_free, u
 
     return campaign_law(SelfTunerState, engage, limited)

@@ -48,8 +48,8 @@ def control_law(model: NominalModel) -> ControlLaw:
         z = state.z + increment
         nu = measured.y_m_dot - params.root * xp.sign(e) * xp.sqrt(xp.abs(e)) + z
         u_free = measured.u_trim + inverse @ nu
-        u, beyond = saturate(u_free, measured, dt, limits)
-        return TwistingState(conditional_integration(state.z, z, increment, Omega @ beyond)), u_free, u
+        u, excess = saturate(u_free, measured, dt, limits)
+        return TwistingState(conditional_integration(state.z, z, increment, Omega @ excess)), u_free, u
 
     return campaign_law(TwistingState, engage, limited)
 
