@@ -166,7 +166,9 @@ else:  # type checkers would take a module with __getattr__ to have any name
     }
     """The names by the module that holds each, as an import statement has them."""
 
-    _HOME = {name.split(" as ")[-1]: (module, name.split(" as ")[0]) for module, names in HOMES.items() for name in names}
+    _HOME: dict[str, tuple[str, str]] = {}
+    for _module, _names in HOMES.items():
+        _HOME |= {name.split(" as ")[-1]: (_module, name.split(" as ")[0]) for name in _names}
 
     def __getattr__(name: str) -> object:
         """Load the module of a name at the first use of the name."""

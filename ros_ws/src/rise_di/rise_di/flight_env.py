@@ -136,9 +136,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         try:
             self._advance(u)
         except FlightEnded as error:
-            left = (self._ticks - self._k + 1) * self._period
+            remaining = (self._ticks - self._k + 1) * self._period
             self._k = self._ticks
-            return self._observed(), -LOSS_OF_TRACK_SCORE * left, True, False, {"outcome": str(error)}
+            return self._observed(), -LOSS_OF_TRACK_SCORE * remaining, True, False, {"outcome": str(error)}
         observed = self._observed()
         e = observed[: len(self._y)] - observed[len(self._y) :]
         return observed, -self._period * float(np.sum(np.abs(e) / self._units)), False, self._k >= self._ticks, {}
@@ -232,9 +232,9 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
             self._y = np.where(started, 0.0, self._y)
         y, y_m = self._sense()
         self._ended = ~self._flights.bounded
-        left = (self._last - self._k + 1) * self._course.period
+        remaining = (self._last - self._k + 1) * self._course.period
         reward = -self._course.period * np.sum(np.abs(y - y_m) / self._units, axis=0)
-        reward = np.where(self._ended, -LOSS_OF_TRACK_SCORE * left, np.where(started, 0.0, reward))
+        reward = np.where(self._ended, -LOSS_OF_TRACK_SCORE * remaining, np.where(started, 0.0, reward))
         truncated = ~self._ended if self._k == self._last else none
         return self._observed(y, y_m), reward, self._ended, truncated, {}
 

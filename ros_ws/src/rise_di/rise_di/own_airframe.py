@@ -79,8 +79,8 @@ def new_airframe(
     require(is_file_name, "name", repr(airframe.name), "the name of a file in the folder, without a /")
     place = as_path(folder, "folder", "the path of a folder")
     files = place / f"{airframe.name}.yaml", place / f"{airframe.name}_flight.yaml"
-    own = isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
-    for path in files[own:]:
+    source_is_target = isinstance(source, str | Path) and Path(source).absolute() == files[0].absolute()
+    for path in files[source_is_target:]:
         require(replace or not path.exists(), "folder", f"{path}", "a new file, or replace")
     lags = first_flight.default_lags(airframe) if lag is None else tuple(lags_by_input(lag, airframe).values())
     text_of_airframe = LICENCE + as_yaml(airframe)
@@ -89,7 +89,7 @@ def new_airframe(
         scenario = _flying(airframe, Path(trial) / files[0].name, files, lags)
     with writing("folder", place, "a folder that can"):
         place.mkdir(parents=True, exist_ok=True)
-        if not own:
+        if not source_is_target:
             write_file(files[0], text_of_airframe)
         write_file(files[1], LICENCE + "#\n" + scenario)
     return NewAirframe(*files, airframe, note)

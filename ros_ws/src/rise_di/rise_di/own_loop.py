@@ -126,8 +126,8 @@ def fly_plant(
     require_channels("reference_model.outputs", config.outputs, loop.outputs, "the outputs of the controller")
     reference = Reference(config)
     period_ns = nanoseconds(loop.period)
-    whole = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
-    require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", whole)
+    multiple = f"a whole multiple of controller.rate ({loop.config.rate:g} Hz)"
+    require(period_ns % reference.period_ns == 0, "reference_model.rate", f"{config.rate:g} Hz", multiple)
     each = period_ns // reference.period_ns
     ticks = int(nanoseconds(as_number(duration, "duration", loop.period, unit="s")) // period_ns) + 1
     channels = {"y": loop.measured, "y_m": loop.outputs, "u": loop.inputs, "internals": loop.names}
@@ -191,9 +191,9 @@ def as_control(controller: ControllerConfig | Mapping[str, Any], *, linear: bool
         state = restored(law, {name: part.reshape(start[name].shape) for name, part in zip(start, parts, strict=True)})
         u_before, y_m_before, effectors = np.split(x[ends[-1] :], [m, 2 * m])
         sample = Measurements(v[:m], v[m:], (v[m:] - y_m_before) / dt, zero, u_before)
-        after, _, u, given = law_within_limits(state, sample, np.float64(dt), tuned, guard, effectors if p else None)
+        after, _, u, allocated = law_within_limits(state, sample, np.float64(dt), tuned, guard, effectors if p else None)
         flat = np.concatenate([value.ravel() for value in fields(after).values()])
-        commanded = np.asarray(u if given is None else given)
+        commanded = np.asarray(u if allocated is None else allocated)
         return np.concatenate([flat - offset, u, v[m:], commanded[:p]]), commanded
 
     return control.nlsys(
