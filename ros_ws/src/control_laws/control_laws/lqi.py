@@ -52,11 +52,8 @@ def control_law(_: NominalModel, *, vanes: bool) -> ControlLaw:
         u, excess = saturate(u_free, measured, dt, limits)
         m = e.shape[0]
         integral_gain = xp.stack([params.gain[i, params.gain.shape[1] - m + i, :] for i in range(m)])
-        return (
-            ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, -integral_gain * increment, excess)),
-            u_free,
-            u,
-        )
+        effect = -integral_gain * increment
+        return ErrorIntegral(e, conditional_integration(state.integral_e, integral_e, effect, excess)), u_free, u
 
     return campaign_law(ErrorIntegral, start_integral, limited)
 
