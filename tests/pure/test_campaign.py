@@ -69,7 +69,7 @@ def fly_campaign(folder: Path, of: Definition) -> Campaign:
 @given(VALUES, st.data())
 def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(values)))
-    whole, parts = Figure.of(values), Figure.of(values[:cut]) + Figure.of(values[cut:])
+    whole, parts = Figure.from_values(values), Figure.from_values(values[:cut]) + Figure.from_values(values[cut:])
     assert parts.count == len(values)
     assert parts.bins == whole.bins
     assert parts.largest == values.max()
@@ -82,13 +82,15 @@ def test_figure_summed_from_parts_is_that_of_whole(values: FloatArray, data: st.
 def test_quantile_is_accurate_to_width_of_bin(values: FloatArray, share: float) -> None:
     # inverted_cdf: the smallest value that so many reach. A bin is 10^(1/100) wide.
     exact = float(np.quantile(values, share, method="inverted_cdf"))
-    assert Figure.of(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
+    assert Figure.from_values(values).quantile(share) == pytest.approx(exact, rel=10 ** (1 / 100) - 1.0)
 
 
 def test_worst_flights_kept_with_diverged_ones_first() -> None:
     scores = np.arange(30.0)
     diverged = scores == 4.0
-    halves = [Tally.of(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)]
+    halves = [
+        Tally.from_flights(first, diverged[first : first + 15], {"score": scores[first : first + 15]}) for first in (0, 15)
+    ]
     total = halves[0] + halves[1]
     assert [flight.number for flight in total.worst] == [4, *range(29, 29 - WORST_KEPT + 1, -1)]
     assert total.worst[0].score is None
@@ -315,7 +317,7 @@ def test_figures_of_diverged_aircraft_are_null() -> None:
     assert table["score"].to_list() == [1.0, None, 11.0]
     assert table["diverged"].to_list() == [False, True, False]
     assert table["lost"].to_list() == [False, False, True]
-    assert tally_of(table) == Tally.of(4, chunk.diverged, chunk.figures)
+    assert tally_of(table) == Tally.from_flights(4, chunk.diverged, chunk.figures)
 
 
 def test_rank_correlations_are_those_of_scipy() -> None:

@@ -129,7 +129,7 @@ VARIATIONS: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", VARIATIONS)
-def test_each_aircraft_of_fleet_flies_as_in_single_process_simulation(name: str) -> None:
+def test_each_aircraft_with_column_limits_flies_as_in_single_process_simulation(name: str) -> None:
     # A fleet holds the nonlinear remainder over a tick and the wind over a step of the integration (2 ms); the simulation
     # does not. In the gust the difference is at most 1e-4 of the error; 1e-3 bounds it. A quantised y sometimes rounds to the
     # next step, after which u differs: 2e-2.
@@ -166,7 +166,7 @@ def test_an_allocation_of_a_fleet_is_that_of_each_aircraft() -> None:
     params = allocation(T, effect, (2, 0, 3, 1), Limits(-stops, stops, np.full(7, 20.0)))
     of_effectors, before = (stops[:, None] * generator.uniform(-1.0, 1.0, (7, 40)) for _ in range(2))
     v = effect @ of_effectors * generator.choice([0.05, 0.9, 3.0, 30.0], 40)
-    u, given = jax.jit(batch_allocation.allocate)(v, before, DT, batch_allocation.of_fleet(params))
+    u, given = jax.jit(batch_allocation.allocate)(v, before, DT, batch_allocation.with_column_limits(params))
     for k in range(40):
         alone_u, alone_given = allocate(v[:, k], before[:, k], DT, params)
         assert np.asarray(u)[:, k] == pytest.approx(alone_u, abs=1e-9)  # sums in another order

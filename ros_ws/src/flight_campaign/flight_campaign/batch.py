@@ -108,7 +108,7 @@ def vehicle(scenario: Scenario) -> Vehicle:
         None,
         seconds(plant.step_ns),
         tuple(scenario.aircraft.load()[0].index(name) for name in scenario.controller.vanes),
-        None if guard.allocation is None else batch_allocation.of_fleet(guard.allocation),
+        None if guard.allocation is None else batch_allocation.with_column_limits(guard.allocation),
     )
 
 
@@ -175,18 +175,18 @@ def assemble(
     tick, forced, rate, forced_rate = begin = _matrices(A, B, directions, plant, course)
     blocks = _blocks((tick != 0.0).any(axis=0))
 
-    def of_blocks(whole: FloatArray) -> tuple[Array, ...]:
-        return tuple(_last(whole[:, block.rows][:, :, block.columns]) for block in blocks)
+    def by_block(matrices: FloatArray) -> tuple[Array, ...]:
+        return tuple(_last(matrices[:, block.rows][:, :, block.columns]) for block in blocks)
 
     change = None
     count = len(A)
     if (drift := plant.drift) is not None:
         end = _matrices(A * drift.A, B * drift.B, directions * drift.wind, plant, course)
         moved, *others = (after - before for before, after in zip(begin, end, strict=True))
-        change = Change(drift.start, drift.duration, of_blocks(moved), *map(_last, others))
+        change = Change(drift.start, drift.duration, by_block(moved), *map(_last, others))
     return Fleet(
         blocks,
-        of_blocks(tick),
+        by_block(tick),
         _last(forced),
         _last(rate),
         _last(forced_rate),
@@ -213,13 +213,13 @@ def _matrices(
     eye = np.broadcast_to(np.eye(A.shape[1]), A.shape)
     pairs = ((eye, 0.0 * eye), (0.0 * eye, eye))
     Phi, Gamma = (rk4(lambda t, x, u, L: L @ x + u, 0.0, x, u, L, dt) for x, u in pairs)
-    powers = list(accumulate(repeat(Phi, K), lambda power, one: one @ power, initial=eye))
+    powers = list(accumulate(repeat(Phi, K), lambda power, step: step @ power, initial=eye))
     held = [powers[K - 1 - k] @ Gamma for k in range(K)]
-    tick = [powers[K], *(of_step @ B for of_step in held), sum(held)[..., remainder_rows(aircraft)]]
+    tick = [powers[K], *(held_step @ B for held_step in held), sum(held)[..., remainder_rows(aircraft)]]
     C = aircraft.C[course.order]
     parts = (directions[..., course.axes], course.basis)
     forcing = np.concatenate([np.broadcast_to(part, (count, *part.shape[-2:])) for part in parts], axis=2)
-    forced = np.concatenate([of_step @ forcing for of_step in held], axis=2)
+    forced = np.concatenate([held_step @ forcing for held_step in held], axis=2)
     return np.concatenate(tick, axis=2), forced, C @ np.concatenate([L, B], axis=2), C @ forcing
 
 
@@ -369,8 +369,8 @@ def _fly(
             return law, u, u
         # As the guard: what the effectors give limits the law.
         _, u_free = control_law.step(now.law, measured, segment.dt, params)
-        _, given = allocate(saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation)
-        law, _, u = control_law.limited(now.law, measured, segment.dt, params, reached(u_free, given))
+        _, reachable = allocate(saturate(u_free, now.u, segment.dt, limits), now.command, segment.dt, allocation)
+        law, _, u = control_law.limited(now.law, measured, segment.dt, params, reached(u_free, reachable))
         command, u = allocate(u, now.command, segment.dt, allocation)
         return law, u, command
 
@@ -441,7 +441,7 @@ def _advance(
     blocks = timing.blocks
     u_late = timing.u_late
     flown = now.mission
-    places = np.argsort([row for block in blocks for row in block.rows])  # of the states in the order of the blocks
+    places = np.argsort([*chain.from_iterable(block.rows for block in blocks)])  # of the states in the order of the blocks
     history = jnp.concatenate([command[None], now.command_before])
     acting = command if not u_late else jnp.sum(jnp.where(jnp.arange(u_late + 1)[:, None, None] == fleet.late, history, 0.0), 0)
     commanded = acting[jnp.argsort(vehicle.inputs)]
@@ -454,7 +454,9 @@ def _advance(
     remainder = remainder_of(now.x[vehicle.remainder_states], vehicle.remainder)
     moves = [*now.x, *chain(*means), *(1.5 * remainder - 0.5 * now.remainder)]
     matrices = _at(segment.t, fleet)
-    parts = [_product(part, [moves[j] for j in block.columns]) for part, block in zip(matrices.tick, blocks, strict=True)]
+    parts = []
+    for matrix, block in zip(matrices.tick, blocks, strict=True):
+        parts.append(_product(matrix, [moves[j] for j in block.columns]))
     x = jnp.concatenate(parts)[places]
     x = jax.lax.cond(
         jnp.any(segment.forcing != 0.0),
@@ -477,14 +479,14 @@ def _advance(
 
 def _result(end: LoopState, ticks: int, period: Array, mission: Mission | None, timing: Timing) -> FleetResult:
     """The figures of flights at their end."""
-    of_mission = None if mission is None else missions.figures(end.mission, mission)
+    mission_figures = None if mission is None else missions.figures(end.mission, mission)
     lengths = np.diff([0, *timing.windows, ticks])[:, None, None]
     return FleetResult(
         jnp.sqrt(jnp.sum(end.squares, axis=0) / ticks),
         end.max,
         end.travel / ((ticks - 1) * period),
         ~end.bounded,
-        of_mission,
+        mission_figures,
         jnp.sqrt(end.squares / lengths),
     )
 
@@ -551,11 +553,11 @@ def _advance_once(
     segments: Segments,
     k: int,
     fleet: Fleet,
-    of: Vehicle,
+    vehicle: Vehicle,
     mission: Mission | None,
     timing: Timing,
 ) -> LoopState:
-    return _advance(now, command, jax.tree.map(lambda values: values[k], segments), fleet, of, mission, timing)
+    return _advance(now, command, jax.tree.map(lambda values: values[k], segments), fleet, vehicle, mission, timing)
 
 
 def _at(t: Array, fleet: Fleet) -> Fleet:

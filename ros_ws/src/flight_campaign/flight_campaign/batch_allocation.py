@@ -14,7 +14,7 @@ from rise_di_controller.allocation import HALVINGS, RELAXATION, SMALL, SWEEPS, A
 from rise_di_controller.saturation import Limits, bounds
 
 
-def of_fleet(params: Allocation) -> Allocation:
+def with_column_limits(params: Allocation) -> Allocation:
     """The parameters with limits of shape (p, 1)."""
     return params._replace(limits=Limits(*(values[:, None] for values in params.limits)))
 
@@ -35,48 +35,48 @@ class _Range(NamedTuple):
 
 def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[Array, Array]:
     """U (p, N) inside its limits for a demanded v (m, N), and the v that u gives."""
-    within = _Range(*bounds(u_before, dt, params.limits))
+    rate_range = _Range(*bounds(u_before, dt, params.limits))
     stops = _Range(*(0.0 * u_before + end for end in (params.limits.lower, params.limits.upper)))
     u = product(params.T, v)
-    free = within.has(u)
+    free = rate_range.has(u)
 
     def at_limits() -> tuple[Array, Array]:
         passed = _exchanged(u, stops, params)
         target = _where_not(stops.has(passed) | free, passed, lambda: _by_priority(jnp.zeros_like(u), v, stops, params))
 
         def at_rate() -> Array:
-            start = within.clip(u_before)
-            moved = _by_priority(start, product(params.effect, target - start), within, params)
-            return _towards(moved, product(params.exchange, target - moved), within, params)
+            start = rate_range.clip(u_before)
+            moved = _by_priority(start, product(params.effect, target - start), rate_range, params)
+            return _towards(moved, product(params.exchange, target - moved), rate_range, params)
 
-        given = jnp.where(free, u, _where_not(within.has(target) | free, target, at_rate))
-        return given, jnp.where(free, v, product(params.effect, given))
+        limited_u = jnp.where(free, u, _where_not(rate_range.has(target) | free, target, at_rate))
+        return limited_u, jnp.where(free, v, product(params.effect, limited_u))
 
     return jax.lax.cond(jnp.all(free), lambda: (u, v), at_limits)
 
 
-def _where_not(done: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """The value of the aircraft that are done; the others, if any, get `otherwise`."""
-    return jax.lax.cond(jnp.all(done), lambda: value, lambda: jnp.where(done, value, otherwise()))
+def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
+    """The value of the aircraft where it is final; the others, if any, get `otherwise`."""
+    return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 
-def _by_priority(start: Array, v: Array, within: _Range, params: Allocation) -> Array:
+def _by_priority(start: Array, v: Array, limits: _Range, params: Allocation) -> Array:
     """U after the effectors of each input of the law in the order of priority."""
     order = jnp.array(params.order)
     moves = params.T.T[order][:, :, None] * v[order][:, None]
-    return jax.lax.scan(lambda u, move: (_towards(u, move, within, params), None), start, moves)[0]
+    return jax.lax.scan(lambda u, move: (_towards(u, move, limits, params), None), start, moves)[0]
 
 
-def _towards(u: Array, move: Array, within: _Range, params: Allocation) -> Array:
+def _towards(u: Array, move: Array, limits: _Range, params: Allocation) -> Array:
     """U after a move as far as the limits let it, from a u inside."""
-    whole = _exchanged(u + move, within, params)
-    arrives = within.has(whole)
+    moved = _exchanged(u + move, limits, params)
+    arrives = limits.has(moved)
 
     def partly() -> Array:
         def halve(_: int, now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
             reached, target, part, size = now
-            halfway = _exchanged(u + (part + 0.5 * size) * move, within, params)
-            fits = within.has(halfway)
+            halfway = _exchanged(u + (part + 0.5 * size) * move, limits, params)
+            fits = limits.has(halfway)
             return (
                 jnp.where(fits, halfway, reached),
                 jnp.where(fits, target, halfway),
@@ -85,26 +85,26 @@ def _towards(u: Array, move: Array, within: _Range, params: Allocation) -> Array
             )
 
         none = 0.0 * u[0]
-        reached, target, _, _ = jax.lax.fori_loop(0, HALVINGS, halve, (u, whole, none, none + 1.0))
+        reached, target, _, _ = jax.lax.fori_loop(0, HALVINGS, halve, (u, moved, none, none + 1.0))
         step = target - reached
-        room = jnp.where(step > 0.0, within.high - reached, within.low - reached)
-        beyond = jnp.abs(step) > jnp.abs(room)
-        last = jnp.min(jnp.where(beyond, room, 1.0) / jnp.where(beyond, step, 1.0), axis=0, initial=1.0)
-        return within.clip(reached + last * step)
+        room = jnp.where(step > 0.0, limits.high - reached, limits.low - reached)
+        passes = jnp.abs(step) > jnp.abs(room)
+        last = jnp.min(jnp.where(passes, room, 1.0) / jnp.where(passes, step, 1.0), axis=0, initial=1.0)
+        return limits.clip(reached + last * step)
 
-    return _where_not(arrives, whole, partly)
+    return _where_not(arrives, moved, partly)
 
 
-def _exchanged(u: Array, within: _Range, params: Allocation) -> Array:
+def _exchanged(u: Array, limits: _Range, params: Allocation) -> Array:
     """U with the same effect, inside its limits where the sweeps find such a u."""
     exchange = params.exchange
 
     def sweep(now: tuple[int, Array]) -> tuple[int, Array]:
         number, moved = now
         for j in range(len(exchange)):
-            excess = moved[j] - jnp.minimum(jnp.maximum(moved[j], within.low[j]), within.high[j])
+            excess = moved[j] - jnp.minimum(jnp.maximum(moved[j], limits.low[j]), limits.high[j])
             part = jnp.where(jnp.abs(exchange[j, j]) > SMALL, RELAXATION * excess / exchange[j, j], 0.0)
             moved = moved - exchange[:, j][:, None] * part
         return number + 1, moved
 
-    return jax.lax.while_loop(lambda now: (now[0] < SWEEPS) & ~jnp.all(within.has(now[1])), sweep, (0, u))[1]
+    return jax.lax.while_loop(lambda now: (now[0] < SWEEPS) & ~jnp.all(limits.has(now[1])), sweep, (0, u))[1]

@@ -111,12 +111,12 @@ def build_course(scenario: Scenario) -> Course:
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     used = np.maximum(np.arange(ticks) - late, 0)
-    wind, other = _forcing(ticks, steps, plant)
+    wind, timed = _forcing(ticks, steps, plant)
     axes = np.flatnonzero(wind.over_step.any(axis=0))
-    _, sizes, rows = np.linalg.svd(other.over_step, full_matrices=False)
+    _, sizes, rows = np.linalg.svd(timed.over_step, full_matrices=False)
     basis = rows[sizes > 1e-12 * max(sizes[0], 1e-300)].T
     over_step, now = (
-        np.concatenate([blowing[:, axes], rest @ basis], axis=1) for blowing, rest in zip(wind, other, strict=True)
+        np.concatenate([blowing[:, axes], forcing @ basis], axis=1) for blowing, forcing in zip(wind, timed, strict=True)
     )
     guard = controller.guard()
     u_ff, x_m = _feedforward(guard.nominal, phase, dt, y_m[used])
@@ -199,7 +199,7 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
     """The wind along the G axes, m/s, and f_time without wind, n rows of x_dot."""
     no_effect = np.zeros_like(plant.aircraft.gust_direction)
     forced = plant_model.forcing(0, ticks * steps, plant._replace(aircraft=plant.aircraft._replace(gust_direction=no_effect)))
-    wind, other = (
+    wind, timed = (
         # Simpson's rule, as in Runge-Kutta
         _Forcing((part[:-1:2] + 4.0 * part[1::2] + part[2::2]) / 6.0, part[: -1 : 2 * steps])
         for part in forced
@@ -212,7 +212,7 @@ def _forcing(ticks: int, steps: int, plant: PlantParams) -> tuple[_Forcing, _For
             turbulent[k] = turbulence.wind(z, air)
             z = turbulence.step(z, normals[k], air)
         wind = _Forcing(wind.over_step + turbulent, wind.at_tick + turbulent[::steps])
-    return wind, other
+    return wind, timed
 
 
 def _air_angles(wind: FloatArray, airframe: Airframe) -> FloatArray:

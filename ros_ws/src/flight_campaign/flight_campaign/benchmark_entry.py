@@ -81,10 +81,10 @@ def entered(entry: BenchmarkEntry, task: Task) -> ControllerConfig | Step | None
         require(law is None or callable(law), entry.name, law, "a section `controller`, a function of t, y, y_m, or None")
         return law
     controller = AnyLaw.validate_mapping({**task.controller, **law}, f"{entry.name}: controller")
-    given = AnyLaw.validate_mapping({**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name)
+    framed = AnyLaw.validate_mapping({**task.controller, **law, **{key: task.controller[key] for key in FIXED}}, entry.name)
     for key in FIXED:
         value = getattr(controller, key)
-        expected = getattr(given, key)
+        expected = getattr(framed, key)
         require(value == expected, f"{entry.name}: controller.{key}", value, f"{expected}, as every law of {task.set} has it")
     return controller
 
@@ -125,8 +125,8 @@ def find_entry(
     if first in REGISTERED:
         require(len(words) == 1, "ENTRY", " ".join(words), "one law, or scenarios alone")
         law = LAWS[first]
-        own = _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
-        return BenchmarkEntry(name or first, sees or law.measurements, knows or law.model_data, *own)
+        tuned = _of_airframes({TUNED_FOR: _tuned(first, find(TUNED_IN))})
+        return BenchmarkEntry(name or first, sees or law.measurements, knows or law.model_data, *tuned)
     scenarios = [find(word) for word in words]
     by_airframe = {scenario.aircraft.airframe: scenario.controller for scenario in scenarios}
     require(len(by_airframe) == len(words), "ENTRY", " ".join(words), "one scenario for each airframe")
@@ -171,9 +171,9 @@ def _function(text: str) -> tuple[Enter, str]:
     return function, hashlib.sha256(_source(function)).hexdigest()
 
 
-def _source(of: Any) -> bytes:
+def _source(entry: Any) -> bytes:
     """The source of the module of a function or a class."""
     try:
-        return Path(str(inspect.getsourcefile(of))).read_bytes()
+        return Path(str(inspect.getsourcefile(entry))).read_bytes()
     except (OSError, TypeError):
         return b""

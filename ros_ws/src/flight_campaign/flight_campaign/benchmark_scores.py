@@ -59,9 +59,9 @@ class Definition(Config):
 
     def jobs(self) -> Iterator[Job]:
         """The chunks, each (number of the set, chunk)."""
-        for number, (name, of) in enumerate(SETS.items()):
+        for number, (name, flight_set) in enumerate(SETS.items()):
             if name not in self.not_flown:
-                yield from ((number, chunk) for chunk in range(-(-of.aircraft(self.aircraft) // CHUNK)))
+                yield from ((number, chunk) for chunk in range(-(-flight_set.aircraft(self.aircraft) // CHUNK)))
 
     def size(self, job: Job) -> int:
         """Number of aircraft of a chunk."""
@@ -119,14 +119,19 @@ class Benchmark:
 
     def scores(self) -> dict[str, Any]:
         """The scores of all sets, and their file."""
-        of = self.definition
+        definition = self.definition
         scored = {name: self._scores(number, name) for number, name in enumerate(SETS)}
-        benchmark = {"version": of.version, "digest": of.digest, "release": of.release, "aircraft": of.aircraft}
-        entry = {"name": of.entry, "sees": of.sees, "knows": of.knows, "source": of.source}
-        found = {"benchmark": benchmark, "entry": entry, "stack": of.stack, "sets": scored}
+        benchmark = {
+            "version": definition.version,
+            "digest": definition.digest,
+            "release": definition.release,
+            "aircraft": definition.aircraft,
+        }
+        entry = {"name": definition.entry, "sees": definition.sees, "knows": definition.knows, "source": definition.source}
+        scores = {"benchmark": benchmark, "entry": entry, "stack": definition.stack, "sets": scored}
         with writing("--output", self.folder, "a folder that can"):
-            write_file(self.folder / SCORES, json.dumps(found, indent=1, allow_nan=False) + "\n")
-        return found
+            write_file(self.folder / SCORES, json.dumps(scores, indent=1, allow_nan=False) + "\n")
+        return scores
 
     def _scores(self, number: int, name: str) -> dict[str, Any]:
         import polars as pl  # noqa: PLC0415 - some tenths of a second
@@ -198,53 +203,53 @@ class Flights:
         return encode(_fly_fleet(self.entry, prepared, seed, first, size), seed, 1.0)
 
 
-def _fly_fleet(entry: BenchmarkEntry, of: _Prepared, seed: int, first: int, size: int) -> Chunk:
+def _fly_fleet(entry: BenchmarkEntry, prepared: _Prepared, seed: int, first: int, size: int) -> Chunk:
     """Fly uncertain aircraft first, first + 1, ..., as in a campaign."""
-    scenario = of.scenario
-    course = of.course
+    scenario = prepared.scenario
+    course = prepared.course
     assert course is not None  # noqa: S101 - for the type checker
     airframe = load_airframe(scenario.aircraft.airframe)
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
     directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
-    late = round(SETS[of.task.set].late / course.period)
+    late = round(SETS[prepared.task.set].late / course.period)
     aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
     vehicle = batch.vehicle(scenario)
-    if isinstance(of.law, ControllerConfig):
-        law = of.law.tuned_law()
+    if isinstance(prepared.law, ControllerConfig):
+        law = prepared.law.tuned_law()
         params = batch.shared(law.params)
-        result = batch.fly(aircraft, vehicle, course, law.control_law, params, of.mission, of.windows)
+        result = batch.fly(aircraft, vehicle, course, law.control_law, params, prepared.mission, prepared.windows)
     else:
-        result = _stepped(Stepper(aircraft, vehicle, course, of.mission, of.windows), entry, of, size)
-    return Chunk(first, np.asarray(result.diverged), _figures(result, of), {})
+        result = _stepped(Stepper(aircraft, vehicle, course, prepared.mission, prepared.windows), entry, prepared, size)
+    return Chunk(first, np.asarray(result.diverged), _figures(result, prepared), {})
 
 
-def _stepped(flights: Stepper, entry: BenchmarkEntry, of: _Prepared, size: int) -> FleetResult:
+def _stepped(flights: Stepper, entry: BenchmarkEntry, prepared: _Prepared, size: int) -> FleetResult:
     """Fly a function, one for each aircraft. That of a diverged aircraft is not called any more."""
-    steps = [entered(entry, of.task) for _ in range(size)]
-    u = np.zeros((len(of.task.inputs), size))
+    steps = [entered(entry, prepared.task) for _ in range(size)]
+    u = np.zeros((len(prepared.task.inputs), size))
     for _ in range(flights.ticks):
         y, y_m = flights.sense()
         bounded = flights.bounded
         t = flights.t
         for k, step in enumerate(steps):
             if bounded[k] and callable(step):
-                u[:, k] = stepped(step, t, y[:, k], y_m[:, k], of.task)
+                u[:, k] = stepped(step, t, y[:, k], y_m[:, k], prepared.task)
         flights.advance(u)
     return flights.result()
 
 
-def _figures(result: FleetResult, of: _Prepared) -> dict[str, FloatArray]:
+def _figures(result: FleetResult, prepared: _Prepared) -> dict[str, FloatArray]:
     """Figures by name, (N,) each, SI; the score of a window has the name "score.30-60"."""
-    outputs = of.task.outputs
-    inputs = of.task.inputs
-    unit = score_units(outputs, of.scenario.aircraft.channels().outputs)
+    outputs = prepared.task.outputs
+    inputs = prepared.task.inputs
+    unit = score_units(outputs, prepared.scenario.aircraft.channels().outputs)
     if result.mission is None:
         figures = {"score": score(np.asarray(result.rms), unit)}
     else:
         figures = {name: np.asarray(values) for name, values in result.mission.items()}
     for kind, names, values in (("rms", outputs, result.rms), ("slew", inputs, result.slew)):
         figures |= {f"{kind}.{name}": row for name, row in zip(names, np.asarray(values), strict=True)}
-    edges = (0.0, *SETS[of.task.set].edges, of.scenario.flight.duration)
+    edges = (0.0, *SETS[prepared.task.set].edges, prepared.scenario.flight.duration)
     if len(edges) > 2:  # more than one window
         for begin, end, rms in zip(edges, edges[1:], np.asarray(result.windows), strict=False):
             figures[f"score.{begin:g}-{end:g}"] = score(rms, unit)
@@ -270,20 +275,20 @@ class _FunctionController(Controller):
         return ControlOutput(y.stamp_ns, u, inputs, lambda: np.zeros(0))
 
 
-def _fly_alone(entry: BenchmarkEntry, of: _Prepared) -> Chunk:
+def _fly_alone(entry: BenchmarkEntry, prepared: _Prepared) -> Chunk:
     """Fly the aircraft of the scenario in one process."""
-    law = of.law if isinstance(of.law, ControllerConfig) else entered(entry, of.task)
+    law = prepared.law if isinstance(prepared.law, ControllerConfig) else entered(entry, prepared.task)
     if isinstance(law, ControllerConfig) or law is None:
-        tape = simulate(of.scenario)
+        tape = simulate(prepared.scenario)
     else:
-        tape = simulate(of.scenario, control=partial(_FunctionController, step=law, task=of.task))
+        tape = simulate(prepared.scenario, control=partial(_FunctionController, step=law, task=prepared.task))
     if tape.outcome == INTERRUPTED:
         raise KeyboardInterrupt
     _, e = best_error(tape)
     rms = np.sqrt(np.mean(e.values**2, axis=0))
     u = tape["u"]
-    slew = np.abs(np.diff(u.values, axis=0)).sum(axis=0) / of.scenario.flight.duration
-    unit = score_units(e.names, of.scenario.aircraft.channels().outputs)
+    slew = np.abs(np.diff(u.values, axis=0)).sum(axis=0) / prepared.scenario.flight.duration
+    unit = score_units(e.names, prepared.scenario.aircraft.channels().outputs)
     figures = {"score": score(rms[:, None], unit)}
     for kind, names, values in (("rms", e.names, rms), ("slew", u.names, slew)):
         figures |= {f"{kind}.{name}": np.array([value]) for name, value in zip(names, values, strict=True)}
@@ -308,10 +313,14 @@ def scores_of(rows: "pl.DataFrame") -> dict[str, Any]:
         return {name.removeprefix(kind): float(values(name)[flown].mean()) if flown.any() else None for name in names}
 
     total = counted("score")
-    found: dict[str, Any] = {"aircraft": len(rows), "lost": int((total >= LOSS_OF_TRACK_SCORE).sum())}
-    found |= {"score": {"mean": float(total.mean()), "worst": float(total.max())}, "rms": means("rms."), "slew": means("slew.")}
+    scores: dict[str, Any] = {"aircraft": len(rows), "lost": int((total >= LOSS_OF_TRACK_SCORE).sum())}
+    scores |= {
+        "score": {"mean": float(total.mean()), "worst": float(total.max())},
+        "rms": means("rms."),
+        "slew": means("slew."),
+    }
     names = [name for name in rows.columns if name.startswith("score.")]
     if names:
         windows = {name.removeprefix("score."): float(counted(name).mean()) for name in names}
-        found |= {"over_time": windows, "recovery": windows[AFTER] / windows[BEFORE]}
-    return found
+        scores |= {"over_time": windows, "recovery": windows[AFTER] / windows[BEFORE]}
+    return scores

@@ -65,7 +65,7 @@ SETS: dict[str, FlightSet] = {
     "jsbsim_c172p": FlightSet("c172p of JSBSim, a gust", "jsbsim_c172p", fleet=False),
     "jsbsim_f16": FlightSet("f16 of JSBSim, a gust", "jsbsim_f16", fleet=False),
 }
-SCENARIOS = tuple(sorted({of.scenario for of in SETS.values()}))
+SCENARIOS = tuple(sorted({flight_set.scenario for flight_set in SETS.values()}))
 # windows of the damage with the same commands
 BEFORE = "30-60"
 AFTER = "90-120"
@@ -95,38 +95,38 @@ class Sets:
     def digest(self) -> str:
         """SHA-256 of the sets of this version: sections, frames, airframes, the fixed seeds and the rules of a score."""
         content = {}
-        for name, of in SETS.items():
-            scenario = _flown(name, self._scenarios[of.scenario], "")
+        for name, flight_set in SETS.items():
+            scenario = _flown(name, self._scenarios[flight_set.scenario], "")
             sections = {key: getattr(scenario, key) for key in ("flight", "aircraft", "reference_model", "guidance")}
             content[name] = {
                 **{
                     key: section and section.model_dump(mode="json", exclude_defaults=True) for key, section in sections.items()
                 },
                 "controller": frame(scenario),
-                "airframe": _airframe(scenario) if of.fleet else None,
-                "rules": [UNCERTAINTY, of.late, of.edges, of.divisor, seed_of(name, "", "aircraft")],
+                "airframe": _airframe(scenario) if flight_set.fleet else None,
+                "rules": [UNCERTAINTY, flight_set.late, flight_set.edges, flight_set.divisor, seed_of(name, "", "aircraft")],
             }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _flown(name: str, scenario: Scenario, release: str) -> Scenario:
-    of = SETS[name]
+    flight_set = SETS[name]
     aircraft: dict[str, Any] = {"sensors": scenario.aircraft.sensors.model_dump() | {"seed": seed_of(name, release, "noise")}}
     if scenario.aircraft.turbulence is not None:
         air = scenario.aircraft.turbulence.model_dump() | {"seed": seed_of(name, release, "turbulence")}
         aircraft["turbulence"] = air
-    if of.turbulent:
+    if flight_set.turbulent:
         aircraft |= {"gusts": {}, "turbulence": MODERATE | {"seed": seed_of(name, release, "turbulence")}}
-    if of.damaged:
+    if flight_set.damaged:
         times = [DAMAGE if key in DAMAGED else math.inf for key in scenario.aircraft.channels().inputs]
         aircraft["actuators"] = scenario.aircraft.actuators.model_dump() | {"weak_at": times}
         scenario = scenario.vary(reference_model={"pulses": _repeated(scenario)})
-    if of.fleet:
+    if flight_set.fleet:
         aircraft |= {"rate": RATE, "step": STEP}
         scenario = scenario.vary(aircraft=aircraft, reference_model={"rate": RATE}, controller={"delay": 0.0})
     else:
         scenario = scenario.vary(aircraft=aircraft)
-    return scenario.vary(**of.changes) if of.changes else scenario
+    return scenario.vary(**flight_set.changes) if flight_set.changes else scenario
 
 
 def _repeated(scenario: Scenario) -> dict[str, Any]:

@@ -6,8 +6,9 @@ The folder of a campaign holds its definition, a table for each completed chunk,
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -97,7 +98,7 @@ class Definition(Config):
     @property
     def spread(self) -> Spread:
         """How the entries of A and B are drawn."""
-        return Spread(equipment.of_matrices(self.entries), self.distribution)
+        return Spread(equipment.matrix_entries(self.entries), self.distribution)
 
     def drawn_equipment(self, scenario: Scenario, first: int, count: int) -> dict[str, FloatArray]:
         """Lags, noise and delays of aircraft of a case, as `equipment.drawn`."""
@@ -123,8 +124,8 @@ class Definition(Config):
         entries = self.spread.entries
         scenario = self.scenario(case)
         uncertainty |= {"entries": [*entries], "parts": [*entries.values()], "distribution": self.distribution}
-        of_equipment = self.drawn_equipment(scenario, number, 1)
-        equipped = equipment.with_equipment(scenario, {name: float(value[0]) for name, value in of_equipment.items()})
+        drawn = self.drawn_equipment(scenario, number, 1)
+        equipped = equipment.with_equipment(scenario, {name: float(value[0]) for name, value in drawn.items()})
         return equipped.vary(aircraft={"uncertainty": uncertainty})
 
     @property
@@ -147,13 +148,13 @@ class Definition(Config):
     def jobs(self) -> Iterator[Job]:
         """The chunks, each (case, chunk)."""
         chunks = -(-self.aircraft // self.chunk)
-        return ((case, chunk) for case in range(self.cases) for chunk in range(chunks))
+        return product(range(self.cases), range(chunks))
 
 
 def swept_parameters(controller: ControllerConfig) -> list[str]:
     """Parameters that a sweep may multiply: the numbers of the law itself, and input_scale."""
-    own = [name for name in type(controller).model_fields if name not in ControllerConfig.model_fields]
-    values = ((name, np.atleast_1d(getattr(controller, name))) for name in own)
+    names = [name for name in type(controller).model_fields if name not in ControllerConfig.model_fields]
+    values = ((name, np.atleast_1d(getattr(controller, name))) for name in names)
     return [*(name for name, value in values if value.dtype == np.float64), "input_scale"]
 
 
@@ -189,15 +190,20 @@ def define(
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
     outputs = scenario.controller.outputs
-    own = dict(units or {})
-    for name, unit in own.items():
+    stated_units = dict(units or {})
+    for name, unit in stated_units.items():
         require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
         require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
-    require(scenario.guidance is None or not own, "score", "a unit", "none: the score of a mission is its cross-track error")
+    require(
+        scenario.guidance is None or not stated_units,
+        "score",
+        "a unit",
+        "none: the score of a mission is its cross-track error",
+    )
     if scenario.guidance is None:
-        score_units(outputs, scenario.aircraft.channels().outputs, own)
-    of_airframe = spread._replace(entries=equipment.of_matrices(spread.entries))
-    sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, of_airframe)
+        score_units(outputs, scenario.aircraft.channels().outputs, stated_units)
+    airframe_spread = spread._replace(entries=equipment.matrix_entries(spread.entries))
+    sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, airframe_spread)
     values = {
         "name": scenario.name,
         "sections": {
@@ -211,7 +217,7 @@ def define(
         "sweep": sweep,
         "entries": dict(spread.entries),
         "distribution": spread.distribution,
-        "score_units": own,
+        "score_units": stated_units,
     }
     definition = Definition.validate_mapping(values, "campaign")
     for case in range(definition.cases):
@@ -233,8 +239,8 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
     except (MemoryError, RuntimeError) as error:  # RuntimeError: of JAX
         if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
             raise
-        found = f"{definition.chunk} aircraft at once, which need more memory than there is"
-        raise ParameterError(f"--chunk: found {found}, expected fewer, or shorter delays of the aircraft") from None
+        demand = f"{definition.chunk} aircraft at once, which need more memory than there is"
+        raise ParameterError(f"--chunk: found {demand}, expected fewer, or shorter delays of the aircraft") from None
     return encode(figures, definition.seed, definition.factor(job[0]))
 
 
@@ -270,6 +276,15 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     return Chunk(first, np.asarray(result.diverged)[:count], figures, entries)
 
 
+def _by_channel(flights: Sequence[learning_flights.Flight], kind: str) -> dict[str, FloatArray]:
+    """A figure of the flights by channel, (N,) each."""
+    values = [getattr(flight, kind) for flight in flights]
+    by_channel = {}
+    for name in values[0]:
+        by_channel[name] = np.array([by_name[name] for by_name in values])
+    return by_channel
+
+
 def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chunk:
     """Fly a chunk of a campaign with learners, one aircraft after another."""
     case, chunk = job
@@ -282,11 +297,11 @@ def fly_learning(definition: Definition, job: Job, learner: MakeLearner) -> Chun
     entries = drawn_entries(airframe, A, B) | definition.drawn_equipment(scenario, first, count)
     flown = [learning_flights.fly(definition.aircraft_scenario(first + k, case), learner) for k in range(count)]
     outputs = scenario.controller.outputs
-    rms = np.array([[flight.rms[name] for flight in flown] for name in outputs])
+    by_kind = {kind: _by_channel(flown, kind) for kind in ("rms", "max", "slew")}
+    rms = np.array([by_kind["rms"][name] for name in outputs])
     figures = {"score": score(rms, score_units(outputs, scenario.aircraft.channels().outputs, definition.score_units))}
-    for kind in ("rms", "max", "slew"):
-        values = [getattr(flight, kind) for flight in flown]
-        figures |= {f"{kind}.{name}": np.array([of[name] for of in values]) for name in values[0]}
+    for kind, by_channel in by_kind.items():
+        figures |= {f"{kind}.{name}": values for name, values in by_channel.items()}
     for name in LearningOutcome._fields:
         figures[name] = np.array([float(getattr(flight.learned, name)) for flight in flown])
     return Chunk(first, np.array([flight.diverged for flight in flown]), figures, entries)
@@ -374,10 +389,12 @@ class Campaign:
 
     def margins(self, case: int) -> LoopMargins | None:
         """Margins of the nominal aircraft and the worst of the first MARGIN_AIRCRAFT of a case; None without a linear loop."""
-        of = self.definition
+        definition = self.definition
         scenario = self.definition.scenario(case)
         try:
-            return margins(scenario, min(of.aircraft, MARGIN_AIRCRAFT), of.uncertainty, of.seed, of.spread)
+            return margins(
+                scenario, min(definition.aircraft, MARGIN_AIRCRAFT), definition.uncertainty, definition.seed, definition.spread
+            )
         except ParameterError:
             return None
 

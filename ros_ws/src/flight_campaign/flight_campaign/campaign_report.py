@@ -5,6 +5,7 @@
 import json
 import shlex
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,9 @@ def write_results(campaign: Campaign) -> tuple[dict[str, Any], Table]:
     with writing("", campaign.folder, "a folder and a disk that can"):
         cases = [
             {"factor": definition.factor(case), **tally.summary(), "fly_again": _write_worst(campaign, case, tally)}
-            | {"margins": None if of_loop is None else margins_as_json(of_loop)}
+            | {"margins": None if loop_margins is None else margins_as_json(loop_margins)}
             | {"influence": _influence(campaign, case, tally)}
-            for case, (tally, of_loop) in enumerate(zip(tallies, margins, strict=True))
+            for case, (tally, loop_margins) in enumerate(zip(tallies, margins, strict=True))
         ]
         figures = {
             "scenario": definition.name,
@@ -99,20 +100,20 @@ def _influence(campaign: Campaign, case: int, tally: Tally) -> dict[str, Any]:
     """Rank correlations of a case; writes the airframe and the scenario of the worst corner where there is one."""
     definition = campaign.definition
     ranked = campaign.influence(case, tally.worst[0].number)
-    corner = {of["entry"]: of["worst_corner"] for of in ranked["entries"] if of["worst_corner"]}
+    corner = {entry["entry"]: entry["worst_corner"] for entry in ranked["entries"] if entry["worst_corner"]}
     if not corner:
         return ranked | {"command": None}
     scenario = definition.scenario(case)
     path = _path(campaign, case, "corner")
     airframe = path.with_name("corner_airframe.yaml" if definition.sweep is None else f"corner_airframe_{case}.yaml").absolute()
     known = equipment.references(scenario, definition.entries)
-    of_equipment = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
-    of_matrices = {name: part for name, part in corner.items() if name not in known}
-    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), of_matrices, definition.wind)))
+    equipment_parts = {name: known[name] * (1.0 + part) for name, part in corner.items() if name in known}
+    matrix_parts = {name: part for name, part in corner.items() if name not in known}
+    write_file(airframe, as_yaml(with_entries(load_airframe(scenario.aircraft.airframe), matrix_parts, definition.wind)))
     learn = getattr(scenario.controller, "learn", None)
     if learn is not None and learn.prior is None:  # the learner begins with the airframe, not with the corner
         scenario = scenario.vary(controller={"learn": {"prior": scenario.aircraft.airframe}})
-    cornered = equipment.with_equipment(scenario, of_equipment).vary(aircraft={"airframe": str(airframe)})
+    cornered = equipment.with_equipment(scenario, equipment_parts).vary(aircraft={"airframe": str(airframe)})
     write_file(path, scenario_yaml(cornered))
     return ranked | {"command": _command(path)}
 
@@ -170,11 +171,13 @@ def write_page(
 def overview(definition: Definition, tallies: Sequence[Tally], margins: Sequence[LoopMargins | None]) -> Table:
     """Scores, lost aircraft and margins, a column for each case."""
     columns = []
-    for tally, of_loop in zip(tallies, margins, strict=True):
+    for tally, loop_margins in zip(tallies, margins, strict=True):
         score = tally.figures.get("score", Figure())
         lost = tally.lost + tally.diverged
         worst = "diverged" if tally.diverged else f"{score.largest:.3g}"
-        columns.append([f"{score.mean:.3g}", worst, f"{100.0 * lost / max(tally.flights, 1):.3g}", *least_margins(of_loop)])
+        columns.append(
+            [f"{score.mean:.3g}", worst, f"{100.0 * lost / max(tally.flights, 1):.3g}", *least_margins(loop_margins)]
+        )
     names = ("score, mean", "score, worst", "lost or diverged, %", *LEAST_MARGINS)
     rows = [[name, *cells] for name, *cells in zip(names, *columns, strict=True)]
     return Table("Score and margins", [Column("", label) for label in _labels(definition)], rows, OVERVIEW_LEGEND)
@@ -188,13 +191,13 @@ def _spread_of_entries(definition: Definition) -> str:
     return "".join(f", {part}" for part in parts)
 
 
-def score_meaning(scenario: Scenario, own: Mapping[str, float] | None = None) -> str:
-    """What the score of a campaign counts, with own units by output, SI."""
+def score_meaning(scenario: Scenario, score_units: Mapping[str, float] | None = None) -> str:
+    """What the score of a campaign counts; `score_units` replaces usual units by output, SI."""
     if scenario.guidance is not None:
         half = CAPTURE_TIME * scenario.aircraft.channels().speed
         return f"the largest cross-track error on the route in {half:g} m, {CAPTURE_TIME:g} s of flight at the trim speed"
     units = display_units(scenario)
-    stated = [f"{name} {unit * units[name].factor:g} {units[name].unit}" for name, unit in (own or {}).items()]
+    stated = [f"{name} {unit * units[name].factor:g} {units[name].unit}" for name, unit in (score_units or {}).items()]
     return f"the sum over the channels of rms error in {', '.join([*stated, '10 mrad/s (p: 20) and 0.1 m/s'])}"
 
 
@@ -203,13 +206,17 @@ def _labels(definition: Definition) -> list[str]:
 
 
 def _ends(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
-    columns = [Column(word, head) for word in ("diverged", "loss of track") for head in ("aircraft", "%", "95 % interval")]
+    columns = [Column(*pair) for pair in product(("diverged", "loss of track"), ("aircraft", "%", "95 % interval"))]
     rows = []
     for label, case in zip(labels, cases, strict=True):
         row = [label]
         for word in ("diverged", "lost"):
-            of = case[word]
-            row += [str(of["count"]), f"{100 * of['share']:.3g}", f"{100 * of['low']:.2g} to {100 * of['high']:.2g}"]
+            outcome = case[word]
+            row += [
+                str(outcome["count"]),
+                f"{100 * outcome['share']:.3g}",
+                f"{100 * outcome['low']:.2g} to {100 * outcome['high']:.2g}",
+            ]
         rows.append(row)
     return Table("Outcomes", columns, rows)
 
@@ -245,11 +252,11 @@ def _label(name: str, units: Mapping[str, DisplayUnit]) -> tuple[str, float]:
 
 def _worst(labels: Sequence[str], cases: Sequence[Mapping[str, Any]]) -> Table:
     columns = [Column("", head) for head in ("aircraft", "score", "fly it again")]
-    rows = [
-        [label, str(flight["number"]), "diverged" if flight["score"] is None else f"{flight['score']:.3g}", flight["command"]]
-        for label, case in zip(labels, cases, strict=True)
-        for flight in case["fly_again"]
-    ]
+    rows = []
+    for label, case in zip(labels, cases, strict=True):
+        for flight in case["fly_again"]:
+            score = "diverged" if flight["score"] is None else f"{flight['score']:.3g}"
+            rows.append([label, str(flight["number"]), score, flight["command"]])
     return Table("Worst flights", columns, rows, "--lockstep in place of --in-process flies it over ROS 2 topics")
 
 
@@ -257,8 +264,13 @@ def influence_table(label: str, case: Mapping[str, Any]) -> Table:
     """The drawn entries whose size goes most with the score, of a case of the summary."""
     ranked = case["influence"]
     rows = [
-        [of["entry"], f"{of['rank_correlation']:+.2f}", f"{100 * of['worst_aircraft']:+.0f} %", _corner(of["worst_corner"])]
-        for of in ranked["entries"][:ENTRIES_SHOWN]
+        [
+            entry["entry"],
+            f"{entry['rank_correlation']:+.2f}",
+            f"{100 * entry['worst_aircraft']:+.0f} %",
+            _corner(entry["worst_corner"]),
+        ]
+        for entry in ranked["entries"][:ENTRIES_SHOWN]
     ]
     legend = (
         f"rank correlation (Spearman, {ranked['aircraft']} aircraft) of the size of the entry with the score: above 0 larger"
@@ -321,7 +333,8 @@ def _sweep(definition: Definition, tallies: Sequence[Tally]) -> plotting.Figure 
     figure = plotting.Figure(1, 1, 260)
     scores = [tally.figures["score"] for tally in tallies]
     curves = {"mean": [score.mean for score in scores]}
-    curves |= {label: [score.quantile(share) for score in scores] for label, share in SPREAD.items()}
+    for label, share in SPREAD.items():
+        curves[label] = [score.quantile(share) for score in scores]
     curves["worst"] = [score.largest for score in scores]
     for (label, values), colour in zip(curves.items(), COLOURS, strict=True):
         look = {"type": "scatter", "mode": "lines+markers", "name": label, "line": {"color": colour}}

@@ -40,8 +40,8 @@ def threads(workers: int | None = None) -> Engine:
         try:
             underway: dict[Future[Any], Job] = {pool.submit(work, job): job for job in islice(waiting, AHEAD * count)}
             while underway:
-                done, _ = wait(underway, return_when=FIRST_COMPLETED)
-                for future in done:
+                finished, _ = wait(underway, return_when=FIRST_COMPLETED)
+                for future in finished:
                     job = underway.pop(future)
                     underway.update((pool.submit(work, following), following) for following in islice(waiting, 1))
                     yield job, future.result()
@@ -83,21 +83,21 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                 try:
                     for job in [*lost, *islice(waiting, max(ahead - len(lost), 0))]:
                         underway[client.submit(work, job, pure=False)] = job  # never a cached result
-                    done = as_completed(list(underway))
-                    for future in done:
+                    finished = as_completed(list(underway))
+                    for future in finished:
                         result = future.result()
                         job = underway.pop(future)
                         for following in islice(waiting, 1):
                             more = client.submit(work, following, pure=False)
                             underway[more] = following
-                            done.add(more)
+                            finished.add(more)
                         yield job, result
                 except (CancelledError, CommClosedError):
                     lost = list(underway.values())
                     patience = RECONNECT
                 except KilledWorker as error:
-                    found = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
-                    raise ParameterError(f"--engine dask: found {found}, expected a smaller --chunk") from None
+                    failure = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
+                    raise ParameterError(f"--engine dask: found {failure}, expected a smaller --chunk") from None
                 else:
                     return
 

@@ -27,7 +27,7 @@ def is_of_equipment(entry: str) -> bool:
     return entry.partition("[")[0] in KINDS
 
 
-def of_matrices(entries: Mapping[str, float]) -> dict[str, float]:
+def matrix_entries(entries: Mapping[str, float]) -> dict[str, float]:
     """The entries of A and B alone."""
     return {name: part for name, part in entries.items() if not is_of_equipment(name)}
 
@@ -37,12 +37,10 @@ def published(scenario: Scenario) -> dict[str, float]:
     aircraft = scenario.aircraft
     channels = scenario.aircraft.channels()
     named = (("lag", channels.inputs, aircraft.actuators.lag), ("noise", channels.outputs, aircraft.sensors.noise))
-    return {
-        f"{kind}[{name}]": value
-        for kind, names, values in named
-        for name, value in zip(names, values, strict=False)
-        if value > 0.0
-    }
+    above: dict[str, float] = {}
+    for kind, names, values in named:
+        above |= {f"{kind}[{name}]": value for name, value in zip(names, values, strict=False) if value > 0.0}
+    return above
 
 
 def expanded(entries: Mapping[str, float], scenario: Scenario) -> dict[str, float]:

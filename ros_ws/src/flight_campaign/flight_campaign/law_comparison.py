@@ -68,14 +68,16 @@ def compare(
     """
     airframe, _ = benchmark.scenario.aircraft.load()
     sampled = [nominal_and_sampled(airframe, level, aircraft, seed) for level in levels]
-    A, B = (np.concatenate([sampled[0][k], *(level[k][1:] for level in sampled[1:])]) for k in range(2))
+    A_by_level, B_by_level = zip(*sampled, strict=True)
+    A = _nominal_once(A_by_level)
+    B = _nominal_once(B_by_level)
     in_time = np.arange(len(A))
     parts = np.split(in_time[1:], len(levels))
     first = in_time[1 : 1 + aircraft]
-    of = np.concatenate([in_time, np.tile(first, len(delays))])
+    numbers = np.concatenate([in_time, np.tile(first, len(delays))])
     late = np.concatenate([0 * in_time, np.repeat(np.array(delays, dtype=int), aircraft)])
     flights = {
-        GUST: benchmark_fleet(A[of], B[of], late, GUST, benchmark),
+        GUST: benchmark_fleet(A[numbers], B[numbers], late, GUST, benchmark),
         TURBULENCE: benchmark_fleet(A, B, 0 * in_time, TURBULENCE, benchmark),
     }
 
@@ -91,16 +93,16 @@ def compare(
             }
             scores = {wind: score(flights_flown, benchmark.unit) for wind, flights_flown in flown.items()}
             delayed = scores[GUST][len(in_time) :].reshape(len(delays), aircraft)
+            by_level = []
+            for level, part in zip(levels, parts, strict=True):
+                by_level.append(Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()}))
             law_results.append(
                 LawResult(
                     name,
                     objective,
                     gains.costs,
                     {wind: float(costs[0]) for wind, costs in scores.items()},
-                    tuple(
-                        Level(level, {wind: _scores(costs[part]) for wind, costs in scores.items()})
-                        for level, part in zip(levels, parts, strict=True)
-                    ),
+                    tuple(by_level),
                     {ticks * benchmark.model.period: _lost(costs) for ticks, costs in zip(delays, delayed, strict=True)},
                     np.asarray(flown[GUST].rms)[:, 0],
                     np.asarray(flown[GUST].slew)[:, 0],
@@ -112,6 +114,11 @@ def compare(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for scored in pool.map(results, tuned):
             yield from scored
+
+
+def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
+    """The matrices of all levels after each other, with the nominal aircraft of the first level alone."""
+    return np.concatenate([matrices[0], *(level[1:] for level in matrices[1:])])
 
 
 def score_cells(result: LawResult) -> list[str]:

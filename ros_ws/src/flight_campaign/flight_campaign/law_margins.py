@@ -24,6 +24,6 @@ def nominal_margins(law: Law, gains: Gains, model: NominalModel) -> Margins:
     tuned = TunedLaw(law.control_law(model), law.params(gains, model))
     count = max((gain.shape[-1] for gain in gains.values()), default=1)
     plant = LinearPlant(model.A + model.gravity, model.B, model.C)
-    of_candidates = linear_law(tuned, len(model.lag), model.period, count)
+    candidates = linear_law(tuned, len(model.lag), model.period, count)
     loop = Loop(model.lag, 0.0, model.period)
-    return loop_margins(plant, of_candidates, loop, together=False)
+    return loop_margins(plant, candidates, loop, together=False)

@@ -267,7 +267,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
     speed = modes.true_airspeed(y_of["V"], params)
     position, course = (pose["north"], pose["east"]), jnp.atan2(pose["v_east"], pose["v_north"])
 
-    def at(numbers: Array) -> Legs:
+    def legs_at(numbers: Array) -> Legs:
         return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], mission.legs)
 
     def passed(leg: Legs, place: path.Point) -> Array:
@@ -286,7 +286,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         return path.joined((leg.start[0], leg.start[1]), leg.start_course, leg.near, place, course)
 
     def fly(before: GuidanceState, number: Array, joining: Array, missed: Array) -> MissionState:
-        leg, following, joins_leg = at(number), at(number + 1), joining != 0.0
+        leg, following, joins_leg = legs_at(number), legs_at(number + 1), joining != 0.0
         origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
         line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
         radius = jnp.where(joins_leg, joining, 1.0) * mission.radius
@@ -344,7 +344,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         )
 
     def begin() -> MissionState:
-        return fly(modes.holding(0, pose, speed, params), 0 * state.leg, joins(at(0 * state.leg)), 0.0 * state.missed)
+        return fly(modes.holding(0, pose, speed, params), 0 * state.leg, joins(legs_at(0 * state.leg)), 0.0 * state.missed)
 
     def step() -> MissionState:
         before = modes.holding(0, pose, speed, params)._replace(
@@ -356,12 +356,12 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             u_m=tuple(state.u_m),
             wind=(state.air[0], state.air[1]),
         )
-        leg, joins_leg = at(state.leg), state.joining != 0.0
+        leg, joins_leg = legs_at(state.leg), state.joining != 0.0
         ends = passed(leg, position) & ~joins_leg & (state.fence == 0.0)
         missed = ends & (jnp.hypot(position[0] - leg.end[0], position[1] - leg.end[1]) > leg.near)
         number = jnp.where(ends, state.leg + 1, state.leg)
         still = jnp.where(joins_leg & ~onto(leg, position), state.joining, 0.0)
-        return fly(before, number, jnp.where(ends, joins(at(number)), still), missed)
+        return fly(before, number, jnp.where(ends, joins(legs_at(number)), still), missed)
 
     return jax.lax.switch(action, (lambda: state, begin, step))
 

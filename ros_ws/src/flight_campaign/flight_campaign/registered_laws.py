@@ -25,8 +25,8 @@ from rise_di_controller.rise_di_config import RiseDiConfig
 
 def own_gains(controller: ControllerConfig) -> dict[str, list[float]]:
     """The positive numbers of the law itself by name, without matrices."""
-    own = (name for name in type(controller).model_fields if name not in ControllerConfig.model_fields)
-    values = {name: np.atleast_1d(getattr(controller, name)) for name in own}
+    names = (name for name in type(controller).model_fields if name not in ControllerConfig.model_fields)
+    values = {name: np.atleast_1d(getattr(controller, name)) for name in names}
     return {name: value.tolist() for name, value in values.items() if value.dtype == np.float64 and (value > 0.0).all()}
 
 
@@ -38,8 +38,11 @@ def registered_law(controller: ControllerConfig, name: str) -> Law:
     def params(gains: Gains, model: NominalModel) -> Any:
         count = max(gain.shape[-1] for gain in gains.values()) if gains else 1
         wide = {key: np.broadcast_to(gain, (len(gain), count)) for key, gain in gains.items()}
-        sets = [{key: _value(gain[:, k], key in scalars) for key, gain in wide.items()} for k in range(count)]
-        each = [type(controller).validate_mapping(controller.model_dump() | values, name).tuned_law().params for values in sets]
+        each = []
+        for k in range(count):
+            values = {key: _value(gain[:, k], key in scalars) for key, gain in wide.items()}
+            tuned = type(controller).validate_mapping(controller.model_dump() | values, name).tuned_law()
+            each.append(tuned.params)
         return jax.tree.map(_last, *each)
 
     return Law(
@@ -76,35 +79,40 @@ def find_laws(names: Iterable[str], scenario: Scenario, others: Mapping[str, Sce
     """
     effectors = "none: the laws that are compared command the effectors"
     require(scenario.controller.allocation is None, "controller.allocation", "a section", effectors)
-    found: dict[str, ControllerConfig | None] = {}
+    controllers: dict[str, ControllerConfig | None] = {}
     for name in names:
         if name in others:
-            own = others[name].controller
+            controller = others[name].controller
         elif name in LAWS:
-            found[name] = None
+            controllers[name] = None
             continue
         elif name == scenario.controller.law:
-            own = scenario.controller
+            controller = scenario.controller
         else:
             flown = "the path of a scenario file whose controller flies it" if name in laws.names() else "a scenario file"
             raise ParameterError(f"--laws: found {name!r}, expected laws among {', '.join(LAWS)}, or {flown}")
         for key in ("outputs", "inputs", "rate"):
             expected = getattr(scenario.controller, key)
             require(
-                getattr(own, key) == expected, f"--laws: {name}: {key}", getattr(own, key), f"{expected}, as in {scenario.name}"
+                getattr(controller, key) == expected,
+                f"--laws: {name}: {key}",
+                getattr(controller, key),
+                f"{expected}, as in {scenario.name}",
             )
-        found[name] = own.model_copy(update={"delay": 0.0})  # in a benchmark topics have no delay
-    return found
+        controllers[name] = controller.model_copy(update={"delay": 0.0})  # in a benchmark topics have no delay
+    return controllers
 
 
 def entries(controllers: Mapping[str, ControllerConfig | None]) -> dict[str, Law]:
     """The laws by name: of the catalogue, or of a controller."""
-    return {name: LAWS[name] if own is None else registered_law(own, name) for name, own in controllers.items()}
+    return {
+        name: LAWS[name] if controller is None else registered_law(controller, name) for name, controller in controllers.items()
+    }
 
 
 def with_courses(benchmark: Benchmark, controllers: Mapping[str, ControllerConfig | None]) -> Benchmark:
     """The benchmark with the courses of the feedforwards of these controllers."""
-    courses = {wind: dict(of_wind) for wind, of_wind in benchmark.courses.items()}
+    courses = {wind: dict(by_law) for wind, by_law in benchmark.courses.items()}
     for name, controller in controllers.items():
         if controller is not None and controller.feedforward is not None:
             for wind, scenario in benchmark.scenarios.items():

@@ -57,4 +57,4 @@ def tally_of(table: "pl.DataFrame") -> Tally:
     """Statistics of the rows of a chunk."""
     figures = [name for name in table.columns if name not in {*KEYS, *entry_names(table)}]
     columns = {name: table[name].to_numpy() for name in figures}
-    return Tally.of(table["number"][0], table["diverged"].to_numpy(), columns)
+    return Tally.from_flights(table["number"][0], table["diverged"].to_numpy(), columns)

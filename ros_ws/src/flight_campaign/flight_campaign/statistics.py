@@ -44,8 +44,8 @@ class Figure(Config):
     bins: dict[int, int] = Field(default={})  # counts by index in EDGES, -1 below and len(EDGES) - 1 above; without empty ones
 
     @classmethod
-    def of(cls, values: FloatArray) -> Self:
-        """Of values >= 0, shape (N,); NaN does not count."""
+    def from_values(cls, values: FloatArray) -> Self:
+        """The figure of values >= 0, shape (N,); NaN does not count."""
         values = values[~np.isnan(values)]
         if not len(values):
             return cls()
@@ -56,18 +56,18 @@ class Figure(Config):
         largest = float(np.max(values))
         return cls(count=len(values), mean=mean, squares=squares, largest=largest, bins=bins)
 
-    def __add__(self, other: Self) -> Self:
+    def __add__(self, added: Self) -> Self:
         """The figures together. Source: Chan, Golub, LeVeque, Updating formulae and a pairwise algorithm, 1979."""
-        count = self.count + other.count
+        count = self.count + added.count
         if not count:
             return self
-        gap = other.mean - self.mean
+        gap = added.mean - self.mean
         return type(self)(
             count=count,
-            mean=self.mean + gap * other.count / count,
-            squares=self.squares + other.squares + gap**2 * self.count * other.count / count,
-            largest=max(self.largest, other.largest),
-            bins=dict(sorted((Counter(self.bins) + Counter(other.bins)).items())),
+            mean=self.mean + gap * added.count / count,
+            squares=self.squares + added.squares + gap**2 * self.count * added.count / count,
+            largest=max(self.largest, added.largest),
+            bins=dict(sorted((Counter(self.bins) + Counter(added.bins)).items())),
         )
 
     @property
@@ -107,8 +107,8 @@ class Tally(Config):
     worst: tuple[Worst, ...] = ()  # the worst first
 
     @classmethod
-    def of(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
-        """Of the aircraft first, first + 1, ...; every figure of shape (N,), the "score" included."""
+    def from_flights(cls, first: int, diverged: FloatArray, figures: Mapping[str, FloatArray]) -> Self:
+        """The tally of the aircraft first, first + 1, ...; every figure of shape (N,), the "score" included."""
         bounded = ~np.asarray(diverged, dtype=bool)
         score = np.asarray(figures["score"])
         rank = np.where(bounded, score, np.inf)
@@ -117,18 +117,18 @@ class Tally(Config):
             flights=len(bounded),
             diverged=int((~bounded).sum()),
             lost=int(lost_track(diverged, score).sum()),
-            figures={name: Figure.of(np.asarray(values)[bounded]) for name, values in figures.items()},
+            figures={name: Figure.from_values(np.asarray(values)[bounded]) for name, values in figures.items()},
             worst=tuple(Worst(number=first + int(k), score=float(score[k]) if bounded[k] else None) for k in order),
         )
 
-    def __add__(self, other: Self) -> Self:
-        names = list(self.figures) or list(other.figures)
-        worst = sorted((*self.worst, *other.worst), key=lambda flight: -math.inf if flight.score is None else -flight.score)
+    def __add__(self, added: Self) -> Self:
+        names = list(self.figures) or list(added.figures)
+        worst = sorted((*self.worst, *added.worst), key=lambda flight: -math.inf if flight.score is None else -flight.score)
         return type(self)(
-            flights=self.flights + other.flights,
-            diverged=self.diverged + other.diverged,
-            lost=self.lost + other.lost,
-            figures={name: self.figures.get(name, Figure()) + other.figures.get(name, Figure()) for name in names},
+            flights=self.flights + added.flights,
+            diverged=self.diverged + added.diverged,
+            lost=self.lost + added.lost,
+            figures={name: self.figures.get(name, Figure()) + added.figures.get(name, Figure()) for name in names},
             worst=tuple(worst[:WORST_KEPT]),
         )
 
@@ -138,23 +138,23 @@ class Tally(Config):
 
     def summary(self) -> dict[str, Any]:
         """The statistics as figures of a file, SI."""
-        shares: dict[str, Any] = {} if (without := self.without_model()) is None else {"without_model": without}
+        unmodelled = self.without_model()
+        shares: dict[str, Any] = {} if unmodelled is None else {"without_model": unmodelled}
         for word, count in (("diverged", self.diverged), ("lost", self.lost)):
             share, low, high = self.share(count)
             shares[word] = {"count": count, "share": share, "low": low, "high": high}
-        named = {
-            name: {"mean": of.mean, "deviation": of.deviation, "worst": of.largest}
-            | {f"q{100 * part:g}": of.quantile(part) for part in QUANTILES}
-            for name, of in self.figures.items()
-        }
+        named = {}
+        for name, figure in self.figures.items():
+            quantiles = {f"q{100 * part:g}": figure.quantile(part) for part in QUANTILES}
+            named[name] = {"mean": figure.mean, "deviation": figure.deviation, "worst": figure.largest} | quantiles
         return {"flights": self.flights, **shares, "figures": named, "worst": [flight.model_dump() for flight in self.worst]}
 
-    def share(self, of: int) -> tuple[float, float, float]:
+    def share(self, count: int) -> tuple[float, float, float]:
         """A number of flights as a share, and the 95 % confidence interval (Clopper-Pearson), 0 to 1."""
         from scipy.stats import binomtest  # noqa: PLC0415 - half a second, only for this
 
-        interval = binomtest(of, self.flights).proportion_ci(0.95, method="exact")
-        return of / self.flights, float(interval.low), float(interval.high)
+        interval = binomtest(count, self.flights).proportion_ci(0.95, method="exact")
+        return count / self.flights, float(interval.low), float(interval.high)
 
 
 def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
@@ -162,12 +162,12 @@ def lost_track(diverged: FloatArray, score: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(~np.asarray(diverged, dtype=bool) & (score > LOSS_OF_TRACK_SCORE))
 
 
-def score_units(outputs: Sequence[str], units: Mapping[str, str], own: Mapping[str, float] | None = None) -> FloatArray:
-    """Units of the rms errors of the channels in the score, SI, shape (m,); `own` replaces usual units by output.
+def score_units(outputs: Sequence[str], units: Mapping[str, str], stated: Mapping[str, float] | None = None) -> FloatArray:
+    """Units of the rms errors of the channels in the score, SI, shape (m,); `stated` replaces usual units by output.
 
     Raises ParameterError for an output without a unit in the score.
     """
-    known = SCORE_UNIT_OF | dict(own or {})
+    known = SCORE_UNIT_OF | dict(stated or {})
     for name in outputs:
         counted = name in known or quantity(units[name]).dimension in SCORE_UNIT
         require(counted, "outputs", f"{name} in {units[name]}", "rad/s or m/s, or a unit of the score for this output")

@@ -57,8 +57,8 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
     require_registered(name)
     model = benchmark.model
     base = benchmark.scenario.controller
-    kept = set(ControllerConfig.model_fields) - {"law", "feedforward", "observer"}
-    values = {key: value for key, value in base.model_dump(exclude_none=True).items() if key in kept}
+    shared = set(ControllerConfig.model_fields) - {"law", "feedforward", "observer"}
+    values = {key: value for key, value in base.model_dump(exclude_none=True).items() if key in shared}
     values |= {"law": REGISTERED[name], "input_scale": model.input_scale.tolist(), "D": [int(sign) for sign in model.D]}
     feedforward = _feedforward(name, benchmark)
     if feedforward is not None:
@@ -67,8 +67,8 @@ def tuned_controller(name: str, tuned: TuningResult, benchmark: Benchmark) -> Co
         values["observer"] = _observer(name, tuned, benchmark).model_dump()
     gains = as_gains(tuned)
     if REGISTERED[name] == "rise_di":
-        of_law = {key: np.broadcast_to(gains[key][:, 0], model.lag.shape) for key in RISE_DI_GAINS if key in gains}
-        values |= _rise_di(of_law, model.input_scale)
+        law_gains = {key: np.broadcast_to(gains[key][:, 0], model.lag.shape) for key in RISE_DI_GAINS if key in gains}
+        values |= _rise_di(law_gains, model.input_scale)
     elif REGISTERED[name] != "lqg":
         values |= {key: tuned.gains[key] for key in ("K", "Lambda", "bandwidth") if key in tuned.gains}
     if REGISTERED[name] == "l1":
@@ -80,9 +80,9 @@ def _rise_di(gains: dict[str, FloatArray], input_scale: FloatArray) -> dict[str,
     """Parameters of RISE-DI: a K that (22) does not have is a larger one with a smaller input scale, the same loop."""
     K = gains["K"]
     least = max(MIN_K, float(K[-1]))
-    whole = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
-    share = K / whole
-    k_g, k_d = split_gain(whole)
+    permitted = np.maximum(K, least + np.append(np.full(len(K) - 1, MIN_GAIN), 0.0))
+    share = K / permitted
+    k_g, k_d = split_gain(permitted)
     return {
         "k_g": k_g,
         "k_d": k_d.tolist(),

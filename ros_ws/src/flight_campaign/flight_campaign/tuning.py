@@ -144,8 +144,8 @@ def build_benchmark(scenario: Scenario, turbulence_seed: int = TUNING_TURBULENCE
 
 def turbulence_of(scenario: Scenario) -> dict[str, float]:
     """The turbulence of a benchmark: altitude and intensity of that of the scenario; moderate at 100 m where it has none."""
-    own = scenario.aircraft.turbulence
-    return MODERATE if own is None else own.model_dump(exclude={"seed"}, exclude_none=True)
+    turbulence = scenario.aircraft.turbulence
+    return MODERATE if turbulence is None else turbulence.model_dump(exclude={"seed"}, exclude_none=True)
 
 
 def _courses(scenario: Scenario) -> dict[str, Course]:
@@ -197,12 +197,12 @@ def evaluations(objective: Objective, benchmark: Benchmark) -> list[Evaluation]:
     A, B = nominal_and_sampled(airframe, UNCERTAINTY, UNCERTAIN_AIRCRAFT, UNCERTAINTY_SEED)
     aircraft = np.arange(len(A))
     delayed = aircraft if objective.all_late else aircraft[:1]
-    of = np.concatenate([aircraft, delayed])
+    numbers = np.concatenate([aircraft, delayed])
     counts = [len(A), len(delayed)]
     late = np.repeat([0, objective.delay * benchmark.delay], counts)
     share = np.repeat([1.0 / count for count in counts], counts)
     return [
-        Evaluation(wind, benchmark_fleet(A[of], B[of], late, wind, benchmark), weight * share)
+        Evaluation(wind, benchmark_fleet(A[numbers], B[numbers], late, wind, benchmark), weight * share)
         for wind, weight in objective.weights.items()
     ]
 
@@ -213,16 +213,16 @@ def repeat_flights(flights: Fleet, times: int) -> Fleet:
     return tiled._replace(blocks=flights.blocks)
 
 
-def spread_over(params: Any, of_one: Any, flights: int) -> Any:
+def spread_over(params: Any, single: Any, flights: int) -> Any:
     """Parameters of several candidates, each for all of its flights: (.., candidates) -> (.., candidates flights).
 
-    `of_one` are the parameters of one candidate. What has the same shape in both is common to all candidates, and stays.
+    `single` are the parameters of one candidate. What has the same shape in both is common to all candidates, and stays.
     """
 
-    def spread(leaf: FloatArray, one: FloatArray) -> FloatArray:
-        return leaf if leaf.shape == one.shape else np.repeat(leaf, flights, axis=-1)
+    def spread(leaf: FloatArray, single_leaf: FloatArray) -> FloatArray:
+        return leaf if leaf.shape == single_leaf.shape else np.repeat(leaf, flights, axis=-1)
 
-    return jax.tree.map(spread, params, of_one)
+    return jax.tree.map(spread, params, single)
 
 
 def generation_count(law: Law, benchmark: Benchmark) -> int:
@@ -262,7 +262,7 @@ def tune(
     ]
     each = len(flights[0].weight)
     control_law = law.control_law(benchmark.model)
-    of_one = law.params(begin, benchmark.model)
+    single = law.params(begin, benchmark.model)
 
     def costs(job: tuple[Any, Evaluation]) -> FloatArray:
         """Costs of a part of the candidates in one wind, (together,)."""
@@ -286,10 +286,10 @@ def tune(
         for generation in range(generations):
             asked = [np.array(search.ask()) for search in searches]
             parts = np.split(np.concatenate(asked), PARTS)
-            params = [spread_over(law.params(gains_of(part), benchmark.model), of_one, each) for part in parts]
-            found = np.array(list(pool.map(costs, product(params, flights)))).reshape(PARTS, len(flights), together)
-            of_search = (found.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(len(seeds), POPULATION)
-            for k, (search, values) in enumerate(zip(searches, of_search, strict=True)):
+            params = [spread_over(law.params(gains_of(part), benchmark.model), single, each) for part in parts]
+            weighted = np.array(list(pool.map(costs, product(params, flights)))).reshape(PARTS, len(flights), together)
+            by_search = (weighted.sum(axis=1) + np.array(list(pool.map(lacking, parts)))).reshape(len(seeds), POPULATION)
+            for k, (search, values) in enumerate(zip(searches, by_search, strict=True)):
                 search.tell(list(asked[k]), list(values))
                 least = int(np.argmin(values))
                 if values[least] < best[k][0]:
@@ -297,7 +297,9 @@ def tune(
             if progress is not None:
                 progress(generation + 1, min(value for value, _ in best))
     winner = int(np.argmin([value for value, _ in best]))
-    gains = {name: [float(f"{v:.5g}") for v in gain[:, 0]] for name, gain in gains_of(best[winner][1][None]).items()}
+    gains = {}
+    for name, gain in gains_of(best[winner][1][None]).items():
+        gains[name] = [float(f"{value:.5g}") for value in gain[:, 0]]
     lowest = [round(value, 4) for value, _ in best]
     return TuningResult(gains, lowest[winner], seeds[winner], lowest, generations * POPULATION)
 
