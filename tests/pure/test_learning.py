@@ -116,7 +116,7 @@ class Fixed:
 def test_replay_of_learning_flight_is_equal_to_the_bit(flown: Flown) -> None:
     result = replay(flown.run)
     assert result.equal()
-    assert result.whole.all()
+    assert result.compared.all()
     assert any("observer.part" in note for note in result.notes)
 
 

@@ -55,7 +55,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
         assert signal.values.tobytes() == recorded[name].values.tobytes(), name
     result = replay(run)
     assert result.equal()
-    assert result.whole.all()
+    assert result.compared.all()
     steps = replay_guidance(recorded, chosen.guidance)
     assert steps.equal()
     assert steps.checked == steps.steps

@@ -171,9 +171,9 @@ def _minus_reference(y: Signal, y_m: Signal) -> Signal:
     if np.array_equal(stamps, y_m.stamp_ns):
         return Signal(stamps, y.names, values - _columns(y_m, y.names))
     # float64 represents stamps exactly relative to the first one, but not ns since the epoch.
-    at = (stamps - y_m.stamp_ns[0]).astype(float)
+    instants = (stamps - y_m.stamp_ns[0]).astype(float)
     knots = (y_m.stamp_ns - y_m.stamp_ns[0]).astype(float)
-    reference = np.stack([np.interp(at, knots, y_m[name]) for name in y.names]).T
+    reference = np.stack([np.interp(instants, knots, y_m[name]) for name in y.names]).T
     return Signal(stamps, y.names, values - reference)
 
 
@@ -241,8 +241,9 @@ def guided_transients(tape: Tape) -> list[Transient]:
     captures |= np.abs(commands["xtrack"]) > CAPTURE_TIME * speed
     captures |= np.diff(speed, prepend=speed[:1]) != 0.0
     spans = {"turn": mask_spans(t, turns, SETTLING_DWELL), "capture": mask_spans(t, captures & ~turns, SETTLING_DWELL)}
-    found = [Transient(kind, "", *span) for kind in spans for span in spans[kind]]
-    return sorted(found, key=lambda transient: transient.start)
+    transients = [Transient("turn", "", *span) for span in spans["turn"]]
+    transients += [Transient("capture", "", *span) for span in spans["capture"]]
+    return sorted(transients, key=lambda transient: transient.start)
 
 
 def mask_spans(t: FloatArray, mask: NDArray[np.bool_], min_length: float = 0.0) -> list[tuple[float, float]]:
@@ -328,9 +329,9 @@ def errors_by_model(tape: Tape) -> list[ModelSpan]:
     engaged = tape["internals"]["mode"][np.maximum(np.searchsorted(ticks, t, side="right") - 1, 0)] == Mode.ENGAGED
     spans = []
     for digest, (start, stop) in zip(flown[changes].tolist(), pairwise([*ticks[changes].tolist(), float(t[-1])]), strict=True):
-        within = (t >= start) & (t < stop) & engaged
-        rms = {name: error_metrics(error[name][within]).rms for name in error.names}
-        if within.any():
+        in_span = (t >= start) & (t < stop) & engaged
+        rms = {name: error_metrics(error[name][in_span]).rms for name in error.names}
+        if in_span.any():
             spans.append(ModelSpan(digests.index(digest), start, stop, rms))
     return spans
 
@@ -352,7 +353,10 @@ def errors_by_part(
     _, error = best_error(tape)
     masks = part_masks((error.stamp_ns - tape.start_ns) / 1e9, transients, settle)
     times = sample_times(error.stamp_ns)
-    return {name: {part: error_metrics(error[name][mask], times[mask]) for part, mask in masks.items()} for name in error.names}
+    by_channel = {}
+    for name in error.names:
+        by_channel[name] = {part: error_metrics(error[name][mask], times[mask]) for part, mask in masks.items()}
+    return by_channel
 
 
 def settling_bands(tape: Tape) -> dict[str, float]:
@@ -446,7 +450,10 @@ def inputs_by_part(
         rate = float(np.abs(np.diff(values))[steps].sum()) / time if time > 0 else float("nan")
         return InputMetrics(*error_metrics(values[mask], times[mask]), rate)
 
-    return {name: {part: metrics(u[name], mask) for part, mask in masks.items()} for name in u.names}
+    by_input = {}
+    for name in u.names:
+        by_input[name] = {part: metrics(u[name], mask) for part, mask in masks.items()}
+    return by_input
 
 
 def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
@@ -455,7 +462,10 @@ def saturation_shares(tape: Tape) -> dict[str, dict[str, float]]:
     if limited is None or len(limited.stamp_ns) == 0:
         return {}
     kinds = (Saturation.MAGNITUDE, Saturation.RATE)
-    return {name: {kind.name.lower(): float(np.mean(limited[name] == kind)) for kind in kinds} for name in limited.names}
+    shares = {}
+    for name in limited.names:
+        shares[name] = {kind.name.lower(): float(np.mean(limited[name] == kind)) for kind in kinds}
+    return shares
 
 
 def sign_switches(tape: Tape) -> dict[str, float]:
@@ -474,7 +484,7 @@ def sign_switches(tape: Tape) -> dict[str, float]:
     if time == 0.0:
         return {}
     signs = {name: np.sign(column[column != 0.0]) for name, column in zip(signal.names, moves.T, strict=True)}
-    return {name: float(np.count_nonzero(np.diff(of))) / time for name, of in signs.items()}
+    return {name: float(np.count_nonzero(np.diff(sign))) / time for name, sign in signs.items()}
 
 
 def spectra(signal: Signal, period_ns: int) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -501,8 +511,8 @@ def _welch(values: FloatArray, rate: float, window: int) -> tuple[FloatArray, Fl
     """
     hann = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(window) / window)
     parts = sliding_window_view(values, window, axis=0)[:: window - window // 2]  # (parts, m, window)
-    of_parts = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
-    power: FloatArray = np.mean(np.abs(of_parts) ** 2, axis=0).T / (rate * np.sum(hann**2))
+    spectra = np.fft.rfft((parts - parts.mean(axis=-1, keepdims=True)) * hann)
+    power: FloatArray = np.mean(np.abs(spectra) ** 2, axis=0).T / (rate * np.sum(hann**2))
     power[1 : (window + 1) // 2] *= 2.0  # each frequency but 0 and the highest of an even window stands for two
     return np.fft.rfftfreq(window, 1.0 / rate).astype(np.float64), power
 

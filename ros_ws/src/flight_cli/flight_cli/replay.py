@@ -76,7 +76,7 @@ def replay(
         if guided is not None:
             _show_guidance(guided)
     equal = result.equal() and (guided is None or guided.equal())
-    part = STATUS_INCOMPLETE if result.whole.sum() < WHOLE * ticks else 0
+    part = STATUS_INCOMPLETE if result.compared.sum() < WHOLE * ticks else 0
     raise typer.Exit(part if equal else DIFFERS)
 
 
@@ -123,7 +123,7 @@ def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:
 def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...], ticks: int, *, open_loop: bool) -> None:
     console = Console(soft_wrap=True, highlight=False)
     first = result.first()
-    checked = int(result.whole.sum())
+    checked = int(result.compared.sum())
     of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
     if first is None:
         console.print(
@@ -175,7 +175,7 @@ def _as_json(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ..
         "open_loop": bool(settings),
         "set": settings,
         "ticks": len(result.number),
-        "checked": int(result.whole.sum()),
+        "checked": int(result.compared.sum()),
         "equal": result.equal(),
         "other_parameters": int(result.other_parameters.sum()),
         "differing": int(result.different().any(axis=1).sum()),

@@ -11,6 +11,7 @@ from flight_analysis.closed_loop.replay import Difference
 from flight_core.channels import ATTITUDE
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
+from flight_core.vectors import FloatArray
 from flight_guidance import guidance, modes
 from flight_guidance.modes import Begin, GuidanceState, Lateral
 from flight_guidance.notices import LINK_AGE
@@ -33,13 +34,18 @@ class GuidanceReplay(NamedTuple):
         return self.differing == 0
 
 
+def _waypoints(rows: FloatArray) -> list[Waypoint]:
+    """The waypoints of a route from its messages, a row each."""
+    return [Waypoint(*row[1:]) for row in rows.tolist()]
+
+
 def known_routes(tape: Tape, parameters: GuidanceConfig) -> dict[int, Route]:
     """The route of the section and the routes of the topic `route`, by digest, as `guidance` logs them."""
     lists = [list(parameters.waypoints())]
     if "route" in tape:
         received = tape["route"]
         starts = np.flatnonzero(received["number"] == 0.0)[1:]
-        lists += [[Waypoint(*row[1:]) for row in rows.tolist()] for rows in np.split(received.values, starts)]
+        lists += [_waypoints(rows) for rows in np.split(received.values, starts)]
     routes = []
     for waypoints in filter(None, lists):
         with suppress(ParameterError):  # guidance has refused it, too

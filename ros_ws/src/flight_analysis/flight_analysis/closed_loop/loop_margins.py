@@ -74,34 +74,35 @@ def margins(
     return loop_assessment(scenario_loop(flown, flown.controller, count, deviation, numbered, spread))
 
 
-def loop_assessment(of: LinearLoop) -> LoopMargins:
+def loop_assessment(linear: LinearLoop) -> LoopMargins:
     """The margins of a loop: of the nominal aircraft, and the worst of the uncertain aircraft."""
-    together = loop_margins(of.plant, of.law, of.loop)
-    nominal, uncertain = (Margins._make(value[part] for value in together) for part in (0, slice(1, None)))
-    delay = delay_margin(of.nominal, of.law, of.loop)
-    each = tuple(delay_margin(of.nominal, of.law, of.loop, channel) for channel in range(len(of.inputs)))
-    result = LoopMargins(of.inputs, nominal, slow_modes(of.nominal, of.law, of.loop), delay, each)
-    count = len(of.plant.A) - 1
+    together = loop_margins(linear.plant, linear.law, linear.loop)
+    nominal = Margins._make(value[0] for value in together)
+    uncertain = Margins._make(value[1:] for value in together)
+    delay = delay_margin(linear.nominal, linear.law, linear.loop)
+    each = tuple(delay_margin(linear.nominal, linear.law, linear.loop, channel) for channel in range(len(linear.inputs)))
+    result = LoopMargins(linear.inputs, nominal, slow_modes(linear.nominal, linear.law, linear.loop), delay, each)
+    count = len(linear.plant.A) - 1
     if not count:
         return result
     stable = int(uncertain.stable.sum())
-    return result._replace(worst=uncertain.worst(), worst_delay=_least_delay(of, delay), aircraft=count, stable=stable)
+    return result._replace(worst=uncertain.worst(), worst_delay=_least_delay(linear, delay), aircraft=count, stable=stable)
 
 
-def _least_delay(of: LinearLoop, nominal: float) -> float:
+def _least_delay(linear: LinearLoop, nominal: float) -> float:
     """The smallest delay margin of the uncertain aircraft, at most the nominal delay margin, s.
 
     The aircraft are tried together with a delay in steps of half a period, or of 1/12 of a longer nominal margin.
     """
     longest = min(nominal, MAX_DELAY_MARGIN)
-    uncertain = LinearPlant(of.plant.A[1:], of.plant.B[1:], of.plant.C)
-    for delay in np.append(np.arange(0.0, longest, max(of.loop.period / 2.0, longest / 12.0)), longest):
-        matrices = closed_loop(uncertain, of.law, of.loop, np.full(len(of.inputs), delay))
+    uncertain = LinearPlant(linear.plant.A[1:], linear.plant.B[1:], linear.plant.C)
+    for delay in np.append(np.arange(0.0, longest, max(linear.loop.period / 2.0, longest / 12.0)), longest):
+        matrices = closed_loop(uncertain, linear.law, linear.loop, np.full(len(linear.inputs), delay))
         radii = np.abs(np.linalg.eigvals(matrices)).max(axis=-1)
         unstable = np.flatnonzero(radii > 1.0 + SPECTRAL_RADIUS_TOLERANCE)
         if len(unstable):
             plants = (LinearPlant(uncertain.A[k], uncertain.B[k], uncertain.C) for k in unstable)
-            return min(nominal, *(delay_margin(plant, of.law, of.loop) for plant in plants))
+            return min(nominal, *(delay_margin(plant, linear.law, linear.loop) for plant in plants))
     return nominal
 
 
@@ -131,8 +132,9 @@ def linear_loop(controller: ControllerConfig, airframe: Airframe, A: FloatArray,
     loop = loop_of(controller)
     if not set(controller.vanes) <= set(airframe.states):  # y_dot = Omega u has no angles: the observer of y alone
         controller = controller.without_vanes()
-    read = [[float(name == state) for state in airframe.states] for name in controller.vanes]
-    C = np.vstack([airframe.matrix_c()[rows], *read])
+    states = np.array(list(airframe.states))
+    vane_rows = [(states == name).astype(np.float64) for name in controller.vanes]
+    C = np.vstack([airframe.matrix_c()[rows], *vane_rows])
     plant = LinearPlant(A + airframe.matrix_gravity(), B[:, :, columns], C)
     model = f"model: {airframe.name}"
     return LinearLoop(model, controller.inputs, plant, linear_law(controller.tuned_law(), len(rows), loop.period), loop)
@@ -158,9 +160,13 @@ def delay_margins(scenario: Scenario, controller: ControllerConfig) -> dict[str,
     """
     if scenario.aircraft.is_jsbsim or is_literal(controller):
         return {}
-    of = scenario_loop(scenario, controller)
-    each = {name: delay_margin(of.nominal, of.law, of.loop, channel) for channel, name in enumerate(controller.outputs)}
-    return {"delay_margin": delay_margin(of.nominal, of.law, of.loop), "channels": each, "least": of.loop.period}
+    loop = scenario_loop(scenario, controller)
+    each = {name: delay_margin(loop.nominal, loop.law, loop.loop, channel) for channel, name in enumerate(controller.outputs)}
+    return {
+        "delay_margin": delay_margin(loop.nominal, loop.law, loop.loop),
+        "channels": each,
+        "least": loop.loop.period,
+    }
 
 
 def is_literal(controller: ControllerConfig) -> bool:

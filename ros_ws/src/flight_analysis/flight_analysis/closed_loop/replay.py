@@ -67,7 +67,7 @@ class ReplayResult(NamedTuple):
     published: NDArray[np.bool_] | None = None  # (N,), whether y and u of the tick are on their topics
 
     @property
-    def whole(self) -> NDArray[np.bool_]:
+    def compared(self) -> NDArray[np.bool_]:
         """Mask of the ticks whose y, state and u are compared, shape (N,)."""
         return self.checked if self.published is None else self.checked & self.published
 
@@ -167,8 +167,8 @@ def _replay(
     ticks = _Ticks(tape, parameters)
     for key, names in (("outputs", "measured"), ("inputs", "inputs"), ("effectors", "effectors")):
         wanted = getattr(parameters, names)
-        found = getattr(others or parameters, names)
-        require(found == wanted, f"controller.{key}", ", ".join(found), f"{', '.join(wanted)}, as recorded")
+        declared = getattr(others or parameters, names)
+        require(declared == wanted, f"controller.{key}", ", ".join(declared), f"{', '.join(wanted)}, as recorded")
     in_force = _ParametersInForce(others or parameters, changes)
     computed = np.full_like(ticks.values, np.nan)
     checked = np.zeros(len(ticks.number), dtype=bool)
@@ -206,10 +206,10 @@ def _recorded(
     """The tape of a run, with the parameters and the changes of the run where none are given. Raises ParameterError."""
     if isinstance(run, Tape):
         scenario = run.scenario
-        own = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
-        return run, as_controller(own, "parameters"), run.changes if changes is None else changes
-    own = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
-    return run.tape, own, recorded_changes(run, own) if changes is None else changes
+        controller = scenario.controller if parameters is None and isinstance(scenario, Scenario) else parameters
+        return run, as_controller(controller, "parameters"), run.changes if changes is None else changes
+    controller = recorded_parameters(run.scenario_file()) if parameters is None else as_controller(parameters, "parameters")
+    return run.tape, controller, recorded_changes(run, controller) if changes is None else changes
 
 
 def recorded_changes(run: RecordedRun, parameters: ControllerConfig) -> Sequence[Change]:
@@ -254,10 +254,11 @@ class _ParametersInForce:
             return state
         applied = self._changes[: len(steps) - 1]
         self._changes = self._changes[len(steps) - 1 :]
-        changed = sorted(
-            {name for change, old, new in zip(applied, steps, steps[1:], strict=False) if new != old for name in change}
-        )
-        self.notes.append(f"parameters changed before tick {number}: {', '.join(changed)}")
+        changed: set[str] = set()
+        for change, old, new in zip(applied, steps, steps[1:], strict=False):
+            if new != old:
+                changed.update(change)
+        self.notes.append(f"parameters changed before tick {number}: {', '.join(sorted(changed))}")
         for step in steps[1:]:
             if step.digest() == self.digest:
                 continue
@@ -278,8 +279,10 @@ class _Ticks:
         groups = parameters.logged_groups()
         names = internals.names(groups)
         missing = [f"no {name}" for name in names if name not in signal.names]
-        found = ", ".join(missing + [f"also {name}" for name in signal.names if name not in names])
-        require(not found, "internals", found, "the channels of the scenario in the log, as this version records them")
+        differences = ", ".join(missing + [f"also {name}" for name in signal.names if name not in names])
+        require(
+            not differences, "internals", differences, "the channels of the scenario in the log, as this version records them"
+        )
         values = np.column_stack([signal[name] for name in names])
         valid = np.isfinite(values).all() and np.isin(signal["mode"], list(Mode)).all()
         require(bool(valid), "internals", "a value that is not finite, or an unknown mode", "what a controller publishes")
@@ -321,18 +324,18 @@ class _Ticks:
     def state(self, k: int, limits: GuardParams, law: TunedLaw, computed: ControllerState | None = None) -> ControllerState:
         """The recorded state after a tick. Values outside the log come from the computed state, if any."""
         row = {name: values[k] for name, values in self._groups.items()}
-        of_law = restored(law.control_law, row)
+        law_state = restored(law.control_law, row)
         mode = Mode(int(self._signal["mode"][k]))
         u = row["u"]
         y_m = row["y_m"]
         effectors = row.get(internals.EFFECTOR)
         if computed is not None and not self.flies[k]:
-            return computed._replace(mode=mode, law=of_law, u=u, u_free=row["u_free"], effectors=effectors)
+            return computed._replace(mode=mode, law=law_state, u=u, u_free=row["u_free"], effectors=effectors)
         feedforward_state = None if computed is None else computed.feedforward
         if limits.nominal is not None and self._engages[k]:
             feedforward_state = feedforward.initial_state(y_m, limits.nominal)
         y = StampedVector(int(self.stamp_ns[k]), row["y"])
-        logged = ControllerState(mode, of_law, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
+        logged = ControllerState(mode, law_state, y, y_m, u, row["u_free"], row["u_trim"], 0, u, row["u_ff"], feedforward_state)
         vanes = Vanes(row["vane"], row["vane_m"]) if limits.vanes else None
         return logged._replace(effectors=effectors, effectors_failsafe=effectors, vanes=vanes)
 
@@ -396,10 +399,10 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{missing} samples of internals are missing: a gap before t = {ticks.t[gaps[0] + 1]:.2f} s{more}"
     if unchecked := int((~checked).sum()):
         yield f"{unchecked} ticks not checked: the log does not hold the state before them"
-    if without := int((ticks.flies & ~ticks.y_found).sum()):
-        yield f"{without} ticks have no sample on the topic y: y taken from internals"
-    if without := int((~ticks.u_found).sum()):
-        yield f"{without} ticks have no sample on the topic u: what was sent is not compared"
+    if unmatched := int((ticks.flies & ~ticks.y_found).sum()):
+        yield f"{unmatched} ticks have no sample on the topic y: y taken from internals"
+    if unmatched := int((~ticks.u_found).sum()):
+        yield f"{unmatched} ticks have no sample on the topic u: what was sent is not compared"
 
 
 def _bits(values: FloatArray) -> NDArray[np.int64]:

@@ -145,8 +145,8 @@ def load_scenario(path: FilePath, *, with_route: bool = True) -> Scenario:
     if with_route:
         return parse_scenario(content, path)
     sections = parse_scenario_sections(content, path)
-    left = {key: value for key, value in sections.get("guidance", {}).items() if key not in {"route", "program"}}
-    return scenario_of(path.stem, path, {**sections, **({"guidance": left} if "guidance" in sections else {})})
+    remaining = {key: value for key, value in sections.get("guidance", {}).items() if key not in {"route", "program"}}
+    return scenario_of(path.stem, path, {**sections, **({"guidance": remaining} if "guidance" in sections else {})})
 
 
 def parse_scenario(content: bytes, path: Path) -> Scenario:
@@ -254,9 +254,9 @@ def limits_beyond_stops(scenario: Scenario) -> tuple[str, ...]:
     sentences = []
     for key, sign in (("lower", -1.0), ("upper", 1.0)):
         stops = dict(zip(scenario.aircraft.channels().inputs, getattr(actuators, key), strict=bool(getattr(actuators, key))))
-        own = dict(zip(controller.effectors, getattr(controller.effector_limits(), key).tolist(), strict=True))
+        limits = dict(zip(controller.effectors, getattr(controller.effector_limits(), key).tolist(), strict=True))
         for name, stop in stops.items():
-            limit = own.get(name, sign * math.inf)
+            limit = limits.get(name, sign * math.inf)
             if sign * limit > sign * stop + STOP_TOLERANCE * abs(stop):
                 sentences.append(f"{section}.{key} of {name}: found {limit:g}, expected the end stop {stop:g} or less far out")
     return tuple(sentences)
@@ -275,8 +275,8 @@ def require_guidable(scenario: Scenario) -> None:
     require(turns, "aircraft.kinematics", f"{aircraft.kinematics!r} beside guidance", "euler: a bank turns the aircraft")
     start = aircraft.start
     inside = guidance.fence_clearance(start.north, start.east)
-    found = f"the start {described(inside)}, at north {start.north:g} m, east {start.east:g} m"
-    require(inside >= 0.0, "guidance.fence", found, "a start inside")
+    position = f"the start {described(inside)}, at north {start.north:g} m, east {start.east:g} m"
+    require(inside >= 0.0, "guidance.fence", position, "a start inside")
 
 
 def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
@@ -284,8 +284,8 @@ def _check_guidance(scenario: Scenario, guidance: GuidanceConfig) -> None:
     aircraft = scenario.aircraft
     rule = guidance_by_rule(aircraft, reference, scenario.controller)
     for key in ("speed", "outputs", "natural_frequency"):
-        found = getattr(guidance, key)
-        require(found == rule[key], f"guidance.{key}", found, f"{rule[key]}, as the other sections have it")
+        value = getattr(guidance, key)
+        require(value == rule[key], f"guidance.{key}", value, f"{rule[key]}, as the other sections have it")
     levels = f"the trim speed {guidance.speed:g} m/s, by which the wings are levelled when guidance is lost"
     require(reference.live.speed is not None, "reference_model.live.speed", "none beside guidance", levels)
     pose_ns = every(aircraft.rate) * period_ns(aircraft.rate, "aircraft.rate")

@@ -44,7 +44,10 @@ def with_route(scenario: Scenario, waypoints: Sequence[Waypoint], fence: Mapping
     Raises ParameterError where it cannot be flown.
     """
     flown = speeds(waypoints, scenario.aircraft.channels().speed)
-    route = {key: [getattr(waypoint, key) for waypoint in waypoints] for key in ("north", "east", "altitude")} | {
+    route: dict[str, list[Any]] = {
+        "north": [waypoint.north for waypoint in waypoints],
+        "east": [waypoint.east for waypoint in waypoints],
+        "altitude": [waypoint.altitude for waypoint in waypoints],
         "V": list(flown),
         "turns": [waypoint.turns for waypoint in waypoints],
         "wait": [waypoint.wait for waypoint in waypoints],

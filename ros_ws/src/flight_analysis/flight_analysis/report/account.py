@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,7 +116,7 @@ class Account(NamedTuple):
         topics = {name: topic._asdict() | {"share": topic.share} for name, topic in self.topics.items()}
         return {
             "end": self.end, "topics": topics, "lacks": list(self.lacks), "busy": self.busy, "unguided": self.unguided,
-            "unflown": list(self.unflown), "processes": {name: of._asdict() for name, of in self.processes.items()},
+            "unflown": list(self.unflown), "processes": {name: process._asdict() for name, process in self.processes.items()},
             "commands": None if self.commands is None else self.commands._asdict(), "late": self.late,
         }  # fmt: skip
 
@@ -132,8 +133,8 @@ def final_outcome(outcome: str, account: Account) -> str:
         return f"{NEVER_FLEW}: the first u came at t = {account.late:.3f} of {account.end:.3f} s"
     if base == COMPLETED and account.unguided:
         return f"{NEVER_FLEW} guided: guidance took no step; see the ages of pose and y against guidance.max_age"
-    left = account.outside if account.outside is not None and account.outside.left else None
-    outside = [] if left is None else [f"{OUTSIDE} for {left.outside_s:.1f} s, {left.farthest_m:.0f} m at most"]
+    outing = account.outside if account.outside is not None and account.outside.left else None
+    outside = [] if outing is None else [f"{OUTSIDE} for {outing.outside_s:.1f} s, {outing.farthest_m:.0f} m at most"]
     if LANDED in base:
         return ", ".join([base, *outside])
     if not base.startswith((COMPLETED, UNKNOWN)):
@@ -154,7 +155,7 @@ def outcome_of_log(tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
     The flight is completed where the log holds y, y_m and u for the duration in the log, else that of the scenario. An
     autopilot may end the last engagement, and with it u, before.
     """
-    is_part = bool(_lost_parts(tape.notes, planned=False)) or any(of.step_ns for of in tape.recording.values())
+    is_part = bool(_lost_parts(tape.notes, planned=False)) or any(recording.step_ns for recording in tape.recording.values())
     if simulated and not {*TICKS} & {*tape.signals}:
         return "" if is_part else f"{NEVER_FLEW}: the controller never engaged"
     loop = [tape[name].stamp_ns for name in ("y", "y_m", *(["u"] if simulated else [])) if name in tape]
@@ -211,8 +212,8 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     if scenario is not None and tape.start_ns > SINCE_EPOCH_NS:  # in real time
         for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
             topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)))
-            if rest := _unsent_rest(tape, name, step_ns, end_ns):
-                topics[name] = topics[name]._replace(unsent=topics[name].unsent + rest)
+            if unsent_at_end := _unsent_rest(tape, name, step_ns, end_ns):
+                topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 late[name] = seconds(end_ns)
     end = seconds(end_ns - tape.start_ns)
     failsafe = 0
@@ -264,7 +265,8 @@ def _too_busy(parts: Sequence[str]) -> str:
 def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
     """Parts of a bag that are missing. A truncated end counts where no planned end does."""
     kinds = PARTS if not planned else PARTS[:1]
-    return [note.partition(";")[0] for note in notes if any(kind in note for kind in kinds)]
+    missing = re.compile("|".join(map(re.escape, kinds)))
+    return [note.partition(";")[0] for note in notes if missing.search(note)]
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
@@ -273,8 +275,12 @@ def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
         return []
     outputs = scenario.controller.outputs
     wanted = {"y": outputs, "y_m": outputs, "u": scenario.controller.effectors}
-    absent = {name: [of for of in wanted[name] if of not in tape[name].names] for name in wanted if name in tape}
-    return [f"{', '.join(names)} of {name}" for name, names in absent.items() if names]
+    sentences = []
+    for topic, channels in wanted.items():
+        absent = [name for name in channels if topic in tape and name not in tape[topic].names]
+        if absent:
+            sentences.append(f"{', '.join(absent)} of {topic}")
+    return sentences
 
 
 def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, simulated: bool) -> dict[str, int]:
@@ -309,17 +315,17 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
     periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
     if simulated:
         y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
-        of_aircraft = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
-        periods |= {name: step for name, step in of_aircraft.items() if name in {"y", *tape.signals, *tape.recording}}
+        aircraft_periods = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
+        periods |= {name: step for name, step in aircraft_periods.items() if name in {"y", *tape.signals, *tape.recording}}
     return periods
 
 
-def _with_unsent(topic: TopicAccount, step_ns: int, of: Recording) -> TopicAccount:
+def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording) -> TopicAccount:
     """The account of a topic with the instants between the first and the last sample that the publisher left out."""
-    if topic.first is None or topic.last is None or of.lost is None or topic.expected is None:
+    if topic.first is None or topic.last is None or recording.lost is None or topic.expected is None:
         return topic
     instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
-    return topic._replace(unsent=max(instants - topic.found - of.lost, 0))
+    return topic._replace(unsent=max(instants - topic.found - recording.lost, 0))
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
@@ -335,12 +341,12 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     if not len(held_ns):
         return 0
     last_ns = int(held_ns[-1])
-    rest = max((end_ns - last_ns) // step_ns, 0)
+    unsent = max((end_ns - last_ns) // step_ns, 0)
     goes_on = len(signal.stamp_ns) > len(held_ns)
     if not goes_on and name in OF_AIRCRAFT and "y" in tape and tape.recording.get("y", Recording(0)).lost == 0:
         later_ns = tape["y"].until(end_ns).stamp_ns - last_ns
         goes_on = not np.any((later_ns > 0) & (later_ns % step_ns == 0))
-    return rest if goes_on else 0
+    return unsent if goes_on else 0
 
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
@@ -356,9 +362,9 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     if not len(log.stamp_ns):
         return count, float(count)
     # Stamps order two ticks of one instant either way. A much smaller number is that of another controller.
-    of_controllers = np.split(log["number"], np.flatnonzero(np.diff(log["number"]) < -RESTART) + 1)
-    missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in of_controllers)
-    before = float(of_controllers[0].min()) - 1.0
+    by_controller = np.split(log["number"], np.flatnonzero(np.diff(log["number"]) < -RESTART) + 1)
+    missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in by_controller)
+    before = float(by_controller[0].min()) - 1.0
     last_ns = int(log.stamp_ns[-1]) + round(float(log["age"][-1]) * NANOSECONDS)
     goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
     after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0)
@@ -367,7 +373,7 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
 
 
 def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, end_ns: int) -> TopicAccount:
-    of = tape.recording.get(name, Recording(0))
+    recording = tape.recording.get(name, Recording(0))
     signal = tape.signals.get(name, Signal(np.zeros(0, dtype=np.int64), (), np.zeros((0, 0)))).until(end_ns)
     early = 0 if begin_ns is None else int(np.searchsorted(signal.stamp_ns, begin_ns))
     count = len(signal.stamp_ns)
@@ -378,7 +384,8 @@ def _topic(tape: Tape, name: str, expected: int | None, begin_ns: int | None, en
         expected, count - early,
         float(t[0]) if count else None, float(t[-1]) if count else None,
         None if longest is None else float(gaps[longest]), None if longest is None else float(t[longest]),
-        of.repeated if of.found else int(np.count_nonzero(gaps == 0.0)), of.unset, seconds(of.step_ns), of.left_out, 0,
+        recording.repeated if recording.found else int(np.count_nonzero(gaps == 0.0)),
+        recording.unset, seconds(recording.step_ns), recording.left_out, 0,
     )  # fmt: skip
 
 
@@ -433,14 +440,14 @@ def account_of_json(summary: Mapping[str, Any]) -> Account | None:
     content = summary.get("account")
     if content is None:
         return None
-    keys = TopicAccount._fields
-    topics = {name: TopicAccount(*(topic[key] for key in keys)) for name, topic in content["topics"].items()}
+    fields_of = itemgetter(*TopicAccount._fields)
+    topics = {name: TopicAccount(*fields_of(topic)) for name, topic in content["topics"].items()}
     guided = summary["guidance"] or {}
     legs = tuple(FlownLeg(**leg) for leg in guided.get("legs", ()))
     outside = None if guided.get("fence") is None else Outside(**guided["fence"])
     unguided = content.get("unguided", False)
     unflown = tuple(content.get("unflown", ()))
-    processes = {name: ProcessAccount(**of) for name, of in content.get("processes", {}).items()}
+    processes = {name: ProcessAccount(**process) for name, process in content.get("processes", {}).items()}
     commands = None if content.get("commands") is None else Commands(**content["commands"])
     lacks = tuple(content["lacks"])
     late = content.get("late")

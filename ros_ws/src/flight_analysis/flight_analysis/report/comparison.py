@@ -3,6 +3,7 @@
 """Comparison of several flights, channels matched by name: ratios of metrics to the first flight, and overlaid curves."""
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,7 +66,10 @@ def labels(flights: Sequence[RecordedFlight]) -> list[str]:
 
 def units(flights: Sequence[RecordedFlight]) -> dict[str, DisplayUnit]:
     """Units by channel, of the first flight with the channel."""
-    return {name: unit for flight in reversed(flights) for name, unit in flight.units.items()}
+    by_channel: dict[str, DisplayUnit] = {}
+    for flight in reversed(flights):
+        by_channel |= flight.units
+    return by_channel
 
 
 # ---- Tables
@@ -77,7 +81,7 @@ def metric_tables(
     """Metrics of "errors" or "inputs" of the summaries: a table per channel, a row per column with a value."""
     display = units(flights)
     tables = []
-    for channel in dict.fromkeys(name for flight in flights for name in flight.summary[key]):
+    for channel in dict.fromkeys(chain.from_iterable(flight.summary[key] for flight in flights)):
         factor = display.get(channel, summary.NO_UNIT).factor
         rows = []
         for group, head, path, scaled in columns:
@@ -97,10 +101,9 @@ def error_tables(flights: Sequence[RecordedFlight]) -> list[ComparisonTable]:
 
 
 def _settling_rows(flights: Sequence[RecordedFlight], channel: str) -> list[ComparisonRow]:
-    times = {
-        kind: tuple(summary.slowest_settling(flight.summary, channel, kind) for flight in flights)
-        for kind in ("command", "gust")
-    }
+    times = {}
+    for kind in ("command", "gust"):
+        times[kind] = tuple(summary.slowest_settling(flight.summary, channel, kind) for flight in flights)
     no_ratios = (None,) * len(flights)
     return [
         ComparisonRow(f"settling, {kind} (s)", texts, no_ratios)
@@ -178,13 +181,13 @@ def _from_zero(signal: Signal, flight: RecordedFlight) -> Signal:
     return Signal(signal.stamp_ns - flight.tape.start_ns, signal.names, signal.values)
 
 
-def _same_curve(one: Signal, other: Signal) -> bool:
+def _same_curve(first: Signal, second: Signal) -> bool:
     """Whether two references differ by at most SAME_CURVE_TOLERANCE of the largest value over their common time."""
-    if set(one.names) != set(other.names) or len(one.stamp_ns) == 0 or len(other.stamp_ns) == 0:
+    if set(first.names) != set(second.names) or len(first.stamp_ns) == 0 or len(second.stamp_ns) == 0:
         return False
-    instants = one.stamp_ns[one.stamp_ns <= other.stamp_ns[-1]]
+    instants = first.stamp_ns[first.stamp_ns <= second.stamp_ns[-1]]
     return all(
-        np.max(np.abs(one[name][: len(instants)] - np.interp(instants, other.stamp_ns, other[name])), initial=0.0)
-        <= SAME_CURVE_TOLERANCE * np.max(np.abs(one[name]))
-        for name in one.names
+        np.max(np.abs(first[name][: len(instants)] - np.interp(instants, second.stamp_ns, second[name])), initial=0.0)
+        <= SAME_CURVE_TOLERANCE * np.max(np.abs(first[name]))
+        for name in first.names
     )

@@ -3,6 +3,7 @@
 """Export of flights: a wide table of the signals (CSV, Parquet), and a figure (PNG)."""
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -94,7 +95,7 @@ def write_png(path: Path, flights: Sequence[RecordedFlight]) -> None:
 
 def _channels(flights: Sequence[RecordedFlight], topics: Sequence[str]) -> list[str]:
     tapes = [flight.tape for flight in flights if {*topics} <= {*flight.tape.signals}]
-    return list(dict.fromkeys(name for tape in tapes for name in tape[topics[0]].names))
+    return list(dict.fromkeys(chain.from_iterable(tape[topics[0]].names for tape in tapes)))
 
 
 def _plot_channel(axes: "Axes", flights: Sequence[RecordedFlight], column: _PlotColumn, name: str) -> None:

@@ -6,6 +6,7 @@ The figures do not depend on the aircraft: channels are drawn under their own na
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import chain, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +61,7 @@ NOISE_FLOOR_LINE = {"color": LIMIT, "width": 1.0, "dash": "dot"}
 INTEGRALS = {"integral_e": "∫e", "Pi": "Pi"}  # groups of `internals` and their labels
 MIN_SPECTRUM_SAMPLES = 64
 HISTOGRAM_BINS = 80
-FREQUENCIES = [digit * 10.0**power for power in range(-4, 4) for digit in (1, 2, 5)]  # Hz, ticks of a spectrum
+FREQUENCIES = [digit * 10.0**power for power, digit in product(range(-4, 4), (1, 2, 5))]  # Hz, ticks of a spectrum
 MIN_VISIBLE_FRACTION = 1 / 500  # of the axis, about two pixels: shorter intervals are lengthened to it
 LIMIT_VIEW_RATIO = 3.0  # a limit is in view where it is at most this many times the largest u
 
@@ -93,11 +94,11 @@ def mode_intervals(tape: Tape, min_length: float = 0.0) -> list[Interval]:
         return []
     t = tape.time("internals")
     modes = tape["internals"]["mode"]
-    return [
-        Interval(mode.name.lower(), start, stop, colour, False)
-        for mode, colour in MODE_COLOURS.items()
-        for start, stop in mask_spans(t, modes == mode, min_length)
-    ]
+    intervals = []
+    for mode, colour in MODE_COLOURS.items():
+        spans = mask_spans(t, modes == mode, min_length)
+        intervals += [Interval(mode.name.lower(), start, stop, colour, False) for start, stop in spans]
+    return intervals
 
 
 def tracking_figure(context: PlotContext) -> Figure:
@@ -149,7 +150,9 @@ def input_figure(context: PlotContext, limits: Mapping[str, Limits]) -> Figure |
         top = high + 0.14 * (high - low)
         for saturation, colour in SATURATION_COLOURS.items():
             spans = mask_spans(*_saturated(tape, name, saturation), context.end * MIN_VISIBLE_FRACTION)
-            x = [instant for start, stop in spans for instant in (start, stop, None)]
+            x: list[float | None] = []
+            for start, stop in spans:
+                x += [start, stop, None]
             add_line(figure, index, f"saturated: {saturation.name.lower()}", x, [mark] * len(x), {"color": colour, "width": 9})
         figure.y[index]["range"] = [low, top]
     return set_layout(figure, labels=16)
@@ -159,8 +162,10 @@ def input_limits(scenario: Scenario, tape: Tape) -> dict[str, Limits]:
     """Limits of u by kind and by input: end stops of the actuators where these are simulated, and limits of the controller."""
     actuators = scenario.aircraft.actuators
     controller = scenario.controller
-    own = controller.effector_limits()
-    limits = {"limits of the controller": _limit_pairs(controller.effectors, own.lower.tolist(), own.upper.tolist())}
+    commanded = controller.effector_limits()
+    limits = {
+        "limits of the controller": _limit_pairs(controller.effectors, commanded.lower.tolist(), commanded.upper.tolist())
+    }
     if not _truth_group(tape, "actuator").names:
         return limits
     return {"end stops": _limit_pairs(tuple(scenario.aircraft.channels().inputs), actuators.lower, actuators.upper)} | limits
@@ -177,7 +182,9 @@ def integral_figure(context: PlotContext) -> Figure | None:
         return None
     internals = context.tape["internals"]
     outputs = internals.group("Pi").names
-    channels = {f"{label} {name}": f"{group}.{name}" for name in outputs for group, label in INTEGRALS.items()}
+    channels: dict[str, str] = {}
+    for name in outputs:
+        channels |= {f"{label} {name}": f"{group}.{name}" for group, label in INTEGRALS.items()}
     if not outputs:
         return None
     values = np.stack([internals[channel] for channel in channels.values()]).T
@@ -193,14 +200,14 @@ def learned_figure(context: PlotContext) -> Figure | None:
     if "learned" not in context.tape:
         return None
     t = context.tape.time("learned")
-    found = context.tape["learned"]
-    known = known_entries(found)
-    values = found.group("value")
-    deviations = found.group("deviation")
+    learned = context.tape["learned"]
+    known = known_entries(learned)
+    values = learned.group("value")
+    deviations = learned.group("deviation")
     if not known:
         return None
     columns = min(len(known), 3)
-    symbols = np.where(found["proposed"] > 0.0, "circle", "circle-open").tolist()
+    symbols = np.where(learned["proposed"] > 0.0, "circle", "circle-open").tolist()
     figure = Figure(len(known), columns, 110, spacing=0.06)
     for index, name in enumerate(known):
         bars = {"type": "data", "array": 2.0 * deviations[name], "thickness": 1.2, "width": 3}
@@ -225,7 +232,7 @@ def spectrum_figure(runs: Runs, colours: Mapping[str, str], units: Mapping[str, 
     }
     if not runs:
         return None
-    channels = list(dict.fromkeys(name for tape, _ in runs.values() for name in tape["u"].names))
+    channels = list(dict.fromkeys(chain.from_iterable(tape["u"].names for tape, _ in runs.values())))
     columns = min(len(channels), 2)
     figure = Figure(len(channels), columns, 190, spacing=0.2)
     for label, (tape, period_ns) in runs.items():
@@ -270,7 +277,7 @@ def timing_figure(runs: Runs, colours: Mapping[str, str]) -> Figure | None:
     A quantity has a subplot with the runs.
     """
     timing = {label: _timing_samples(tape, period_ns) for label, (tape, period_ns) in runs.items()}
-    quantities = list(dict.fromkeys(quantity for samples in timing.values() for quantity in samples))
+    quantities = list(dict.fromkeys(chain.from_iterable(timing.values())))
     if not quantities:
         return None
     columns = min(len(quantities), 2)

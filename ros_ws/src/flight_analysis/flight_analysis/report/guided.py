@@ -75,7 +75,7 @@ def segments(tape: Tape) -> list[Segment]:
     errors = control_errors(tape)
     times = sample_times(tape["guidance"].stamp_ns)
     log = tape["guidance"]
-    targets = [name for name in (f"target.{name}" for name in TARGETS) if name in log.names]
+    targets = [f"target.{name}" for name in TARGETS if f"target.{name}" in log.names]
     named = ["mode.lateral", "mode.vertical", "leg", *targets, *(name for name in ("joining",) if name in log.names)]
     columns = np.column_stack([log[name] for name in named])
     follows = [k for k, name in enumerate(named) if name in {"target.altitude", "target.climb"}]
@@ -85,7 +85,7 @@ def segments(tape: Tape) -> list[Segment]:
     for k in np.flatnonzero(changes) + 1:
         if t[k] - t[starts[-1]] >= SETTLING_DWELL:
             starts.append(int(k))
-    found = []
+    flown = []
     for first, after in zip(starts, [*starts[1:], len(t)], strict=True):
         last = after - 1  # its modes and commands are those that the segment ends with
         lateral = Lateral(int(log["mode.lateral"][last]))
@@ -94,8 +94,8 @@ def segments(tape: Tape) -> list[Segment]:
         quantities = (on_path, "altitude" if vertical is Vertical.PROFILE else vertical.name.lower(), "V")
         held = [_held(name, t[first:after], errors[name][first:after], times[first:after]) for name in quantities]
         leg = int(log["leg"][last]) if lateral is Lateral.ROUTE else None
-        found.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
-    return found
+        flown.append(Segment(float(t[first]), float(t[min(after, len(t) - 1)]), leg, *held))
+    return flown
 
 
 def flown_legs(tape: Tape) -> list[FlownLeg]:
@@ -108,14 +108,14 @@ def flown_legs(tape: Tape) -> list[FlownLeg]:
     if "missed" not in log.names:
         return []
     legs = np.where(log["mode.lateral"] == Lateral.ROUTE, log["leg"], -1.0)
-    given = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins again
-    edges = np.flatnonzero((np.diff(legs) != 0.0) | (given[1:] != 0)) + 1
+    chosen = log["given"].astype(np.int64) & bits(("leg",))  # a leg chosen again begins again
+    edges = np.flatnonzero((np.diff(legs) != 0.0) | (chosen[1:] != 0)) + 1
     flown = []
     for first, after in zip([0, *edges], [*edges, len(t)], strict=True):
         if legs[first] < 0.0 or first == after:
             continue
         on_leg = np.flatnonzero(log["joining"][first:after] == 0.0)
-        ends = after < len(t) and not given[after]
+        ends = after < len(t) and not chosen[after]
         ends = ends and legs[after] == legs[first] + 1.0
         missed = float(log["missed"][after]) if ends else 0.0
         result = "not ended" if not ends else "missed" if missed else "flown"
@@ -172,10 +172,14 @@ def mission_drawing(section: GuidanceConfig, routes: Sequence[Route]) -> dict[st
     `route` and `legs` of the routes, points of the line and [number, north, east]; `to_end`, the lengths after each leg of the
     last route up to its last orbit; `fence` and `home` as in the section.
     """
-    legs = [[number, *place] for route in routes for number, place in leg_places(route).items()]
+    legs: list[list[float]] = []
+    outline: list[Any] = []
+    for route in routes:
+        legs += [[number, *place] for number, place in leg_places(route).items()]
+        outline += route_outline(route)
     fence = [zone.model_dump() for zone in section.fence.values()]
     return {
-        "route": [point for route in routes for point in route_outline(route)],
+        "route": outline,
         "legs": legs,
         "to_end": lengths_after(routes[-1]) if routes else [],
         "fence": fence,
@@ -216,8 +220,8 @@ def _held(quantity: str, t: FloatArray, error: FloatArray, times: FloatArray) ->
     first = float(error[0])
     if abs(first) <= BANDS[quantity]:
         return Held(quantity, *metrics, None, None)
-    beyond = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
-    return Held(quantity, *metrics, beyond, settling_time(t, error, BANDS[quantity], math.inf))
+    overshoot = float(np.max(-error * math.copysign(1.0, first), initial=0.0))
+    return Held(quantity, *metrics, overshoot, settling_time(t, error, BANDS[quantity], math.inf))
 
 
 def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
@@ -236,6 +240,11 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 
+def _segment_figures(segment: Segment) -> dict[str, Any]:
+    """The figures of a segment with those of the quantities that guidance holds."""
+    return segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
+
+
 def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[str, Any] | None:
     """The figures of a guided flight as `summary.json` holds them, SI; None for a flight without guidance."""
     if "guidance" not in tape or len(tape["guidance"].stamp_ns) == 0:
@@ -244,10 +253,7 @@ def guidance_summary(tape: Tape, section: GuidanceConfig | None = None) -> dict[
     limited = log.group("limited")
     outside = time_outside(tape, section)
     return {
-        "segments": [
-            segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
-            for segment in segments(tape)
-        ],
+        "segments": [_segment_figures(segment) for segment in segments(tape)],
         "legs": [leg._asdict() for leg in flown_legs(tape)],
         "fence": None if outside is None else outside._asdict(),
         "wind": _mean_wind(tape),

@@ -45,11 +45,10 @@ def guided_context(context: PlotContext) -> PlotContext:
     """The context with the units of the held quantities, and the times of a stale pose."""
     t = context.tape.time("guidance")
     mode = context.tape["guidance"]["mode"]
-    stale = [
-        Interval(f"guidance: {shaded.name.lower().replace('_', ' ')}", start, stop, colour, False)
-        for shaded, colour in MODE_SHADES.items()
-        for start, stop in mask_spans(t, mode == shaded)
-    ]
+    stale = []
+    for shaded, colour in MODE_SHADES.items():
+        label = f"guidance: {shaded.name.lower().replace('_', ' ')}"
+        stale += [Interval(label, start, stop, colour, False) for start, stop in mask_spans(t, mode == shaded)]
     return context._replace(units=QUANTITY_UNITS, intervals=[*context.intervals, *stale])
 
 
@@ -194,11 +193,10 @@ def cross_track_figure(context: PlotContext) -> Figure | None:
     error = Curve(_signal(context, {"xtrack": np.where(on_path, log["xtrack"], np.nan)}), ERROR)
     t = context.tape.time("guidance")
     legs = np.where(lateral == Lateral.ROUTE, log["leg"], -1.0)
-    spans = [
-        Interval(f"leg {int(leg)}", *span, END_STOP if leg % 2 else "#ffffff", True)
-        for leg in np.unique(legs[legs >= 0.0])
-        for span in mask_spans(t, legs == leg)
-    ]
+    spans = []
+    for leg in np.unique(legs[legs >= 0.0]):
+        colour = END_STOP if leg % 2 else "#ffffff"
+        spans += [Interval(f"leg {int(leg)}", *span, colour, True) for span in mask_spans(t, legs == leg)]
     return time_series_figure(context._replace(intervals=[*context.intervals, *spans]), {"": error})
 
 

@@ -103,7 +103,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
     tape = flight.tape
     source = flight.summary["source"]
     context = figures.plot_context(tape, flight.units, {})
-    of_flight = tables.imported_tables(flight.summary, flight.units)
+    flight_tables = tables.imported_tables(flight.summary, flight.units)
     colour = figures.PLANT
     pose = None
     spectrum = figures.spectrum_figure({"u": (tape, flight.period_ns)}, {"u": colour}, flight.units)
@@ -113,7 +113,7 @@ def _imported_page(flight: RecordedFlight) -> Page:
     return Page(
         f"Flight {flight.name}",
         [Line(text)],
-        [TableGroup(of_flight)],
+        [TableGroup(flight_tables)],
         [
             Section("Output y", "about trim", time_series_figure(context, {"y": Curve(tape["y"], colour)})),
             Section("Input u", "about trim", figures.input_figure(context, {})),
@@ -131,7 +131,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
     gusts = flight.gusts
     context = figures.plot_context(flight.tape, units, gusts)
     loop = _linear_loop(scenario)
-    of_flight = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts, scenario))
+    flight_tables = tables.flight_tables(flight.summary, units, tables.events(flight.tape, gusts, scenario))
     return Page(
         f"Flight {flight.name}",
         [
@@ -140,7 +140,7 @@ def _flight_page(flight: RecordedFlight, scenario: Scenario) -> Page:
                 flight.summary["outcome"],
             )
         ],
-        [TableGroup([*of_flight, *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))])])],
+        [TableGroup([*flight_tables, *([] if loop is None else [margin_figures.margin_table(loop_assessment(loop))])])],
         [*_sections(flight, scenario, context), *([] if loop is None else _loop_sections(loop))],
         context.samples,
         flight.summary["notes"],

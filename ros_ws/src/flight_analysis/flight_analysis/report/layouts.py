@@ -8,6 +8,7 @@ the same channels in the same order.
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -76,7 +77,7 @@ def tabs_of(channels: Channels) -> tuple[Tab, ...]:
     outputs = channels["y_m"]
     wind = [name for name in channels["truth"] if name.startswith("gust.")]
     inputs = [name.removeprefix("u_free.") for name in channels["internals"] if name.startswith("u_free.")]
-    integrals = [f"{group}.{name}" for name in outputs for group in ("integral_e", "Pi")]
+    integrals = [f"{group}.{name}" for name, group in product(outputs, ("integral_e", "Pi"))]
     integrals = [name for name in integrals if name in channels["internals"]]  # another law may have neither
 
     def log(title: str, *names: str) -> Plot:
@@ -124,11 +125,11 @@ def foxglove(aircraft: Mapping[str, Channels]) -> str:
         panels[MAP] = _foxglove_map(guided)
         tabs.append({"title": "map", "layout": MAP})
     for namespace, channels in aircraft.items():
-        own = _foxglove_tabs(panels, namespace, channels)
+        panel_tabs = _foxglove_tabs(panels, namespace, channels)
         if len(aircraft) == 1:
-            tabs += own
+            tabs += panel_tabs
         else:
-            panels[f"Tab!{namespace}"] = {"activeTabIdx": 0, "tabs": own}
+            panels[f"Tab!{namespace}"] = {"activeTabIdx": 0, "tabs": panel_tabs}
             tabs.append({"title": namespace, "layout": f"Tab!{namespace}"})
     panels["Tab!rise_di"] = {"activeTabIdx": 0, "tabs": tabs}
     defaults = {"globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
@@ -190,7 +191,7 @@ def _foxglove_map(namespaces: Sequence[str]) -> dict[str, Any]:
         "followTf": "map",
         "scene": {},
         "transforms": {},
-        "topics": {_topic(namespace, name): {"visible": True} for namespace in namespaces for name in MAP_TOPICS},
+        "topics": {_topic(*pair): {"visible": True} for pair in product(namespaces, MAP_TOPICS)},
         "layers": {
             "grid": {
                 "visible": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid", "frameId": "map",
@@ -214,21 +215,27 @@ def _split(parts: Sequence[Any], direction: str) -> Any:
     return {"direction": direction, "first": first, "second": _split(others, direction), "splitPercentage": share}
 
 
+def _plotjuggler_tab(window: ElementTree.Element, namespace: str, tab: Tab) -> None:
+    """Add the tab to the window with its plots in rows; a tab without a plot is left out."""
+    if not tab.plots:
+        return
+    title = f"{namespace} {tab.title}".strip()
+    element = ElementTree.SubElement(window, "Tab", {"tab_name": title, "containers": "1"})
+    rows = [tab.plots[start : start + COLUMNS] for start in range(0, len(tab.plots), COLUMNS)]
+    outer = _splitter(ElementTree.SubElement(element, "Container"), "-", len(rows))
+    for row in rows:
+        inner = _splitter(outer, "|", len(row))
+        for plot in row:
+            _plotjuggler_plot(inner, plot, namespace)
+
+
 def plotjuggler(aircraft: Mapping[str, Channels]) -> str:
     """A layout of PlotJuggler: XML, tabs of docked plots, curves "/topic/channel/position". `aircraft` as in `foxglove`."""
     root = ElementTree.Element("root")
     window = ElementTree.SubElement(root, "tabbed_widget", {"name": "Main Window", "parent": "main_window"})
-    for namespace, tab in [(namespace, tab) for namespace, channels in aircraft.items() for tab in tabs_of(channels)]:
-        if not tab.plots:
-            continue
-        title = f"{namespace} {tab.title}".strip()
-        element = ElementTree.SubElement(window, "Tab", {"tab_name": title, "containers": "1"})
-        rows = [tab.plots[start : start + COLUMNS] for start in range(0, len(tab.plots), COLUMNS)]
-        outer = _splitter(ElementTree.SubElement(element, "Container"), "-", len(rows))
-        for row in rows:
-            inner = _splitter(outer, "|", len(row))
-            for plot in row:
-                _plotjuggler_plot(inner, plot, namespace)
+    for namespace, channels in aircraft.items():
+        for tab in tabs_of(channels):
+            _plotjuggler_tab(window, namespace, tab)
     ElementTree.SubElement(window, "currentTabIndex", {"index": "0"})
     ElementTree.SubElement(root, "use_relative_time_offset", {"enabled": "1"})
     ElementTree.indent(root)

@@ -46,14 +46,18 @@ def decibels(factor: FloatArray | float) -> FloatArray:
         return np.asarray(20.0 * np.log10(factor))
 
 
-def margin_rows(of: LoopMargins) -> list[list[str]]:
+def margin_rows(margins: LoopMargins) -> list[list[str]]:
     """A row an input, then ALL_INPUTS, with the cells of MARGIN_COLUMNS: nominal (worst uncertain aircraft)."""
-    columns = _values(of.nominal, (*of.channel_delay, of.delay))
-    beside = columns if of.worst is None else _values(of.worst, (*[math.nan] * len(of.inputs), of.worst_delay or 0.0))
+    columns = _values(margins.nominal, (*margins.channel_delay, margins.delay))
+    uncertain = columns
+    if margins.worst is not None:
+        uncertain = _values(margins.worst, (*[math.nan] * len(margins.inputs), margins.worst_delay or 0.0))
     rows = []
-    for i, name in enumerate((*of.inputs, ALL_INPUTS)):
-        pairs = zip(columns, beside, FORMATS, strict=True)
-        rows.append([name, *(_cell(values[i], None if of.worst is None else worst[i], form) for values, worst, form in pairs)])
+    for i, name in enumerate((*margins.inputs, ALL_INPUTS)):
+        pairs = zip(columns, uncertain, FORMATS, strict=True)
+        rows.append(
+            [name, *(_cell(values[i], None if margins.worst is None else worst[i], form) for values, worst, form in pairs)]
+        )
     return rows
 
 
@@ -92,15 +96,15 @@ LEAST_MARGINS = {
 """The least margins of a loop, each with its format: of the worst input, or of all inputs at once."""
 
 
-def least_margins(of: LoopMargins | None) -> list[str]:
+def least_margins(margins: LoopMargins | None) -> list[str]:
     """The values of LEAST_MARGINS: nominal (worst uncertain aircraft)."""
-    if of is None:
+    if margins is None:
         return [NO_VALUE] * len(LEAST_MARGINS)
-    nominal = _least(of.nominal, of.delay)
-    worst = None if of.worst is None else _least(of.worst, of.worst_delay or 0.0)
+    nominal = _least(margins.nominal, margins.delay)
+    worst = None if margins.worst is None else _least(margins.worst, margins.worst_delay or 0.0)
     formats = LEAST_MARGINS.values()
-    beside = [None] * len(nominal) if worst is None else worst
-    return [_cell(*values) for values in zip(nominal, beside, formats, strict=True)]
+    uncertain = [None] * len(nominal) if worst is None else worst
+    return [_cell(*values) for values in zip(nominal, uncertain, formats, strict=True)]
 
 
 def _least(margins: Margins, delay: float) -> list[float]:
@@ -111,35 +115,38 @@ def _least(margins: Margins, delay: float) -> list[float]:
     return [float(value) for value in values]
 
 
-def modes_text(of: LoopMargins) -> str:
+def modes_text(margins: LoopMargins) -> str:
     """The slow modes with little damping as a sentence."""
-    shown = [(w, zeta) for w, zeta in zip(*of.modes, strict=True) if zeta < SHOWN_DAMPING]
+    shown = [(w, zeta) for w, zeta in zip(*margins.modes, strict=True) if zeta < SHOWN_DAMPING]
     modes = ", ".join(f"{w:.3g} rad/s {zeta:.2f}" for w, zeta in shown)
-    least = f"; least of the uncertain aircraft {float(of.worst.damping):.2f}" if of.worst is not None else ""
+    least = f"; least of the uncertain aircraft {float(margins.worst.damping):.2f}" if margins.worst is not None else ""
     return f"slow modes and their damping: {modes or f'all above {SHOWN_DAMPING:g}'}{least}"
 
 
-def margin_table(of: LoopMargins) -> Table:
+def margin_table(margins: LoopMargins) -> Table:
     """The margins of a flight's loop."""
-    return Table("Margins of the linear loop", MARGIN_COLUMNS, margin_rows(of), f"{MARGIN_LEGEND}. {modes_text(of)}")
+    return Table("Margins of the linear loop", MARGIN_COLUMNS, margin_rows(margins), f"{MARGIN_LEGEND}. {modes_text(margins)}")
 
 
-def margins_as_json(of: LoopMargins) -> dict[str, Any]:
+def margins_as_json(margins: LoopMargins) -> dict[str, Any]:
     """The margins in SI: phase in rad, gain as factors, delay in s. None for an infinite margin."""
-
-    def of_aircraft(margins: Margins) -> dict[str, Any]:
-        each = ("phase", "crossover", "gain_decrease", "gain_increase", "sensitivity", "disk")
-        by_input = {name: {key: float(getattr(margins, key)[i]) for key in each} for i, name in enumerate(of.inputs)}
-        together = {"disk": float(margins.disk_all), "sensitivity": float(margins.sensitivity_all)}
-        return {"inputs": by_input, "all": together, "damping": float(margins.damping)}
-
-    result: dict[str, Any] = {"nominal": of_aircraft(of.nominal) | {"stable": bool(of.nominal.stable)}}
-    result["nominal"]["modes"] = [{"frequency": w, "damping": zeta} for w, zeta in zip(*map(list, of.modes), strict=True)]
-    result["nominal"]["delay"] = {"all": of.delay, "inputs": dict(zip(of.inputs, of.channel_delay, strict=True))}
-    if of.worst is not None:
-        result["worst"] = of_aircraft(of.worst) | {"delay": {"all": of.worst_delay}}
-        result |= {"aircraft": of.aircraft, "stable": of.stable}
+    nominal = _aircraft_as_json(margins.nominal, margins.inputs) | {"stable": bool(margins.nominal.stable)}
+    nominal["modes"] = [{"frequency": w, "damping": zeta} for w, zeta in zip(*map(list, margins.modes), strict=True)]
+    nominal["delay"] = {"all": margins.delay, "inputs": dict(zip(margins.inputs, margins.channel_delay, strict=True))}
+    result: dict[str, Any] = {"nominal": nominal}
+    if margins.worst is not None:
+        result["worst"] = _aircraft_as_json(margins.worst, margins.inputs) | {"delay": {"all": margins.worst_delay}}
+        result |= {"aircraft": margins.aircraft, "stable": margins.stable}
     return result
+
+
+def _aircraft_as_json(margins: Margins, inputs: Sequence[str]) -> dict[str, Any]:
+    each = ("phase", "crossover", "gain_decrease", "gain_increase", "sensitivity", "disk")
+    by_input = {}
+    for i, name in enumerate(inputs):
+        by_input[name] = {key: float(getattr(margins, key)[i]) for key in each}
+    together = {"disk": float(margins.disk_all), "sensitivity": float(margins.sensitivity_all)}
+    return {"inputs": by_input, "all": together, "damping": float(margins.damping)}
 
 
 # Bode and Nyquist plots

@@ -5,6 +5,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +116,10 @@ def write_figure(
             _draw(axes, flights, name)
         grid[-1].set_xlabel("t (s)")
         grid[-1].set_xlim(0.0, max(flight_end(flight.tape) for flight in flights) or 1.0)
-        handles = {label: line for axes in grid for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        handles: dict[str, Any] = {}
+        for axes in grid:
+            lines, labels = axes.get_legend_handles_labels()
+            handles |= dict(zip(labels, lines, strict=True))
         figure.legend(handles.values(), handles.keys(), loc="outside upper left", ncols=2, frameon=False)
         stamps = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(suffix, {})
         with replacing(path) as stream:
@@ -124,7 +128,7 @@ def write_figure(
 
 def _names(flights: Sequence[RecordedFlight], topic: str) -> list[str]:
     """Channels of a topic on any of the tapes."""
-    return list(dict.fromkeys(name for flight in flights if topic in flight.tape for name in flight.tape[topic].names))
+    return list(dict.fromkeys(chain.from_iterable(flight.tape[topic].names for flight in flights if topic in flight.tape)))
 
 
 def _draw(axes: "Axes", flights: Sequence[RecordedFlight], name: str) -> None:
@@ -177,22 +181,22 @@ def _mat_structure(flight: RecordedFlight) -> dict[str, Any]:
     topics = matlab_names(flight.tape.signals)
     original: dict[str, dict[str, str]] = {}
     for topic, signal in flight.tape.signals.items():
-        names = matlab_names(signal.names, taken=("stamp_ns", "t"))
+        names = matlab_names(signal.names, used_names=("stamp_ns", "t"))
         columns = {names[name]: np.asarray(signal[name], dtype=np.float64) for name in signal.names}
         t = (signal.stamp_ns - flight.tape.start_ns) / NANOSECONDS
         structure[topics[topic]] = {"stamp_ns": signal.stamp_ns.astype(np.int64), "t": t, **columns}
-        original[topics[topic]] = {given: name for name, given in names.items()}
+        original[topics[topic]] = {permitted: name for name, permitted in names.items()}
     units = {name: unit.unit for name, unit in flight.units.items()}
     notes: dict[str, Any] = {"name": flight.name, "outcome": str(flight.summary["outcome"])}
     notes |= {"scenario": flight.summary["scenario"] or ""}
-    free = matlab_names(("info",), taken=structure)
+    free = matlab_names(("info",), used_names=structure)
     notes |= {"units_of_report": {matlab_names((name,))[name]: unit for name, unit in units.items()}, "channels": original}
     return structure | {free["info"]: notes}
 
 
-def matlab_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
+def matlab_names(names: Iterable[str], used_names: Iterable[str] = ()) -> dict[str, str]:
     """Names that MATLAB permits by name: letters, digits and _, a letter first, 63 characters, no keyword, each once."""
-    used = set(taken)
+    used = set(used_names)
     permitted = {}
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)

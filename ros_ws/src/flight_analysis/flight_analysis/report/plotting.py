@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from hashlib import blake2b
+from itertools import chain
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -159,9 +160,9 @@ class Figure:
         self.y: list[dict[str, Any]] = []
         for index in range(count):
             row, column = divmod(index, columns)
-            left = column * (wide + across)
+            left_edge = column * (wide + across)
             bottom = (self.rows - 1 - row) * (high + between)
-            self.x.append({"anchor": axis("y", index), "domain": [left, left + wide]})
+            self.x.append({"anchor": axis("y", index), "domain": [left_edge, left_edge + wide]})
             self.y.append({"anchor": axis("x", index), "domain": [bottom, bottom + high]})
         self.layout: dict[str, Any] = {"shapes": [], "annotations": []}
         for letter, axes in (("x", self.x), ("y", self.y)):
@@ -179,7 +180,7 @@ def axis(name: str, index: int) -> str:
 
 def time_series_figure(context: PlotContext, curves: Mapping[str, Curve], *, columns: int = 1, height: int = 150) -> Figure:
     """A subplot of `height` pixels per channel, with the curves of the channel; two columns are filled row by row."""
-    channels = list(dict.fromkeys(name for curve in curves.values() for name in curve.signal.names))
+    channels = list(dict.fromkeys(chain.from_iterable(curve.signal.names for curve in curves.values())))
     columns = min(columns, len(channels))
     figure = Figure(len(channels), columns, height)
     followed = (figure.rows - 1) * columns

@@ -43,7 +43,8 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
     if truth is not None:
         groups = [name for name in truth.names if name.startswith(("actuator.", "gust.")) or name in attitude]
         topics["truth"] = _topic(context, truth, {name: name.partition(".")[2] for name in groups})
-    if not {"phi", "x.phi"} & {name for topic in topics.values() for name in topic["channels"]}:
+    names = set().union(*(topic["channels"] for topic in topics.values()))
+    if not {"phi", "x.phi"} & names:
         return None
     if "internals" in tape:
         topics["internals"] = _topic(context, tape["internals"], {"mode": ""})
@@ -60,14 +61,14 @@ def replay(flight: RecordedFlight, context: PlotContext) -> Replay | None:
 
 def _topic(context: PlotContext, signal: Signal, channels: dict[str, str]) -> dict[str, Any]:
     """Where times and values of channels are, with the factors of their units; `channels` maps names to names of the units."""
-    found = {}
+    stored_channels = {}
     times = ""
     for name, quantity in channels.items():
         if name in signal.names:
             factor = context.units.get(quantity, NO_UNIT).factor
             times, values = stored(context, signal, name, factor)
-            found[name] = [values, factor]
-    return {"t": times, "channels": found}
+            stored_channels[name] = [values, factor]
+    return {"t": times, "channels": stored_channels}
 
 
 def _thinned(pose: Signal) -> Signal:

@@ -118,10 +118,10 @@ def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFl
     if outcome == COMPLETED and not {"u", "internals"} & set(log.signals) and engagements is None:
         outcome = f"{NEVER_FLEW}: the controller never engaged"
     tape = flown(log)
-    of = account(log, scenario, outcome, simulated=engagements is None)
+    flight_account = account(log, scenario, outcome, simulated=engagements is None)
     engaged = _engaged(tape, engagements or [])
     has_figures = {"y", "y_m"} <= set(engaged.signals)  # an engagement may be shorter than a sample
-    summary = summarise(engaged if has_figures else tape, scenario, outcome, of)
+    summary = summarise(engaged if has_figures else tape, scenario, outcome, flight_account)
     if engagements is not None:
         summary["engagements"] = [_engagement(tape, engagement) for engagement in engagements]
         summary["notes"] = [*engagement_notes(summary["engagements"], has_figures=has_figures), *summary["notes"]]
@@ -245,8 +245,8 @@ def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, si
         return tape.outcome
     if folder is not None:
         with suppress(ParameterError):
-            if left := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):
-                return bounded(left.strip())
+            if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):
+                return bounded(outcome.strip())
     return outcome_of_log(tape, scenario, simulated=simulated) or f"{UNKNOWN}: neither the run nor the log has one"
 
 

@@ -83,12 +83,11 @@ def display_units(scenario: Scenario) -> dict[str, DisplayUnit]:
 def pulse_edges(scenario: Scenario) -> list[Transient]:
     """Edges of the scenario's pulses as transients, in order of time."""
     profile = scenario.reference_model.profile()
-    edges = [
-        Transient("command", name, float(time), float(time + profile.rise))
-        for name, times, changes in zip(scenario.reference_model.outputs, profile.time, profile.change, strict=True)
-        for time, change in zip(times, changes, strict=True)
-        if change != 0.0
-    ]
+    edges = []
+    for name, times, changes in zip(scenario.reference_model.outputs, profile.time, profile.change, strict=True):
+        for time, change in zip(times, changes, strict=True):
+            if change != 0.0:
+                edges.append(Transient("command", name, float(time), float(time + profile.rise)))
     return sorted(edges, key=lambda edge: edge.start)
 
 
@@ -135,12 +134,12 @@ class RecordedFlight(NamedTuple):
 
 
 def summarise(
-    tape: Tape, scenario: Scenario | None = None, outcome: str | None = None, of: Account | None = None
+    tape: Tape, scenario: Scenario | None = None, outcome: str | None = None, flight_account: Account | None = None
 ) -> dict[str, Any]:
     """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys.
 
-    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `of` is the account of
-    the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
+    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `flight_account` is
+    that of the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
     """
     flown = as_tape(tape).scenario if scenario is None else scenario
     require(flown is not None, "scenario", "none on the tape of a log", "summarise(run.tape, recorded_scenario(run))")
@@ -150,17 +149,17 @@ def summarise(
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
         refused = "".join(f" ({note})" for note in tape.notes if note.startswith(f"{topic}: ") and "refused" in note)
         require(topic in tape, "the log", f"no sample of {topic}{unset}{refused}", "a flight with y and y_m")
-    of = account(tape, scenario, outcome) if of is None else of
+    flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     events = transients(scenario, tape)
-    of = of._replace(commands=_commands(tape, events, of.end))
+    flight_account = flight_account._replace(commands=_commands(tape, events, flight_account.end))
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_metrics(tape)
     age = age_metrics(tape)
     if tape.start_ns > SINCE_EPOCH_NS:  # in real time
-        of = _with_late_ticks(of, ticks, scenario)
-    notes = [of.busy] if of.busy else []
-    summary = empty_summary(scenario, final_outcome(outcome, of)) | {
-        "duration": _duration(tape, of),
+        flight_account = _with_late_ticks(flight_account, ticks, scenario)
+    notes = [flight_account.busy] if flight_account.busy else []
+    summary = empty_summary(scenario, final_outcome(outcome, flight_account)) | {
+        "duration": _duration(tape, flight_account),
         "error": best_error(tape)[0],
         "errors": _errors(tape, events),
         "inputs": _inputs(tape, events),
@@ -173,7 +172,7 @@ def summarise(
         "age_of_u": None if age is None or not np.isfinite(age).all() else age._asdict(),
         "guidance": guidance_summary(tape, scenario.guidance),
         "models": [span._asdict() for span in errors_by_model(tape)],
-        "account": of.as_json(),
+        "account": flight_account.as_json(),
         "notes": [
             *notes,
             *late_u(scenario, age),
@@ -191,13 +190,13 @@ def summarise_imported(tape: Tape, source: Mapping[str, str]) -> dict[str, Any]:
 
     It has no reference, and so no error. `source`: of `rise-di import`, the metadata record IMPORTED.
     """
-    of = account(tape, None)
-    deviations = {
-        key: {name: {"whole": parts["whole"]._asdict()} for name, parts in inputs_by_part(tape, (), topic=topic).items()}
-        for key, topic in (("outputs", "y"), ("inputs", "u"))
-    }
-    summary = empty_summary(None, IMPORT) | deviations | {"duration": of.end, "account": of.as_json()}
-    summary |= {"source": dict(source), "notes": [*filter(None, [source.get(COMPARED)]), *of.notes(), *tape.notes]}
+    flight_account = account(tape, None)
+    deviations = {}
+    for key, topic in (("outputs", "y"), ("inputs", "u")):
+        by_channel = inputs_by_part(tape, (), topic=topic)
+        deviations[key] = {name: {"whole": parts["whole"]._asdict()} for name, parts in by_channel.items()}
+    summary = empty_summary(None, IMPORT) | deviations | {"duration": flight_account.end, "account": flight_account.as_json()}
+    summary |= {"source": dict(source), "notes": [*filter(None, [source.get(COMPARED)]), *flight_account.notes(), *tape.notes]}
     return {key: finite_or_null(value) for key, value in summary.items()}
 
 
@@ -213,33 +212,33 @@ def late_u(scenario: Scenario, age: AgeMetrics | None) -> list[str]:
     from flight_analysis.closed_loop.loop_margins import scenario_loop  # noqa: PLC0415 - loads SciPy, which few flights need
 
     try:
-        of = scenario_loop(scenario, controller)
+        linear = scenario_loop(scenario, controller)
     except ParameterError:  # no linear model
         return []
-    margin = delay_margin(of.nominal, of.law, of.loop)
+    margin = delay_margin(linear.nominal, linear.law, linear.loop)
     late = f"u is {1e3 * age.mean:.1f} ms old at the aircraft"
-    beyond = age.mean - controller.delay - margin
-    made = f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of {1e3 * margin:.1f} ms"
-    return [f"{late}, {made}: {'more than' if beyond > 0.0 else 'within'} the margin; see rise-di gains --delay"]
+    late_past_margin = age.mean - controller.delay - margin
+    designed = f"the gains are made for {1e3 * controller.delay:.1f} ms, with a delay margin of {1e3 * margin:.1f} ms"
+    return [f"{late}, {designed}: {'more than' if late_past_margin > 0.0 else 'within'} the margin; see rise-di gains --delay"]
 
 
 def _commands(tape: Tape, events: Sequence[Transient], end: float) -> Commands:
     commands = [event.start for event in events if event.kind == "command"]
     targets = sum(tape.recording[topic].found for topic in ("target", "route") if topic in tape.recording)
     guided = "guidance" in tape and "given" in tape["guidance"].names
-    taken = int(np.count_nonzero(tape["guidance"]["given"])) if guided else 0
-    return Commands(len(commands), sum(start <= end for start in commands), targets, taken)
+    steps_taken = int(np.count_nonzero(tape["guidance"]["given"])) if guided else 0
+    return Commands(len(commands), sum(start <= end for start in commands), targets, steps_taken)
 
 
 def command_results(summary: Mapping[str, Any]) -> str:
     """The commands that the flight did not fly, and the targets: "8 of 24 commands flown"; empty without any."""
-    of = account_of_json(summary)
-    if of is None or of.commands is None:
+    flight_account = account_of_json(summary)
+    if flight_account is None or flight_account.commands is None:
         return ""
-    given, flown, targets, taken = of.commands
-    parts = [f"{flown} of {given} commands flown"] if flown < given else []
+    planned, flown, targets, steps_taken = flight_account.commands
+    parts = [f"{flown} of {planned} commands flown"] if flown < planned else []
     if targets:
-        parts.append(f"{targets} targets and routes given, guidance took commands in {taken} steps")
+        parts.append(f"{targets} targets and routes given, guidance took commands in {steps_taken} steps")
     return "; ".join(parts)
 
 
@@ -247,24 +246,29 @@ STANDS_STILL = 5.0  # s, after which a vane at the end of a flight is named
 BUSY = 0.05  # share of the ticks without a new y of a host that is too busy
 
 
-def _with_late_ticks(of: Account, ticks: TickMetrics | None, scenario: Scenario) -> Account:
+def _with_late_ticks(flight_account: Account, ticks: TickMetrics | None, scenario: Scenario) -> Account:
     """The account with the ticks that found no new y although the log has every y: the host is too busy.
 
     The rate of y is that of the scenario: that of an autopilot is not known.
     """
-    whole = not (of.over("y", "internals") and not of.busy) and not of.lacks and not scenario.aircraft.sensors.dropout
-    rated = "y" in of.topics and of.topics["y"].expected is not None
-    if ticks is None or not whole or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
-        return of
+    log_complete = (
+        not (flight_account.over("y", "internals") and not flight_account.busy)
+        and not flight_account.lacks
+        and not scenario.aircraft.sensors.dropout
+    )
+    rated = "y" in flight_account.topics and flight_account.topics["y"].expected is not None
+    if ticks is None or not log_complete or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
+        return flight_account
     late = f"{ticks.without_new_y} ticks without a new y"
-    return of._replace(busy=f"{late}: this host is too busy; see docs/faults.md" if not of.busy else f"{late}; {of.busy}")
+    reason = f"; {flight_account.busy}" if flight_account.busy else ": this host is too busy; see docs/faults.md"
+    return flight_account._replace(busy=f"{late}{reason}")
 
 
-def _duration(tape: Tape, of: Account) -> float | None:
+def _duration(tape: Tape, flight_account: Account) -> float | None:
     """Flight time of the last y, s; of a log that lacks y, the end of the flight."""
     if not len(tape["y"].stamp_ns):
         return None
-    return of.end if of.over("y") else float(tape.time("y")[-1])
+    return flight_account.end if flight_account.over("y") else float(tape.time("y")[-1])
 
 
 FIGURES = {
@@ -278,9 +282,9 @@ FIGURES = {
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
     """The part of the flight over which the figures of a table are taken, after a comma; empty for the whole flight."""
-    of = account_of_json(summary)
+    flight_account = account_of_json(summary)
     truth = ("truth",) if table == "errors" and summary["error"] == TRUE_ERROR else ()
-    part = "" if of is None else of.over(*truth, *FIGURES[table])
+    part = "" if flight_account is None else flight_account.over(*truth, *FIGURES[table])
     return f", {part}" if part else ""
 
 
@@ -347,20 +351,24 @@ def _errors(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
     bands = settling_bands(tape)
     floors = noise_floor(tape)
     switches = sign_switches(tape)
-    return {
-        channel: {part: metrics._asdict() for part, metrics in parts.items()}
-        | {"bound": parts["calm"].max, "band": bands[channel], "floor": floors[channel]}
-        | {"sign_switches": switches.get(channel)}
-        for channel, parts in errors_by_part(tape, events).items()
-    }
+    figures = {}
+    for channel, parts in errors_by_part(tape, events).items():
+        figures[channel] = {part: metrics._asdict() for part, metrics in parts.items()} | {
+            "bound": parts["calm"].max,
+            "band": bands[channel],
+            "floor": floors[channel],
+            "sign_switches": switches.get(channel),
+        }
+    return figures
 
 
 def _inputs(tape: Tape, events: Sequence[Transient]) -> dict[str, Any]:
     saturation = saturation_shares(tape)
-    return {
-        name: {part: metrics._asdict() for part, metrics in parts.items()} | {"limited": saturation.get(name)}
-        for name, parts in inputs_by_part(tape, events).items()
-    }
+    figures: dict[str, Any] = {}
+    for name, parts in inputs_by_part(tape, events).items():
+        by_part: dict[str, Any] = {part: metrics._asdict() for part, metrics in parts.items()}
+        figures[name] = by_part | {"limited": saturation.get(name)}
+    return figures
 
 
 def finite_or_null(value: Any) -> Any:
@@ -420,7 +428,7 @@ SETTLING_COLUMNS = {kind: Column("settling (s)", kind) for kind in ("command", "
 
 def columns_of(columns: Sequence[Column], channels: Mapping[str, Any]) -> tuple[Column, ...]:
     """The columns whose part of the flight the metrics have: a guided flight has "capture" and "turn" in place of "command"."""
-    parts = {part for metrics in channels.values() for part in metrics}
+    parts = set().union(*channels.values())
     return tuple(column for column in columns if column.path[0] in parts)
 
 
@@ -462,16 +470,12 @@ def model_rows(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayU
 
 def table_rows(channels: Mapping[str, Any], columns: Sequence[Column], units: Mapping[str, DisplayUnit]) -> list[list[str]]:
     """Rows for "errors" or "inputs" of a summary: the channel with the unit, then a cell per column."""
-    return [
-        [
-            channel_label(name, units),
-            *(
-                format_value(metric(metrics, *column.path), units.get(name, NO_UNIT).factor if column.scaled else 1.0)
-                for column in columns
-            ),
-        ]
-        for name, metrics in channels.items()
-    ]
+    rows = []
+    for name, metrics in channels.items():
+        factor = units.get(name, NO_UNIT).factor
+        cells = [format_value(metric(metrics, *column.path), factor if column.scaled else 1.0) for column in columns]
+        rows.append([channel_label(name, units), *cells])
+    return rows
 
 
 def input_rows(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> list[list[str]]:

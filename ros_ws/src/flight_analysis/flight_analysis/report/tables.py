@@ -152,9 +152,9 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
     for title, key in (("Outputs", "outputs"), ("Inputs", "inputs")):
         columns = columns_of(INPUT_COLUMNS, summary[key])
         tables.append(Table(title, columns, table_rows(summary[key], columns, units), IMPORTED_LEGEND))
-    of = account_of_json(summary)
+    flight_account = account_of_json(summary)
     rows = []
-    for name, topic in ({} if of is None else of.topics).items():
+    for name, topic in ({} if flight_account is None else flight_account.topics).items():
         length = (topic.last or 0.0) - (topic.first or 0.0)
         rate = (topic.found - 1) / length if length else None
         rows.append([name, f"{topic.found}", format_value(rate), format_value(topic.gap)])
@@ -163,11 +163,11 @@ def imported_tables(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]
 
 def _error_table(summary: Mapping[str, Any], units: Mapping[str, DisplayUnit]) -> Table:
     columns = columns_of((*ERROR_COLUMNS, NOISE_FLOOR_COLUMN, SWITCH_COLUMN), summary["errors"])
-    settling = [kind for kind in SETTLING_COLUMNS if any(kind in metrics for metrics in summary["errors"].values())]
-    rows = [
-        [*row, *(slowest_settling(summary, channel, kind) for kind in settling)]
-        for channel, row in zip(summary["errors"], table_rows(summary["errors"], columns, units), strict=True)
-    ]
+    parts = set().union(*summary["errors"].values())
+    settling = [kind for kind in SETTLING_COLUMNS if kind in parts]
+    rows = table_rows(summary["errors"], columns, units)
+    for channel, row in zip(summary["errors"], rows, strict=True):
+        row.extend(slowest_settling(summary, channel, kind) for kind in settling)
     caption = f"Tracking error ({summary['error']}){taken_over(summary, 'errors')}"
     legend = f"{parts_legend(summary)}. {ERROR_LEGEND}{NOISE_FLOOR_LEGEND}"
     return Table(caption, (*columns, *(SETTLING_COLUMNS[kind] for kind in settling)), rows, legend)
@@ -223,11 +223,11 @@ def _tick_table(summary: Mapping[str, Any]) -> Table:
 
 
 def _process_table(summary: Mapping[str, Any]) -> Table:
-    of = account_of_json(summary)
-    processes = {} if of is None else of.processes
+    flight_account = account_of_json(summary)
+    processes = {} if flight_account is None else flight_account.processes
     columns = [Column("", "ready (s)"), *(Column("output", head) for head in ("first (s)", "last (s)", "samples"))]
-    rows = [
-        [name, *("" if time is None else f"{time:.3f}" for time in times), f"{samples}"]
-        for name, (*times, samples) in processes.items()
-    ]
+    rows = []
+    for name, (*times, samples) in processes.items():
+        cells = ["" if time is None else f"{time:.3f}" for time in times]
+        rows.append([name, *cells, f"{samples}"])
     return Table("Processes", columns, rows)
