@@ -94,7 +94,7 @@ def test_gains_of_theorem_1_meet_conditions() -> None:
     assert not gain_conditions.failing(conditions)
     assert [condition.margin for condition in conditions[:3]] == pytest.approx([1.0, 1.0, 1.0])  # the least beta
     assert conditions[3].margin == pytest.approx(1.5)
-    assert (conditions[4].found, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
+    assert (conditions[4].value, conditions[4].bound) == pytest.approx((0.3, 1.0 / 3.0))  # 2 rows of 0.15; 1 - 2/3
 
 
 @pytest.mark.equation(29, 30, "Step 2")

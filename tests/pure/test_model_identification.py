@@ -210,7 +210,7 @@ def test_the_osprey_has_two_blocks() -> None:
 
 def test_innovations_of_right_model_are_white_and_of_unit_covariance() -> None:
     block = innovation_filters.blocks(osprey_model())[0]
-    model = block.of(osprey_model())
+    model = block.restricted(osprey_model())
     model = model._replace(A=model.A[None], B=model.B[None], wind=model.wind[None], gravity=0.0 * model.gravity)
     names = Names(("V", "alpha", "q", "theta"), ("elevator", "thrust"), ("q", "V"), ("vertical", "longitudinal"))
     bank = innovation_filters.filter_bank(model, names, 25.0, np.ones((1, 2)))

@@ -158,7 +158,7 @@ def test_trade_predicts_the_flight() -> None:
     _, error = best_error(flown)
     rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
     np.testing.assert_allclose(row.rms, rms, rtol=0.05)
-    assert row.found >= row.phase_margin
+    assert row.reached >= row.phase_margin
 
 
 def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:

@@ -195,7 +195,7 @@ def _show_trade(console: Console, selection: Selection) -> None:
     table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left=())
     for row in trade(selection):
         errors = (f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True))
-        margins = f"{row.phase_margin:g}", f"{row.found:.0f}", _milliseconds(row.delay_margin)
+        margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
         table.add_row(*margins, *errors, f"{float(np.sum(row.rms / units)):.2f}")
     console.print(table)
 
@@ -315,7 +315,7 @@ def _milliseconds(margin: float) -> str:
 def _cells(condition: Condition) -> tuple[str, str]:
     margin = "" if math.isnan(condition.margin) else f"{condition.margin:.2g}"
     side = SIDES[condition.side]
-    return f"{condition.found:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
+    return f"{condition.value:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
 def _as_json(found: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
@@ -342,7 +342,7 @@ def _as_json(found: Study, answers: dict[str, Assessment], seed: int) -> dict[st
                     "name": condition.name,
                     "part": part,
                     "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
-                    "found": condition.found,
+                    "found": condition.value,
                     condition.side.replace(" ", "_"): condition.bound,
                     "margin": condition.margin,
                     "holds": condition.holds,

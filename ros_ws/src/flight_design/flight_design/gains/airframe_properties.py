@@ -8,6 +8,7 @@ have bounded rates for bounded angular rates.
 
 from collections.abc import Sequence
 from enum import StrEnum
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -157,7 +158,7 @@ def output_coordinates(C: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 def marginal_sentence(facts: Sequence[AirframeFacts]) -> str:
     """Which zeros on the imaginary axis Assumption 3 does not cover; "" for none."""
-    states = list(dict.fromkeys(state for airframe in facts for state in airframe.integrated))
+    states = list(dict.fromkeys(chain.from_iterable(airframe.integrated for airframe in facts)))
     names = [airframe.name for airframe in facts if airframe.zero_dynamics is ZeroDynamics.MARGINAL]
     if not names:
         return ""

@@ -116,9 +116,10 @@ def scenario_text(
         if length == 8.0:
             pulses[output] = {"start": [start], "stop": [start + length], "value": [value]}
         start += 3.0 if length == 2.0 else 4.0
+    crosswise = [axis for axis in airframe.gusts if axis != "longitudinal"]
     gusts = {
         axis: {"start": 32.0 + 3.0 * k, "speed": round(0.03 * V0, 2), "length": round(0.5 * V0, 1)}
-        for k, axis in enumerate(axis for axis in airframe.gusts if axis != "longitudinal")
+        for k, axis in enumerate(crosswise)
     }
     return SCENARIO_YAML.render(
         airframe=airframe,
@@ -145,19 +146,19 @@ def scenario_text(
 
 
 def _surfaces(airframe: Airframe) -> list[bool]:
-    return [quantity(given.unit).dimension == ANGLE for given in airframe.inputs.values()]
+    return [quantity(channel.unit).dimension == ANGLE for channel in airframe.inputs.values()]
 
 
 def _stops(airframe: Airframe) -> list[float]:
     """The end stop of each input: STOP of a surface, of another input what gives AUTHORITY on the output that it moves."""
     Omega = np.abs(airframe.matrix_c() @ airframe.matrix_b())
-    given = np.array([AUTHORITY.get(quantity(unit).dimension, 1.0) for unit in airframe.units_of_outputs().values()])
-    moved = np.argmax(Omega / given[:, None], axis=0).tolist()
+    authorities = np.array([AUTHORITY.get(quantity(unit).dimension, 1.0) for unit in airframe.units_of_outputs().values()])
+    moved = np.argmax(Omega / authorities[:, None], axis=0).tolist()
     if len(airframe.inputs) == len(airframe.outputs):
         for i, j in enumerate(pairing(airframe)):
             moved[j] = i
     return [
-        STOP if surface else float(f"{given[i] / max(Omega[i, j], 1e-9):.3g}")
+        STOP if surface else float(f"{authorities[i] / max(Omega[i, j], 1e-9):.3g}")
         for j, (surface, i) in enumerate(zip(_surfaces(airframe), moved, strict=True))
     ]
 

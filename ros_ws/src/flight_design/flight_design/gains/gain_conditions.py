@@ -70,42 +70,42 @@ class Bounds(NamedTuple):
 
 
 class Condition(NamedTuple):
-    """One condition on a gain set: found >= bound, found <= bound, or, if it is strict, found > bound."""
+    """One condition on a gain set: value >= bound, value <= bound, or, if it is strict, value > bound."""
 
     name: str
     channel: int | None  # None: all of them together
-    found: float
+    value: float
     bound: float
     at_least: bool = True
     estimate: bool = False  # depends on gamma_2, an assumption
-    strict: bool = False  # found = bound does not meet it
+    strict: bool = False  # value = bound does not meet it
 
     @property
     def side(self) -> str:
-        """The relation in words: found is "at least", "at most" or "above" the bound."""
+        """The relation in words: the value is "at least", "at most" or "above" the bound."""
         return "above" if self.strict else "at least" if self.at_least else "at most"
 
     @property
     def holds(self) -> bool:
         """Whether the gain set meets it."""
         if self.strict:
-            return self.found > self.bound
+            return self.value > self.bound
         slack = BOUND_TOLERANCE * abs(self.bound)
-        return self.found >= self.bound - slack if self.at_least else self.found <= self.bound + slack
+        return self.value >= self.bound - slack if self.at_least else self.value <= self.bound + slack
 
     @property
     def margin(self) -> float:
         """Factor by which it is met: below 1 if it fails, 0 if no gain can meet it, NaN for a lower bound of 0."""
         if self.at_least:
-            return self.found / self.bound if self.bound > 0.0 else math.nan
+            return self.value / self.bound if self.bound > 0.0 else math.nan
         if self.bound <= 0.0:
             return 0.0
-        return self.bound / self.found if self.found > 0.0 else math.inf
+        return self.bound / self.value if self.value > 0.0 else math.inf
 
     def sentence(self, channels: Sequence[str]) -> str:
         """In the form of errors: "beta (30) of q: found 15, expected at least 29.1"; `channels` are the names of y."""
         where = self.name if self.channel is None else f"{self.name} of {channels[self.channel]}"
-        return f"{where}: found {self.found:.4g}, expected {self.side} {self.bound:.4g}"
+        return f"{where}: found {self.value:.4g}, expected {self.side} {self.bound:.4g}"
 
 
 def failing(conditions: Sequence[Condition]) -> tuple[Condition, ...]:
@@ -276,8 +276,8 @@ def check_loop(
     conditions: list[Condition] = []
     total = loop.total
 
-    def add(name: str, found: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
-        pairs = enumerate(zip(found, bound, strict=True))
+    def add(name: str, values: FloatArray, bound: FloatArray, *, at_least: bool) -> None:
+        pairs = enumerate(zip(values, bound, strict=True))
         finite = ((i, float(a), float(b)) for i, (a, b) in pairs if math.isfinite(b))
         conditions.extend(Condition(name, i, a, b, at_least) for i, a, b in finite)
 

@@ -203,8 +203,8 @@ def _with_limits(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> L
         stops = getattr(aircraft.actuators, key)
         if stops:
             by_input = dict(zip(aircraft.channels().inputs, stops, strict=True))
-            own = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
-            limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(own, loop.base.inputs, strict=True))
+            bounds = getattr(loop.base, key) or [by_input[name] for name in loop.base.inputs]
+            limits[key] = tuple(tighter(value, by_input[name]) for value, name in zip(bounds, loop.base.inputs, strict=True))
     return loop._replace(base=loop.base.model_copy(update=limits))
 
 
@@ -226,16 +226,17 @@ def _allocated(loop: LoopSetting, scenario: Scenario, airframe: Airframe) -> tup
     """
     actuators = scenario.aircraft.actuators
     names = list(airframe.inputs)
-    own = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
-    stops = own and actuators.lower and actuators.upper
+    same_airframe = not scenario.aircraft.is_jsbsim and load_airframe(scenario.aircraft.airframe).name == airframe.name
+    stops = same_airframe and actuators.lower and actuators.upper
     require(bool(stops), "scenario", scenario.name, f"a scenario of {airframe.name} with aircraft.actuators, lower and upper")
-    given = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True)) | dict(loop.lag)
+    lags = dict(zip(names, actuators.lag or [0.0] * len(names), strict=True)) | dict(loop.lag)
     rate = np.array(actuators.rate or [np.inf] * len(names))
-    lag = np.array([given[name] for name in names])
+    lag = np.array([lags[name] for name in names])
     effectors = Effectors(np.array(actuators.lower), np.array(actuators.upper), rate, lag)
     earlier = loop.base.allocation
-    kept = () if earlier is None or earlier.priority is None else [name.removeprefix(LAW_INPUT) for name in earlier.priority]
-    allocation, law = design_allocation(airframe, effectors, kept)
+    ranked = () if earlier is None or earlier.priority is None else earlier.priority
+    priority = [name.removeprefix(LAW_INPUT) for name in ranked]
+    allocation, law = design_allocation(airframe, effectors, priority)
     m = len(law.names)
     slew = dict(zip(law.names, law.slew.tolist(), strict=True))
     base = {
@@ -315,30 +316,30 @@ def observed(
     candidates = [(gains_by_rule(nominal, axes, model.speed), origin)]
     if sketched:
         candidates = [(gains_beside_sketch(nominal, controller.outputs, axes, model.speed), origin)]
-    of_tuned = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
-    ratios = [lag / of_tuned.get(name, np.inf) for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)]
+    tuned_lag = dict(zip(tuned.controller.outputs, loop_of(tuned.controller).total, strict=True))
+    ratios = [lag / tuned_lag.get(name, np.inf) for name, lag in zip(controller.outputs, nominal.total_lag, strict=True)]
     if searched and max(ratios) < SLOWER and tuple(scenario.aircraft.load()[0].states) == tuple(model.states):
         titles = (f"gains of a search in {tuned.name}, law {law} on {OBJECTIVE}" for _, law, _ in searched)
-        of_search = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
-        candidates = list(zip(of_search, titles, strict=True))
+        searched_gains = (gains_of_search(result.gains, nominal.total_lag) for _, _, result in searched)
+        candidates = list(zip(searched_gains, titles, strict=True))
     sets, origins = zip(*candidates, strict=True)
-    found = with_aircraft_observer(
+    selected = with_aircraft_observer(
         controller, model, sets, noise, margin, needed, vanes, uncertain=uncertain, speeds=speeds, progress=progress
     )
-    origin = origins[found.place]
-    factors = zip(found.controller.outputs, found.relaxation.tolist(), strict=True)
+    origin = origins[selected.place]
+    factors = zip(selected.controller.outputs, selected.relaxation.tolist(), strict=True)
     relaxed = ", ".join(f"{output} {factor:.2f}" for output, factor in factors if factor > 1.0)
     lowered = f"; for the margin K and integral /, effort x {relaxed}" if relaxed else ""
-    margins = f"delay margin {1e3 * found.delay_margin:.0f} ms, phase margin {np.degrees(found.phase_margin):.0f} deg"
-    beside = f" with vanes for {' and '.join(vanes)}" if vanes else ""
-    return found.controller, f"observer of {model.name}{beside}: {origin}{lowered}; {margins}"
+    margins = f"delay margin {1e3 * selected.delay_margin:.0f} ms, phase margin {np.degrees(selected.phase_margin):.0f} deg"
+    vane_text = f" with vanes for {' and '.join(vanes)}" if vanes else ""
+    return selected.controller, f"observer of {model.name}{vane_text}: {origin}{lowered}; {margins}"
 
 
 def _tuned_scenario(scenario: Scenario) -> Scenario:
     """The scenario itself if it has tuned gains, else one that ships with the same airframe and actuators and has them."""
     shipped = (find_scenario(path.stem) for path in sorted(tuned_gains.TUNED.glob("*.yaml")))
-    own = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
-    alike = (candidate for candidate in shipped if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == own)
+    model = scenario.aircraft.airframe, scenario.aircraft.actuators.lag
+    equal = (candidate for candidate in shipped if (candidate.aircraft.airframe, candidate.aircraft.actuators.lag) == model)
     return next(
-        (candidate for candidate in (scenario, *alike) if tuned_gains.load(tuned_gains.tuned_file(candidate))), scenario
+        (candidate for candidate in (scenario, *equal) if tuned_gains.load(tuned_gains.tuned_file(candidate))), scenario
     )

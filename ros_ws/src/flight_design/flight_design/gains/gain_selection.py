@@ -211,23 +211,24 @@ def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
     A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed. Raises ParameterError for an
     output without command in the scenario.
     """
-    whole = scenario.reference_model
+    commands = scenario.reference_model
     for name in airframe.outputs:
         require(
-            name in whole.outputs,
+            name in commands.outputs,
             f"{scenario.name}: reference_model.outputs",
-            ", ".join(whole.outputs),
+            ", ".join(commands.outputs),
             f"{name} too: --scenario has them",
         )
-    values = whole.model_dump(exclude_none=True)
-    if set(airframe.outputs) != set(whole.outputs):
+    values = commands.model_dump(exclude_none=True)
+    if set(airframe.outputs) != set(commands.outputs):
         require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
-        kept = [whole.outputs.index(name) for name in airframe.outputs]
+        rows = [commands.outputs.index(name) for name in airframe.outputs]
         values["outputs"] = airframe.outputs
-        values["second_order"] = {key: [row[i] for i in kept] for key, row in values["second_order"].items()}
+        for key, row in values["second_order"].items():
+            values["second_order"][key] = [row[i] for i in rows]
         for key in ("pulses", "sines"):
             values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
-    turn = whole.coordinated_turn
+    turn = commands.coordinated_turn
     if turn is not None:
         present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs) and airframe.speed > 0.0
         values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
@@ -262,7 +263,7 @@ def study_airframe(
     C = airframe.matrix_c()
     n = len(airframe.states)
     m = len(airframe.outputs)
-    of_y, of_eta, H = output_coordinates(C)
+    P, N, H = output_coordinates(C)
     Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
     require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
     inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
@@ -274,7 +275,7 @@ def study_airframe(
         return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
 
     def state(k: int, eta: FloatArray) -> FloatArray:
-        return np.asarray((of_y @ y_m[k])[:, None] + of_eta @ eta)
+        return np.asarray((P @ y_m[k])[:, None] + N @ eta)
 
     def drift(t: Any, x: FloatArray) -> FloatArray:
         return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
@@ -325,9 +326,8 @@ def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, F
 def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
     """The aircraft with f for states in columns, shape (n, columns), the last column without gusts."""
     gust_on = np.append(np.ones(columns - 1), 0.0)
-    start, speed, length = (
-        np.array([[getattr(gust, key)] for gust in gusts.values()]).reshape(-1, 1) for key in ("start", "speed", "length")
-    )
+    profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(-1, 3)
+    start, speed, length = np.split(profiles, 3, axis=1)
     directions = [airframe.gust_direction(name) for name in gusts]
     return Aircraft(
         airframe.matrix_a(),
@@ -360,12 +360,12 @@ def require_channels(
     except DecompositionError as error:
         problem = f"no D, for leading minor {error.minor} is zero"
     if problem:
-        found = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
+        named = ", ".join(f"{output}-{name}" for output, name in zip(*channels, strict=True))
         fits = f"inputs that can be paired: {'no order of these' if m <= MANY else 'none of three orders that were tried'} can"
         if better := search(Omega, MAX_COUPLING):
             pairs = (f"{channels.outputs[i]}-{channels.inputs[j]}" for i, j in zip(*better[:2], strict=True))
             fits = f"another pairing: {', '.join(pairs)}"
-        raise ParameterError(f"controller.inputs: found {found} with {problem}, expected {fits}")
+        raise ParameterError(f"controller.inputs: found {named} with {problem}, expected {fits}")
     actual = signs(Omega) * flips
     stated = actual if D is None else np.array(D, dtype=np.float64)
     wrong = [name for name, a, b in zip(channels.inputs, actual, stated, strict=True) if a != b]
@@ -403,7 +403,10 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     loop = Loop(_by_name(setting.lag, pairing.inputs, 0.0), setting.delay, 1.0 / setting.rate)
     bandwidth = gain_conditions.bandwidths(loop, products)
     places = np.argsort(-bandwidth, kind="stable").tolist()  # the fastest first: (22) gives the last channel the smallest K
-    channels = ChannelPairing(*(tuple(names[i] for i in places) for names in pairing))
+    channels = ChannelPairing(
+        tuple(pairing.outputs[i] for i in places),
+        tuple(pairing.inputs[i] for i in places),
+    )
     columns = [paired[i] for i in places]
     D = require_channels(Omega[np.ix_(places, places)], channels)
     unit = 1.0 / np.abs(np.diag(Omega))[places]
@@ -434,7 +437,9 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
             "feedforward": None,
             "observer": None,
         }
-        values |= {key: [row[base_inputs.index(name)] for name in channels.inputs] for key, row in limits.items() if row}
+        for key, row in limits.items():
+            if row:
+                values[key] = [row[base_inputs.index(name)] for name in channels.inputs]
         if setting.base.allocation is not None:
             values["allocation"] = setting.base.allocation.ordered(base_inputs, channels.inputs).model_dump()
         return RiseDiConfig.validate_mapping(values, "controller")
@@ -450,11 +455,11 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     sufficient = gain_conditions.theorem_gains(bounds, ones)
     first = engineering(ones, ones)
     # The theorem may ask for gains beyond those that a controller takes, as k_d of 2e17 1/s for the f16 of JSBSim.
-    within = GainSet(
+    accepted = GainSet(
         min(sufficient.k_g, LARGEST),
         *(np.minimum(values, LARGEST) for values in (sufficient.k_d, sufficient.Lambda, sufficient.beta)),
     )
-    literal = controller(within, ones, ones).model_copy(
+    literal = controller(accepted, ones, ones).model_copy(
         update={"k_g": float(sufficient.k_g)}
         | {name: tuple(getattr(sufficient, name).tolist()) for name in ("k_d", "Lambda", "beta")}
     )
@@ -502,14 +507,14 @@ def loop_setting(scenario: Scenario, gamma_2: float = 0.0) -> LoopSetting:
     """The loop of a scenario: its controller, and the rate limits of controller and actuators."""
     controller = scenario.controller
     rates = scenario.aircraft.actuators.rate
-    own = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
+    slew = dict(zip(controller.inputs, controller.slew or (), strict=bool(controller.slew)))
     limits = dict(zip(scenario.aircraft.channels().inputs, rates, strict=bool(rates)))
     return LoopSetting(
         controller,
         controller.rate,
         dict(zip(controller.inputs, controller.lag, strict=True)),
         controller.delay,
-        {name: min(own.get(name, math.inf), limits.get(name, math.inf)) for name in controller.inputs},
+        {name: min(slew.get(name, math.inf), limits.get(name, math.inf)) for name in controller.inputs},
         gamma_2,
     )
 
@@ -528,23 +533,23 @@ def assess_gains(study: Study, controller: Controller, setting: LoopSetting) -> 
     channels = ChannelPairing(controller.outputs, controller.inputs)
     D = require_channels(study.Omega[np.ix_(rows, columns)], channels, controller.D)
     theorem: tuple[Condition, ...] = ()
-    of_loop: tuple[Condition, ...] = ()
+    loop_conditions: tuple[Condition, ...] = ()
     bounds = None
     if isinstance(controller, RiseDiConfig):
-        theorem, of_loop, bounds = _rise_di_conditions(study, controller, setting, D)
+        theorem, loop_conditions, bounds = _rise_di_conditions(study, controller, setting, D)
     if is_literal(controller):
-        return GainAssessment(controller, theorem, of_loop, bounds, None, study)
+        return GainAssessment(controller, theorem, loop_conditions, bounds, None, study)
     loop = linear_loop(controller, study.airframe, study.A, study.B)
     margins = loop_assessment(loop)
     stable = (margins.stable + float(margins.nominal.stable)) / len(study.A)
-    of_loop += (Condition("linear stability", None, stable, 1.0),)
+    loop_conditions += (Condition("linear stability", None, stable, 1.0),)
     if not (isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT):
         observer = controller.observer
         needed = above_zeros(setting.requirement, loop.nominal)
         least = 1.0 / controller.rate if observer is None else observer.margin - controller.delay
         needed = needed if observer is None else needed._replace(phase=min(needed.phase, OBSERVER_REQUIREMENT.phase))
-        of_loop += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))
-    return GainAssessment(controller, theorem, of_loop, bounds, margins, study)
+        loop_conditions += (Condition("delay margin", None, margins.delay, least), *conditions(margins, needed))
+    return GainAssessment(controller, theorem, loop_conditions, bounds, margins, study)
 
 
 def _rise_di_conditions(
@@ -594,13 +599,13 @@ def stable_speed_ratio(study: Study, controller: ControllerConfig) -> float:
     The response to every input but that of V grows with V^2, all else is that of the trim. The answer is rounded down to
     SPEED_STEP, and infinite where the linear loop is stable up to MAX_SPEED_RATIO. Raises ParameterError for the literal sign.
     """
-    of = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
+    loop = linear_loop(controller, study.airframe, study.A[:1], study.B[:1])
     steps = round(1.0 / SPEED_STEP)
     surfaces = np.array([name != "V" for name in controller.outputs])
-    no_delay = np.zeros(len(of.inputs))
+    no_delay = np.zeros(len(loop.inputs))
     for step in range(steps, round(MAX_SPEED_RATIO * steps) + 1):
         response = np.where(surfaces, (step / steps) ** 2, 1.0)
-        if not is_stable(of.nominal._replace(B=of.nominal.B * response), of.law, of.loop, no_delay):
+        if not is_stable(loop.nominal._replace(B=loop.nominal.B * response), loop.law, loop.loop, no_delay):
             return (step - 1) / steps if step > steps else 0.0
     return math.inf
 
@@ -700,6 +705,10 @@ CONTROLLER_YAML = yaml_template("""\
 """)
 
 
+def _listed(values: FloatArray) -> str:
+    return ", ".join(f"{value:.3g}" for value in values)
+
+
 def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments.
 
@@ -712,10 +721,9 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     params = controller.law_params()
     _, columns = law_order(study.airframe, controller)
     responses = response(study, controller)
-    K, bandwidth, slew = (
-        ", ".join(f"{value:.3g}" for value in values)
-        for values in (params.K, params.K * responses, study.slew[columns] / params.input_scale)
-    )
+    K = _listed(params.K)
+    bandwidth = _listed(params.K * responses)
+    slew = _listed(study.slew[columns] / params.input_scale)
     comments = {
         "rate": "Hz",
         "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
@@ -734,8 +742,8 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
     }
     if theorem:
         comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
-    beside = controller.observer is not None and controller.observer.part > 0.0  # else the observer of a learner, later
-    if beside:
+    has_observer = controller.observer is not None and controller.observer.part > 0.0  # else the observer of a learner, later
+    if has_observer:
         unscaled = "units of u s / units of y; for a K of (22) that is above 1"
         comments |= {
             "Lambda": "1/s",
@@ -743,7 +751,7 @@ def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
             "omega": "abs(Omega_ii) in scaled inputs",
             "input_scale": unscaled,
         }
-    origin = "by Theorem 1" if theorem else "beside an observer" if beside else "by the engineering procedure"
+    origin = "by Theorem 1" if theorem else "beside an observer" if has_observer else "by the engineering procedure"
     return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
 
 

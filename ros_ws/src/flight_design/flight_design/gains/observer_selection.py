@@ -194,7 +194,7 @@ def with_aircraft_observer(
         sampled = ObserverModel(observer.states, observer.Phi, observer.Gamma, observer.H)
         return lambda slower: observer._replace(F=feedback_gain(sampled, model, slower * gains.weights.effort))
 
-    def at(ratio: float, gains: ObserverGains) -> AtSpeed:
+    def model_at(ratio: float, gains: ObserverGains) -> AtSpeed:
         frame = at_speed(airframe, ratio, controller.inputs[controller.outputs.index("V")])
         model = model_for(frame, controller, noise)
         feedforward = with_feedforward(base, frame).feedforward
@@ -208,19 +208,22 @@ def with_aircraft_observer(
         require(not vanes, "speeds", f"the vanes {', '.join(vanes)}", "none: they read the model of the trim speed")
         require("V" in controller.outputs, "speeds", f"the outputs {', '.join(controller.outputs)}", "V among them")
     A, B = nominal_and_sampled(airframe, WORST_UNCERTAINTY, WORST_OF * uncertain, WORST_SEED)
-    read = [[float(name == state) for state in airframe.states] for name in vanes]
-    plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *read]))
+    states = np.array(list(airframe.states))
+    vane_rows = [(states == name).astype(np.float64) for name in vanes]
+    plant = LinearPlant(A + model.gravity, B[:, :, columns], np.vstack([model.C, *vane_rows]))
 
-    others = [[at(ratio, gains) for ratio in speeds or ()] for gains in sets]
+    others = []
     searches = []
-    for gains, elsewhere in zip(sets, others, strict=True):
+    for gains in sets:
+        elsewhere = [model_at(ratio, gains) for ratio in speeds or ()]
+        others.append(elsewhere)
         section = _vanes(airframe, model, names, gains.weights, vanes) if vanes else None
         design = designer(model, gains)
         searches.append(_within_margin(base, model, plant, gains, design, margin, needed, section, elsewhere))
     selected = _least_relaxed(searches, progress)
     if speeds is None:
         return selected
-    slow, fast = (there.model(selected.relaxation).model_dump() for there in others[selected.place])
+    slow, fast = (speed.model(selected.relaxation).model_dump() for speed in others[selected.place])
     schedule = {"speed": airframe.speed, "slow": slow, "fast": fast}
     if controller.schedule is not None:
         schedule["time"] = controller.schedule.time
@@ -257,16 +260,16 @@ class AtSpeed(NamedTuple):
         """The models of feedforward and observer."""
         design = self.design(slower)
         matrices = {key: tuple(getattr(design, key).ravel().tolist()) for key in ("Phi", "Gamma", "L", "F")}
-        of_nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
-        return SpeedConfig(ratio=self.ratio, **of_nominal, **matrices)
+        nominal = {key: getattr(self.feedforward, key) for key in ("A", "B", "gravity")}
+        return SpeedConfig(ratio=self.ratio, **nominal, **matrices)
 
     def flown(self, controller: RiseDiConfig, slower: FloatArray) -> RiseDiConfig:
         """What flies at this speed; not checked."""
         assert controller.observer is not None  # noqa: S101 - it was designed
         model = self.model(slower)
-        own = {key: getattr(model, key) for key in ("Phi", "Gamma", "L", "F")}
+        matrices = {key: getattr(model, key) for key in ("Phi", "Gamma", "L", "F")}
         changed = {
-            "observer": controller.observer.model_copy(update=own),
+            "observer": controller.observer.model_copy(update=matrices),
             "feedforward": self.feedforward,
             "input_scale": tuple((np.array(controller.input_scale) * self.scale).tolist()),
         }
@@ -322,7 +325,7 @@ def with_extended_state_observer(
     none = np.zeros((m, m))
     eye = np.eye(m)
     loop = loop_of(controller)
-    one = np.ones(m)
+    ones = np.ones(m)
     effects = np.diag(Omega)
     model = NominalModel(
         A=none,
@@ -334,12 +337,12 @@ def with_extended_state_observer(
         kinematic=np.zeros(m),
         size=size,
         input_scale=1.0 / np.abs(effects),
-        D=one,
+        D=ones,
         lag=loop.lag,
         total_lag=loop.total,
         period=loop.period,
-        lower=-one,
-        upper=one,
+        lower=-ones,
+        upper=ones,
     )
     model = _limited(model, controller)
     names = Names(controller.outputs, controller.inputs, controller.outputs, ())
@@ -390,10 +393,10 @@ def _least_relaxed(
             del reached[place]
         else:
             reached[place] = float(np.prod(now.relaxation))
-            found = (
+            reached_text = (
                 f"least margin {now.fraction:.0%} of the needed" if now.fraction < 1.0 else "margins met, uncertain aircraft"
             )
-            progress(f"observer: {found}, K and integral / {', '.join(f'{factor:.2f}' for factor in now.relaxation)}")
+            progress(f"observer: {reached_text}, K and integral / {', '.join(f'{factor:.2f}' for factor in now.relaxation)}")
     raise refusal
 
 
@@ -423,32 +426,32 @@ def _within_margin(
         laws = _laws(controller)
         return laws, min(delay_margin(plant, law, loop, longest=DELAYS * margin) for law in laws)
 
-    def of_delay(delay: float) -> float:
+    def delay_fraction(delay: float) -> float:
         return delay / (margin + RESOLUTION) if margin > 0.0 else 1.0
 
-    def of_margins(controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant) -> tuple[float, float]:
+    def margin_fraction(controller: RiseDiConfig, laws: Sequence[LinearLaw], plant: LinearPlant) -> tuple[float, float]:
         """The least phase margin, and the least of what is found over what is needed beside the delay margin."""
         each = [loop_margins(plant, law, loop_of(controller), together=False) for law in laws]
         return min(float(margins.phase.min()) for margins in each), min(least_fraction(margins, needed) for margins in each)
 
-    def assessed(there: AtSpeed, controller: RiseDiConfig, relaxation: FloatArray) -> float:
-        flown = there.flown(controller, relaxation)
-        laws, delay = delayed(flown, there.plant)
-        return min(of_delay(delay), of_margins(flown, laws, there.plant)[1])
+    def assessed(speed_model: AtSpeed, controller: RiseDiConfig, relaxation: FloatArray) -> float:
+        flown = speed_model.flown(controller, relaxation)
+        laws, delay = delayed(flown, speed_model.plant)
+        return min(delay_fraction(delay), margin_fraction(flown, laws, speed_model.plant)[1])
 
     def best(relaxations: FloatArray) -> SelectedObserver:
         """The first with the largest fraction; loop margins only where the delay margin leaves a chance."""
         controllers = [_parameters(base, model, gains, design(relaxation), relaxation, vanes) for relaxation in relaxations]
-        each, found = [delayed(controller, nominal) for controller in controllers], dict[int, SelectedObserver]()
-        for k in sorted(range(len(each)), key=lambda k: -of_delay(each[k][1])):
+        each, candidates = [delayed(controller, nominal) for controller in controllers], dict[int, SelectedObserver]()
+        for k in sorted(range(len(each)), key=lambda k: -delay_fraction(each[k][1])):
             (laws, delay), controller, relaxation = each[k], controllers[k], relaxations[k]
-            if found and of_delay(delay) < max(candidate.fraction for candidate in found.values()):
+            if candidates and delay_fraction(delay) < max(candidate.fraction for candidate in candidates.values()):
                 break
-            phase, fraction = of_margins(controller, laws, nominal)
-            elsewhere = (assessed(there, controller, relaxation) for there in others)
-            fraction = min([of_delay(delay), fraction, *elsewhere])
-            found[k] = SelectedObserver(controller, delay, phase, fraction, relaxation)
-        return max((found[k] for k in sorted(found)), key=lambda candidate: candidate.fraction)
+            phase, fraction = margin_fraction(controller, laws, nominal)
+            elsewhere = (assessed(speed_model, controller, relaxation) for speed_model in others)
+            fraction = min([delay_fraction(delay), fraction, *elsewhere])
+            candidates[k] = SelectedObserver(controller, delay, phase, fraction, relaxation)
+        return max((candidates[k] for k in sorted(candidates)), key=lambda candidate: candidate.fraction)
 
     def worst_phases(controller: RiseDiConfig) -> FloatArray:
         uncertain = plant._replace(A=plant.A[1:], B=plant.B[1:])
@@ -469,16 +472,16 @@ def _within_margin(
             stepped = best(selected.relaxation * steps)
             selected = stepped if stepped.fraction > selected.fraction else best(selected.relaxation[None] * RELAXATION)
             fractions.append(selected.fraction)
-        elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.of_uncertain:
+        elif len(plant.A) > 1 and (worst := worst_phases(selected.controller)).min() < needed.uncertain_phase:
             selected, fractions = best(selected.relaxation * steps[[int(np.argmin(worst))]]), []
         else:
             break
     checked = selected.controller.model_dump()
     checked["observer"]["margin"] = margin
-    found = RiseDiConfig.validate_mapping(checked, "controller")
+    final = RiseDiConfig.validate_mapping(checked, "controller")
     return selected._replace(
-        controller=found,
-        delay_margin=min(delay_margin(nominal, law, loop) for law in _laws(found)),
+        controller=final,
+        delay_margin=min(delay_margin(nominal, law, loop) for law in _laws(final)),
     )
 
 
@@ -487,7 +490,7 @@ def _laws(controller: RiseDiConfig) -> list[LinearLaw]:
     (law, params), period = controller.tuned_law(), 1.0 / controller.rate
     sets = product((False, True), repeat=len(controller.vanes))
     flown = (without_frozen(params, frozen) for frozen in sets)
-    return [linear_law(TunedLaw(law, of), len(controller.outputs), period) for of in flown]
+    return [linear_law(TunedLaw(law, law_params), len(controller.outputs), period) for law_params in flown]
 
 
 def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margin: float, needed: Requirement) -> str:
@@ -503,7 +506,7 @@ def _lacking(selected: SelectedObserver, nominal: LinearPlant, loop: Loop, margi
 
 
 def _phases(needed: Requirement) -> str:
-    phase = np.degrees(needed.of_uncertain)
+    phase = np.degrees(needed.uncertain_phase)
     return f"of {WORST_OF} uncertain aircraft: found a phase margin below {phase:.0f} deg, expected at least this"
 
 
@@ -517,16 +520,16 @@ def _parameters(
 ) -> RiseDiConfig:
     """The parameters with gains and matrices. A K below MIN_K is MIN_K with a smaller input scale: the same loop."""
     K = gains.K / relaxation
-    whole = np.maximum(K, MIN_K + MIN_GAIN)
-    whole[-1] = MIN_K
-    share = K / whole
+    permitted = np.maximum(K, MIN_K + MIN_GAIN)
+    permitted[-1] = MIN_K
+    share = K / permitted
     k_g = MIN_K - 1.0
     Phi, Gamma, L, F = (tuple(matrix.ravel().tolist()) for matrix in (design.Phi, design.Gamma, design.L, design.F))
     require(spectral_radius(design.Phi - design.Gamma @ design.F) < 1.0, "observer.F", "an unstable feedback", "a stable one")
     observer = ObserverConfig(rate=base.rate, states=design.states, Phi=Phi, Gamma=Gamma, L=L, F=F, margin=0.0, vanes=vanes)
     changes: dict[str, Any] = {
         "k_g": k_g,
-        "k_d": tuple((whole[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
+        "k_d": tuple((permitted[:-1] - gain(np.array(k_g), np.zeros(len(K) - 1))[:-1]).tolist()),
         "Lambda": tuple((gains.Lambda / relaxation).tolist()),
         "beta": tuple((gains.beta / relaxation / share).tolist()),
         "softening": tuple((gains.softening * relaxation).tolist()),

@@ -50,7 +50,7 @@ class Requirement(NamedTuple):
     worst_phase: float = math.radians(30.0)  # rad, of the uncertain aircraft
 
     @property
-    def of_uncertain(self) -> float:
+    def uncertain_phase(self) -> float:
         """Phase margin of the worst uncertain aircraft, rad: never above what is asked of the nominal aircraft."""
         return min(self.worst_phase, self.phase)
 
@@ -113,11 +113,11 @@ def least_fraction(margins: Margins, needed: Requirement) -> float:
 
 def conditions(margins: LoopMargins, needed: Requirement) -> tuple[Condition, ...]:
     """The requirement as conditions, input by input, the nominal aircraft first."""
-    of_nominal = nominal_conditions(margins.nominal, needed)
+    nominal = nominal_conditions(margins.nominal, needed)
     if margins.worst is None:
-        return of_nominal
+        return nominal
     worst = math.degrees(float(margins.worst.phase.min()))
-    return (*of_nominal, Condition(NAMES[4], None, worst, math.degrees(needed.of_uncertain)))
+    return (*nominal, Condition(NAMES[4], None, worst, math.degrees(needed.uncertain_phase)))
 
 
 def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition, ...]:
@@ -129,12 +129,10 @@ def nominal_conditions(nominal: Margins, needed: Requirement) -> tuple[Condition
         (NAMES[1], decibels, 20.0 * math.log10(needed.gain), True),
         (NAMES[2], nominal.sensitivity, needed.sensitivity, False),
     ]
-    found = (
-        Condition(name, i, float(value), bound, at_least)
-        for name, values, bound, at_least in rows
-        for i, value in enumerate(values)
-    )
-    return (*found, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
+    by_input: list[Condition] = []
+    for name, values, bound, at_least in rows:
+        by_input += [Condition(name, i, float(value), bound, at_least) for i, value in enumerate(values)]
+    return (*by_input, Condition(NAMES[3], None, float(nominal.damping), needed.damping))
 
 
 def unmet(margins: LoopMargins, needed: Requirement, outputs: Sequence[str]) -> str:
@@ -164,7 +162,7 @@ def within_requirement(
     target = needed
     best = _nominal_search(build, target)
     for _ in range(MAX_WORST_STEPS):
-        if best.fraction < 1.0 or _worst_phase(best.candidate.loop) >= needed.of_uncertain:
+        if best.fraction < 1.0 or _worst_phase(best.candidate.loop) >= needed.uncertain_phase:
             break
         target = target._replace(phase=target.phase + WORST_STEP)
         following = _nominal_search(build, target, best.slower, best.lower)

@@ -20,7 +20,7 @@ class TradeRow(NamedTuple):
     """The engineering gains for a phase margin."""
 
     phase_margin: float  # deg, the requirement
-    found: float  # deg, the least of the loop
+    reached: float  # deg, the least of the loop
     delay_margin: float  # s
     rms: FloatArray  # (m,) of the error of the linear loop along the manoeuvre, SI, by output of the law
 
@@ -47,23 +47,23 @@ def _nominal(study: Study) -> Study:
     return study._replace(A=study.A[:1], B=study.B[:1], u_dot=study.u_dot[:, :1], stable=study.stable[:1])
 
 
-def linear_error(of: LinearLoop, u_dot: FloatArray) -> FloatArray:
+def linear_error(loop: LinearLoop, u_dot: FloatArray) -> FloatArray:
     """Rms of e of the nominal linear loop that has to give the ideal control u*, (m,), SI.
 
     u* keeps y on y_m, so e is the response of the loop to the disturbance -u* at the input of the aircraft, from trim on.
     `u_dot` (T, m) is the rate of u* every STEP, inputs in the law's order.
     """
-    period = of.loop.period
+    period = loop.loop.period
     u = np.concatenate([np.zeros((1, u_dot.shape[1])), np.cumsum((u_dot[1:] + u_dot[:-1]) / 2.0 * STEP, axis=0)])
     t = period * (np.arange(int((len(u) - 1) * STEP / period)) + 0.5)
     held = np.array([np.interp(t, STEP * np.arange(len(u)), column) for column in u.T]).T
-    step = closed_loop(of.nominal, of.law, of.loop, np.zeros(u.shape[1]))
-    _, drive = zero_order_hold(of.nominal.A, of.nominal.B, period)
-    n = len(of.nominal.A)
+    step = closed_loop(loop.nominal, loop.law, loop.loop, np.zeros(u.shape[1]))
+    _, drive = zero_order_hold(loop.nominal.A, loop.nominal.B, period)
+    n = len(loop.nominal.A)
     state = np.zeros(len(step))
-    total = np.zeros(len(of.nominal.C))
+    total = np.zeros(len(loop.nominal.C))
     for disturbance in -(held @ drive.T):
         state = step @ state
         state[:n] += disturbance
-        total += (of.nominal.C @ state[:n]) ** 2
+        total += (loop.nominal.C @ state[:n]) ** 2
     return np.asarray(np.sqrt(total / max(len(t), 1)))

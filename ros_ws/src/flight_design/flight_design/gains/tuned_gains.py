@@ -47,9 +47,12 @@ def load(path: Path) -> dict[str, dict[str, TuningResult]]:
     content = read_yaml(path, path.name, "a file of tuned gains")
     try:
         laws = content["laws"].items()
-        return {law: {objective: TuningResult(**entry) for objective, entry in sets.items()} for law, sets in laws}
+        tuned = {}
+        for law, sets in laws:
+            tuned[law] = {objective: TuningResult(**entry) for objective, entry in sets.items()}
     except (TypeError, KeyError, AttributeError) as error:
         raise ParameterError(f"{path.name}: found {error}, expected laws, each with gains by objective") from None
+    return tuned
 
 
 def find(scenario: Scenario, law: str, objective: str) -> TuningResult | None:
@@ -62,14 +65,17 @@ def save(path: Path, tuned: Mapping[str, Mapping[str, TuningResult]], order: Seq
 
     Raises ParameterError where the file cannot be written.
     """
-    objectives = [name for name in order if any(name in sets for sets in tuned.values())]
+    known = set().union(*tuned.values())
+    objectives = [name for name in order if name in known]
     head = (
         "# SPDX-FileCopyrightText: RISE-DI contributors\n# SPDX-License-Identifier: Apache-2.0\n#\n"
         "# Gains found by CMA-ES, in the law's order of channels and its scaled inputs; cost, seed, evaluations of a search.\n"
         + comment([f"Made by: {command} --tuning {','.join(objectives)}"])
     )
     names = [*(law for law in LAWS if law in tuned), *(law for law in tuned if law not in LAWS)]
-    laws = {law: {name: tuned[law][name] for name in objectives if name in tuned[law]} for law in names}
+    laws = {}
+    for law in names:
+        laws[law] = {name: tuned[law][name] for name in objectives if name in tuned[law]}
     text = yaml.dump({"laws": laws}, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=160)
     with writing("", path, "a file of tuned gains that can"):
         path.parent.mkdir(parents=True, exist_ok=True)

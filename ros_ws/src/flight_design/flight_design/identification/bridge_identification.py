@@ -83,8 +83,9 @@ def channel_pairs(channel_map: ChannelMap) -> tuple[ChannelPairing, FloatArray]:
     driven: dict[str, tuple[str, int]] = {}
     for name, row in channel_map.inputs.items():
         output, sign = row.motion
-        other = driven.setdefault(output, (name, sign))
-        require(other[0] == name, f"map {channel_map.name}: inputs", f"{other[0]} and {name} both for {output}", "one of them")
+        driver = driven.setdefault(output, (name, sign))
+        both = f"{driver[0]} and {name} both for {output}"
+        require(driver[0] == name, f"map {channel_map.name}: inputs", both, "one of them")
     moved = motions(channel_map)
     for (name, motion), sign in zip(moved.items(), output_signs(channel_map), strict=True):
         require(motion in driven, f"map {channel_map.name}: inputs", f"none that moves {name}", "one input for each output")
@@ -109,8 +110,8 @@ def require_envelope(channel_map: ChannelMap) -> None:
     needed += [name for name, motion in motions(channel_map).items() if UNITS[motion] == "m/s"]
     missing = [name for name in needed if name not in channel_map.envelope]
     limits = ", ".join(needed)
-    found = f"none of {', '.join(missing)}"
-    require(not missing, f"map {channel_map.name}: envelope", found, f"limits of {limits}: an experiment is open loop")
+    unlimited = f"none of {', '.join(missing)}"
+    require(not missing, f"map {channel_map.name}: envelope", unlimited, f"limits of {limits}: an experiment is open loop")
 
 
 class Experiment(NamedTuple):
@@ -140,7 +141,7 @@ def experiment(
             "amplitude": [amplitude * min(-row.lower, row.upper) for row in rows],
             "pause": PAUSE,
         }
-        | {key: [getattr(excitation, key) for excitation in chosen] for key in Excitation._fields},
+        | {key: list(values) for key, values in zip(Excitation._fields, zip(*chosen, strict=True), strict=True)},
         "controller",
     )
     none = {"rate": RATE, "outputs": list(pairing.outputs), "rise": 0.1}
@@ -261,7 +262,7 @@ class Flyable(NamedTuple):
 
 
 def flying_scenario(
-    channel_map: ChannelMap, found: Channels, speed: float | None, airframe_file: str, needed: Requirement = REQUIREMENT
+    channel_map: ChannelMap, channels: Channels, speed: float | None, airframe_file: str, needed: Requirement = REQUIREMENT
 ) -> Flyable:
     """Gains for identified channels, and the texts of airframe and scenario.
 
@@ -270,18 +271,19 @@ def flying_scenario(
     `needed`. The feedforward has the airframe as model, in coordinated turns without sideslip.
     """
     pairing, _ = channel_pairs(channel_map)
-    delay = float(np.min(found.delay))
-    later = found.lag + found.delay - delay  # the controller has one delay: what a channel has beyond it counts as its lag
+    delay = float(np.min(channels.delay))
+    # The controller has one delay: what a channel has beyond it counts as its lag.
+    later = channels.lag + channels.delay - delay
     moved = motions(channel_map)
     products = {name: gain_selection.CROSSOVER_LAG_PRODUCTS[motion] for name, motion in moved.items()}
     loop = Loop(later, delay, 1.0 / RATE)
     bandwidth = dict(zip(pairing.outputs, bandwidths(loop, np.array(list(products.values()))).tolist(), strict=True))
     rows = {name: channel_map.inputs[name] for name in pairing.inputs}
     range_ = np.array([min(-row.lower, row.upper) for row in rows.values()])
-    authority = dict(zip(pairing.outputs, (np.abs(np.diag(found.Omega)) * range_).tolist(), strict=True))
+    authority = dict(zip(pairing.outputs, (np.abs(np.diag(channels.Omega)) * range_).tolist(), strict=True))
     held = {
         name: HELD_FRACTION * authority[name] / max(damping, 1e-3)
-        for name, damping in zip(pairing.outputs, found.damping.tolist(), strict=True)
+        for name, damping in zip(pairing.outputs, channels.damping.tolist(), strict=True)
     }
     commands = _commands(moved, bandwidth, speed, authority, held)
     lag = dict(zip(pairing.inputs, later.tolist(), strict=True))
@@ -296,10 +298,10 @@ def flying_scenario(
     manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, WAIT + 60.0)
     range_rate = range_ / FULL_RANGE_TIME
 
-    airframe = airframe_yaml(channel_map, pairing, found, speed, "identified in flight")
+    airframe = airframe_yaml(channel_map, pairing, channels, speed, "identified in flight")
     frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
     slew = gain_selection.study_airframe(frame, manoeuvre, samples=1).slew
-    none = found._replace(damping=0.0 * found.damping, stiffness=0.0 * found.stiffness, zero=0.0 * found.zero)
+    none = channels._replace(damping=0.0 * channels.damping, stiffness=0.0 * channels.stiffness, zero=0.0 * channels.zero)
     integrators = Airframe.validate_mapping(
         yaml.safe_load(airframe_yaml(channel_map, pairing, none, speed, "none")), "airframe"
     )
@@ -308,8 +310,8 @@ def flying_scenario(
     studied = studied._replace(slew=np.maximum(slew, range_rate))
     setting = LoopSetting(base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed)
     selection = gain_selection.select_gains(studied, setting)
-    flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, found, loop), frame, needed)
-    turning = found if commands["coordinated_turn"] is None else _without_sideslip(found, pairing)
+    flown, margins = _within_margins(_with_integrals(selection.chosen, pairing, channels, loop), frame, needed)
+    turning = channels if commands["coordinated_turn"] is None else _without_sideslip(channels, pairing)
     model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
     heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
@@ -347,19 +349,19 @@ def _within_margins(
     return chosen.controller, loop_assessment(chosen.loop)
 
 
-def _without_sideslip(found: Channels, pairing: ChannelPairing) -> Channels:
+def _without_sideslip(channels: Channels, pairing: ChannelPairing) -> Channels:
     """Channels of r with damping alone: the stiffness of a straight flight would skid in a coordinated turn.
 
     The stiffness of r is N_beta, and beta_dot = -r + g / V phi is 0 there: a rudder against the stiffness would skid.
     """
     turns = np.array([name == "r" for name in pairing.outputs])
-    damping = np.where(turns, found.damping - found.zero, found.damping)
-    return found._replace(
-        damping=damping, stiffness=np.where(turns, 0.0, found.stiffness), zero=np.where(turns, 0.0, found.zero)
+    damping = np.where(turns, channels.damping - channels.zero, channels.damping)
+    return channels._replace(
+        damping=damping, stiffness=np.where(turns, 0.0, channels.stiffness), zero=np.where(turns, 0.0, channels.zero)
     )
 
 
-def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Channels, loop: Loop) -> RiseDiConfig:
+def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, channels: Channels, loop: Loop) -> RiseDiConfig:
     """The controller with integrals for a crossover of the modelled loops as of y_dot = Omega u.
 
     Lambda and the slope of the softened sign, 1 / (softening total lag), are the integrals of K (s + integral) / s. For first
@@ -369,23 +371,23 @@ def _with_integrals(controller: RiseDiConfig, pairing: ChannelPairing, found: Ch
     """
     places = [pairing.outputs.index(name) for name in controller.outputs]
     params = controller.law_params()
-    crossover = params.K * params.input_scale * np.abs(np.diag(found.Omega)[places])
-    of_sign = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
+    crossover = params.K * params.input_scale * np.abs(np.diag(channels.Omega)[places])
+    sign_slope = 1.0 / (np.broadcast_to(controller.softening, (len(places),)) * loop.total[places])
     Lambda = [
-        max(float(own), _integral(found, i, float(K), float(loop.total[i])) - float(slope))
-        for own, i, K, slope in zip(controller.Lambda, places, crossover, of_sign, strict=True)
+        max(float(least), _integral(channels, i, float(K), float(loop.total[i])) - float(slope))
+        for least, i, K, slope in zip(controller.Lambda, places, crossover, sign_slope, strict=True)
     ]
     return RiseDiConfig.validate_mapping(controller.model_dump() | {"Lambda": Lambda}, "controller")
 
 
-def _integral(found: Channels, i: int, crossover: float, total_lag: float) -> float:
+def _integral(channels: Channels, i: int, crossover: float, total_lag: float) -> float:
     """The integral of a channel, 1/s, for a crossover of the loop at `crossover`, rad/s, or the largest safe integral below."""
     omega = np.geomspace(0.1, 1e3, 400) * crossover
 
     def response(omega: Any) -> Any:
         """Of K times the model, without the delay."""
         s = 1j * omega
-        return crossover * (s + found.zero[i]) / (s**2 + found.damping[i] * s + found.stiffness[i])
+        return crossover * (s + channels.zero[i]) / (s**2 + channels.damping[i] * s + channels.stiffness[i])
 
     wanted = crossover * np.sqrt(max(0.0, abs(response(crossover)) ** -2 - 1.0))
     delayed = response(omega) * np.exp(-1j * omega * total_lag)
@@ -422,8 +424,8 @@ def within_range(channel_map: ChannelMap, trims: Mapping[str, float]) -> tuple[C
         for side, limit, room in (("lower", row.lower, low - trim), ("upper", row.upper, high - trim)):
             if abs(limit) > abs(room):
                 values["inputs"][name][side] = float(f"{room * (1.0 - 1e-4):.5g}")  # the trim is rounded too
-                found = f"{name}: its trim is {trim:.3g}, so that the {side} limit is {room:.3g} in place of {limit:.3g}"
-                sentences.append(f"{found}: {way_on}")
+                narrower = f"{name}: its trim is {trim:.3g}, so that the {side} limit is {room:.3g} in place of {limit:.3g}"
+                sentences.append(f"{narrower}: {way_on}")
     return ChannelMap.validate_mapping(values, f"map {channel_map.name}"), sentences
 
 
@@ -471,11 +473,11 @@ def _commands(
     if cruise is not None:
         fastest |= dict(zip(cruise["outputs"], cruise["second_order"]["natural_frequency"], strict=True))
     limit = {name: REFERENCE_BANDWIDTH * bandwidth[name] for name in moved}
-    pulses = {
-        motion_of[motion]: pulse | {key: [WAIT + t for t in pulse[key]] for key in ("start", "stop")}
-        for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items()
-        if motion in motion_of
-    }
+    pulses = {}
+    for motion, pulse in (_hover_pulses() if cruise is None else cruise["pulses"]).items():
+        if motion in motion_of:
+            edges = {"start": [WAIT + t for t in pulse["start"]], "stop": [WAIT + t for t in pulse["stop"]]}
+            pulses[motion_of[motion]] = pulse | edges
     for name, pulse in pulses.items():
         if UNITS[moved[name]] == "m/s":
             pulse["value"] = [round(min(value, held[name]), 4) for value in pulse["value"]]
@@ -503,7 +505,14 @@ def _hover_pulses() -> dict[str, dict[str, list[float]]]:
     return pulses | {"climb": {"start": [20.0], "stop": [28.0], "value": [PULSE_V / 2.0]}}
 
 
-def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Channels, speed: float | None, source: str) -> str:
+def _rounded(row: FloatArray) -> list[float]:
+    """The row to four digits."""
+    return [float(f"{value:.4g}") for value in row]
+
+
+def airframe_yaml(
+    channel_map: ChannelMap, pairing: ChannelPairing, channels: Channels, speed: float | None, source: str
+) -> str:
     """The text of the airframe of identified channels, in units of the map's channels.
 
     With z_i of the dimension of y_i dt:
@@ -512,15 +521,15 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
     z_i_dot = y_i - zero_i z_i                                             only where stiffness or zero are not 0
     """
     m = len(pairing.outputs)
-    second = [i for i in range(m) if found.stiffness[i] or found.zero[i]]
+    second = [i for i in range(m) if channels.stiffness[i] or channels.zero[i]]
     A = np.zeros((m + len(second), m + len(second)))
     for i in range(m):
-        A[i, i] = found.zero[i] - found.damping[i]
+        A[i, i] = channels.zero[i] - channels.damping[i]
     for place, i in enumerate(second, m):
-        A[i, place] = found.damping[i] * found.zero[i] - found.stiffness[i] - found.zero[i] ** 2
+        A[i, place] = channels.damping[i] * channels.zero[i] - channels.stiffness[i] - channels.zero[i] ** 2
         A[place, i] = 1.0
-        A[place, place] = -found.zero[i]
-    B = np.vstack([found.Omega, np.zeros((len(second), m))])
+        A[place, place] = -channels.zero[i]
+    B = np.vstack([channels.Omega, np.zeros((len(second), m))])
     states = {name: UNITS[motion] for name, motion in motions(channel_map).items()}
     states |= {f"{pairing.outputs[i]}_integral": "1" for i in second}
     values = {
@@ -532,8 +541,8 @@ def airframe_yaml(channel_map: ChannelMap, pairing: ChannelPairing, found: Chann
             name: {"unit": "1", "positive": motion_as_channel_grows(channel_map.inputs[name])} for name in pairing.inputs
         },
         "outputs": list(pairing.outputs),
-        "A": [[float(f"{value:.4g}") for value in row] for row in A],
-        "B": [[float(f"{value:.4g}") for value in row] for row in B],
+        "A": [_rounded(row) for row in A],
+        "B": [_rounded(row) for row in B],
     }
     Airframe.validate_mapping(values, "airframe")
     return dump_yaml(values)

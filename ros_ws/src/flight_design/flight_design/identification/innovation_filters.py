@@ -3,6 +3,7 @@
 """The observer's Kalman filter over a recorded flight: y and u in equal periods, innovations of many models side by side."""
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -113,9 +114,9 @@ def filter_model(airframe: Airframe, actuation: Actuation, recorded: Recording) 
 
 def delayed(u: FloatArray, periods: float) -> FloatArray:
     """u, (T, m), some periods later: between two samples the mean that acts in a period."""
-    whole = int(periods)
+    full_periods = int(periods)
     part = periods % 1.0
-    late = np.concatenate([np.repeat(u[:1], whole + 1, axis=0), u])
+    late = np.concatenate([np.repeat(u[:1], full_periods + 1, axis=0), u])
     return np.asarray((1.0 - part) * late[1 : len(u) + 1] + part * late[: len(u)])
 
 
@@ -186,22 +187,25 @@ class Passage:
         u = np.concatenate([u, np.zeros((*u.shape[:-2], short, m))], axis=-2)
         self._seen: NDArray[np.bool_] = np.asarray(np.isfinite(y).all(axis=1))
         known = np.where(self._seen[:, None], y, 0.0).reshape(blocks, HOLD * m).T
-        given = np.swapaxes(u.reshape(*u.shape[:-2], blocks, HOLD * m), -1, -2)
-        inputs = np.concatenate([np.broadcast_to(known, given.shape), given], axis=-2)
+        u_blocks = np.swapaxes(u.reshape(*u.shape[:-2], blocks, HOLD * m), -1, -2)
+        inputs = np.concatenate([np.broadcast_to(known, u_blocks.shape), u_blocks], axis=-2)
         code = level << HOLD | self._seen.reshape(blocks, HOLD) @ (1 << np.arange(HOLD))
         kinds, self._kind = np.unique(code, return_inverse=True)
-        lifted = [bank.lifted(kind >> HOLD, [bool(kind >> j & 1) for j in range(HOLD)]) for kind in kinds.tolist()]
+        lifted = []
+        for kind in kinds.tolist():
+            seen = [bool(kind >> j & 1) for j in range(HOLD)]
+            lifted.append(bank.lifted(kind >> HOLD, seen))
         self._forced, self._states = np.empty((N, HOLD * m, blocks)), np.zeros((blocks + 1, N, s + len(self._angles), 1))
-        own = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
+        state_columns = np.r_[:s, s + 2 * HOLD * m : lifted[0].shape[-1]]
         driven = slice(s, s + 2 * HOLD * m)
         following = HOLD * m + np.append(np.arange(s), self._angles)  # z, and again its angles, in place of sin(x) - x
         for k, matrix in enumerate(lifted):
-            of = np.flatnonzero(self._kind == k)
-            forced = matrix[..., driven] @ inputs[..., of]
-            self._forced[..., of] = forced[:, :-s]
-            self._states[of + 1, ..., 0] = np.moveaxis(forced[:, following], -1, 0)
-        self._steps = [np.ascontiguousarray(matrix[:, following][..., own]) for matrix in lifted]
-        self._outputs = [np.ascontiguousarray(matrix[:, :-s, own]) for matrix in lifted]
+            columns = np.flatnonzero(self._kind == k)
+            forced = matrix[..., driven] @ inputs[..., columns]
+            self._forced[..., columns] = forced[:, :-s]
+            self._states[columns + 1, ..., 0] = np.moveaxis(forced[:, following], -1, 0)
+        self._steps = [np.ascontiguousarray(matrix[:, following][..., state_columns]) for matrix in lifted]
+        self._outputs = [np.ascontiguousarray(matrix[:, :-s, state_columns]) for matrix in lifted]
 
     def run(self, z: FloatArray, first: int = 0, last: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Innovations in some blocks, (N, periods, m), NaN where y is lost, from z, (N, s), on; and z after them."""
@@ -218,8 +222,8 @@ class Passage:
         r = self._forced[..., first : first + len(kind)].copy()
         x = np.moveaxis(states[:-1, ..., 0], 0, -1)
         for k in np.unique(kind).tolist():
-            of = kind == k
-            r[..., of] += self._outputs[k] @ x[..., of]
+            same_kind = kind == k
+            r[..., same_kind] += self._outputs[k] @ x[..., same_kind]
         r = np.moveaxis(r, -1, 1).reshape(N, len(kind) * HOLD, m)
         r[:, ~self._seen[HOLD * first : HOLD * first + r.shape[1]]] = np.nan
         return r, states[-1, :, :s, 0]
@@ -280,8 +284,8 @@ def filter_bank(
         kinematic=np.concatenate([LEAK * model.kinematic, np.zeros(3 * G)]),
         size=np.concatenate([model.size, np.ones(3 * G)]),
     )
-    of_wind = tuple(f"{kind}.{axis}" for kind in ("wind", "rate", "change") for axis in names.winds)
-    sampled = observer_design.aircraft_model(each, names._replace(states=names.states + of_wind, winds=()), np.zeros(0))
+    wind_states = tuple(f"{kind}.{axis}" for kind, axis in product(("wind", "rate", "change"), names.winds))
+    sampled = observer_design.aircraft_model(each, names._replace(states=names.states + wind_states, winds=()), np.zeros(0))
     gust, change = (
         strength[:, None] * LEVELS[levels, None, k] * factor for k, factor in enumerate((noise, noise / np.max(noise)))
     )
@@ -301,7 +305,7 @@ class Block(NamedTuple):
     outputs: NDArray[np.int64]
     winds: NDArray[np.int64]
 
-    def of(self, model: NominalModel) -> NominalModel:
+    def restricted(self, model: NominalModel) -> NominalModel:
         """The model of this part alone."""
         x = self.states
         u = self.inputs
@@ -325,6 +329,11 @@ class Block(NamedTuple):
         )
 
 
+def _block(parts: Sequence[NDArray[np.int32]], label: np.int32) -> Block:
+    """The states, inputs, outputs and winds with a label."""
+    return Block(*(np.flatnonzero(part == label) for part in parts))
+
+
 def blocks(model: NominalModel) -> list[Block]:
     """The parts of an aircraft that neither A, gravity, B, C nor the wind couple; one where a part is not square."""
     (n, m), G = model.B.shape, model.wind.shape[1]
@@ -332,13 +341,13 @@ def blocks(model: NominalModel) -> list[Block]:
     coupled[:n] = np.hstack([model.A + model.gravity, model.B, model.C.T, model.wind]) != 0.0
     _, labels = connected_components(coupled, directed=False)
     parts = np.split(labels, [n, n + m, n + 2 * m])
-    found = [Block(*(np.flatnonzero(part == label) for part in parts)) for label in np.unique(labels)]
-    if all(len(block.inputs) == len(block.outputs) > 0 for block in found):
-        return found
-    return [whole(model)]
+    independent = [_block(parts, label) for label in np.unique(labels)]
+    if all(len(block.inputs) == len(block.outputs) > 0 for block in independent):
+        return independent
+    return [whole_aircraft(model)]
 
 
-def whole(model: NominalModel) -> Block:
+def whole_aircraft(model: NominalModel) -> Block:
     """All of an aircraft as one part."""
     (n, m), G = model.B.shape, model.wind.shape[1]
     return Block(*map(np.arange, (n, m, m, G)))

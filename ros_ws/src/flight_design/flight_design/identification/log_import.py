@@ -69,7 +69,9 @@ def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos
     speed = next((log.at(sources[name], stamps) for name, row in rows.items() if row.motion[0] == "V"), None)
     if speed is None:  # a multicopter: its thrust
         lifts = {name: row.motion[1] for name, row in channel_map.inputs.items() if row.motion[0] == "climb"}
-        speed = next((sign * _commands(channel_map, log, name, servos, {}).at(stamps) for name, sign in lifts.items()), None)
+        speed = next(
+            (sign * _commands(channel_map, log, name, servos, {}).commands_at(stamps) for name, sign in lifts.items()), None
+        )
     has_sticks = log.format is not None and log.vehicle == PLANE
     first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
     parameters = log.parameters_at(first)
@@ -88,7 +90,7 @@ def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos
         y[:, column] += -np.median(y[:, column]) if row.captured else row.offset
     u_stamps = np.unique(np.concatenate([reader.stamp_ns for reader in readers.values()]))
     u_stamps = u_stamps[(u_stamps >= first) & (u_stamps <= last)]
-    u_stamps, commands = _complete(u_stamps, np.column_stack([reader.at(u_stamps) for reader in readers.values()]))
+    u_stamps, commands = _complete(u_stamps, np.column_stack([reader.commands_at(u_stamps) for reader in readers.values()]))
     require(len(u_stamps) > 1, "the log", "no instant with all inputs of the map", "a flight")
     signals = {
         "y": Signal(y_stamps, tuple(rows), y),
@@ -117,7 +119,7 @@ def _messages(log: VehicleLog, quantity: str) -> str:
     from flight_log.vehicle_log import ULOG_SOURCES  # noqa: PLC0415 - of this sentence alone
 
     sources = ULOG_SOURCES if log.format is None else log.format.sources
-    return " or ".join(dict.fromkeys(at.message for at in sources.get(quantity, ()))) or "one that the format has"
+    return " or ".join(dict.fromkeys(source.message for source in sources.get(quantity, ()))) or "one that the format has"
 
 
 class _Reader(NamedTuple):
@@ -133,7 +135,7 @@ class _Reader(NamedTuple):
     def stamp_ns(self) -> Stamps:
         return self.log.tables[self.source.message].stamp_ns
 
-    def at(self, stamp_ns: Stamps) -> FloatArray:
+    def commands_at(self, stamp_ns: Stamps) -> FloatArray:
         values = self.log.at(self.source, stamp_ns)
         if self.stick is not None and self.servo is not None:
             values = self.stick.raw(self.servo.deflection(values, self.stick))
@@ -169,7 +171,8 @@ def _commands(channel_map: ChannelMap, log: VehicleLog, name: str, servos: bool,
 def _torque(log: VehicleLog, name: str, row: InputRow, servos: bool) -> _Reader:
     """The output of a multicopter's rate controller: no mode has sticks that are commands. It is normalised as PX4's."""
     quantity, sign = row.motion
-    source = next((at for at in log.format.torques.get(quantity, ()) if log.has(at)), None) if log.format else None
+    sources = log.format.torques.get(quantity, ()) if log.format else ()
+    source = next(filter(log.has, sources), None)
     if source is None:
         expected = "a DataFlash log with RATE: sticks of a multicopter command angles or rates"
         raise ParameterError(f"inputs.{name}: found a multicopter's log without RATE of {quantity}, expected {expected}")
@@ -196,7 +199,7 @@ def _flight(
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
-        mode = next((at for at in log.format.mode if log.has(at)), None) if log.format is not None else None
+        mode = next((source for source in log.format.mode if log.has(source)), None) if log.format is not None else None
         if mode is None:
             raise ParameterError(f"the log: found no message with the mode, expected MANUAL in {expected}")
         keep &= log.at(mode, stamps) == log.manual
@@ -250,9 +253,8 @@ def _rows_of_import(channel_map: ChannelMap) -> dict[str, object]:
         "inputs": {"field", "positive", "sign", "scale", "offset", "range"},
         "trims": {"field", "sign", "scale", "offset"},
     }
-    return {
-        f"{kind}.{name}.{key}": getattr(row, key)
-        for kind, fields in keys.items()
-        for name, row in getattr(channel_map, kind).items()
-        for key in sorted(fields)
-    }
+    values: dict[str, object] = {}
+    for kind, fields in keys.items():
+        for name, row in getattr(channel_map, kind).items():
+            values |= {f"{kind}.{name}.{key}": getattr(row, key) for key in sorted(fields)}
+    return values

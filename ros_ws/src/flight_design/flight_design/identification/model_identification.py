@@ -8,7 +8,7 @@ to an aircraft.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from itertools import count
+from itertools import chain, count
 from typing import NamedTuple
 
 import numpy as np
@@ -38,7 +38,7 @@ from flight_design.identification.innovation_filters import (
     delayed,
     filter_bank,
     filter_model,
-    whole,
+    whole_aircraft,
 )
 
 PRIOR = 0.29  # 1, standard deviation of a relative error before the flight: that of +-50 %, uniform
@@ -156,15 +156,16 @@ def units(model: NominalModel, *, coupled: bool = False) -> tuple[FloatArray, Fl
     """
     free = model.kinematic[:, None] == 0.0
     turned = model.kinematic == 0.0
-    of_A = np.where(free, model.A, 0.0)
-    of_B = np.where(free, model.B, 0.0)
+    units_A = np.where(free, model.A, 0.0)
+    units_B = np.where(free, model.B, 0.0)
     if coupled:
-        largest_A = np.max(np.abs(of_A) * model.size, axis=1, keepdims=True) / model.size * turned
-        largest_B = np.max(np.abs(of_B), axis=1, keepdims=True)
-        of_A, of_B = (
-            np.where((part == 0.0) & free, COUPLING * largest, part) for part, largest in ((of_A, largest_A), (of_B, largest_B))
+        largest_A = np.max(np.abs(units_A) * model.size, axis=1, keepdims=True) / model.size * turned
+        largest_B = np.max(np.abs(units_B), axis=1, keepdims=True)
+        units_A, units_B = (
+            np.where((part == 0.0) & free, COUPLING * largest, part)
+            for part, largest in ((units_A, largest_A), (units_B, largest_B))
         )
-    return of_A, of_B
+    return units_A, units_B
 
 
 def largest_error(entry: Entry) -> float:
@@ -201,39 +202,40 @@ class Search:
         self._delay = delay / recorded.period
         self._delay_deviation = unknown.delay / recorded.period
         self._drift = unknown.drift
-        angles = np.flatnonzero(block.of(model).gravity.any(axis=0))
+        angles = np.flatnonzero(block.restricted(model).gravity.any(axis=0))
         self._angles = angles if unknown.angle else angles[:0]
         self._angle_deviation = unknown.angle
-        self._model = block.of(model)
+        self._model = block.restricted(model)
         self._block = block
         self._airframe = airframe
         named = (tuple(airframe.states), tuple(airframe.inputs), airframe.outputs, tuple(airframe.gusts))
-        self.names = Names(*(tuple(names[k] for k in part) for names, part in zip(named, block, strict=True)))
+        parts = [tuple(map(names.__getitem__, places)) for names, places in zip(named, block, strict=True)]
+        self.names = Names(*parts)
         self._y = recorded.y[:, block.outputs]
         self._u = recorded.u[:, block.inputs]
         length = span_length(recorded)
         self._spans = [slice(first, first + length) for first in range(0, len(recorded.t), length)]
         self._units = units(self._model, coupled=coupled)
-        of_A, of_B = map(np.count_nonzero, self._units)
+        count_A, count_B = map(np.count_nonzero, self._units)
         self._passed: tuple[bytes, NDArray[np.int64], Normalised] | None = None  # theta, levels and innovations of `levels`
-        self.count = int(of_A + of_B)  # of the entries that are identified
-        self.believe(np.repeat([PRIOR, unknown.effect], [of_A, of_B]))
+        self.count = int(count_A + count_B)  # of the entries that are identified
+        self.believe(np.repeat([PRIOR, unknown.effect], [count_A, count_B]))
 
     def believe(self, deviation: FloatArray) -> None:
         """Take these standard deviations of the relative errors before the flight, (p - G,)."""
-        of_delay = np.ones(1 if self._delay_deviation else 0)
-        of_winds = np.full(len(self._block.winds), WIND_PRIOR)
+        delay_prior = np.ones(1 if self._delay_deviation else 0)
+        wind_prior = np.full(len(self._block.winds), WIND_PRIOR)
         if self.coarse is not self:
             self.coarse.believe(deviation)
-        self.prior = np.concatenate([deviation, of_winds, np.ones(len(self._angles)), of_delay])
+        self.prior = np.concatenate([deviation, wind_prior, np.ones(len(self._angles)), delay_prior])
         self._errors = np.arange(len(self.prior)) < len(deviation)
         self._upper = MAX_ERROR / PRIOR * self.prior
         self._lower = -self._upper
         self._upper[self._errors] = deviation / PRIOR * [largest_error(entry) for entry in self.nominal_entries()]
-        if len(of_delay):  # no u acts before it is sent
+        if len(delay_prior):  # no u acts before it is sent
             self._lower[-1] = max(-MAX_DELAY_ERROR, -self._delay / self._delay_deviation)
             self._upper[-1] = MAX_DELAY_ERROR
-        self._winds = slice(len(deviation), len(deviation) + len(of_winds))
+        self._winds = slice(len(deviation), len(deviation) + len(wind_prior))
         self._begin = slice(self._winds.stop, self._winds.stop + len(self._angles))
 
     def with_errors(self, thetas: FloatArray) -> NominalModel:
@@ -244,10 +246,10 @@ class Search:
             changed = np.tile(matrix, (len(thetas), 1, 1))
             changed[:, unit != 0.0] += unit[unit != 0.0] * part
             matrices.append(changed)
-        whole = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1))
+        A = np.tile(self._airframe.matrix_a(), (len(thetas), 1, 1))
         x = self._block.states
-        whole[:, x[:, None], x] = matrices[0]
-        wind = gust_directions(self._airframe, whole, AIR_RELATIVE)[:, x[:, None], self._block.winds]
+        A[:, x[:, None], x] = matrices[0]
+        wind = gust_directions(self._airframe, A, AIR_RELATIVE)[:, x[:, None], self._block.winds]
         return self._model._replace(A=matrices[0], B=matrices[1], wind=wind)
 
     def models(self, thetas: FloatArray, levels: NDArray[np.int64], *, near: bool = False) -> Models:
@@ -284,17 +286,17 @@ class Search:
         length = self._spans[0].stop // HOLD
         flight = Passage(bank, self._y, u, np.zeros(-(-len(self._y) // HOLD), dtype=np.int64))
         z = np.repeat(models.begin, len(LEVELS), axis=0)
-        found = list[int]()
+        calmest = list[int]()
         r_found = list[FloatArray]()
         for k in range(len(self._spans)):
             r, after = flight.run(z, k * length, (k + 1) * length)
             gain = -np.nansum(np.einsum("lki,lij,lkj->lk", r, precision, r) + log_det[:, None], axis=1) / 2.0
-            found.append(int(np.argmax(gain >= gain.max() - CHANGE)))
-            r_found.append(r[found[-1]])
-            z = np.repeat(after[found[-1]][None], len(LEVELS), axis=0)
-        passed = normalised(np.concatenate(r_found)[None, : len(self._y)], models.bank.covariance, self._of_span(found))
-        self._passed = theta.tobytes(), np.array(found), passed
-        return np.array(found)
+            calmest.append(int(np.argmax(gain >= gain.max() - CHANGE)))
+            r_found.append(r[calmest[-1]])
+            z = np.repeat(after[calmest[-1]][None], len(LEVELS), axis=0)
+        passed = normalised(np.concatenate(r_found)[None, : len(self._y)], models.bank.covariance, self._of_span(calmest))
+        self._passed = theta.tobytes(), np.array(calmest), passed
+        return np.array(calmest)
 
     def _of_span(self, values: Sequence[int] | NDArray[np.int64]) -> NDArray[np.int64]:
         """Values of the spans for the samples, (T,)."""
@@ -361,14 +363,14 @@ class Search:
         fitted = coarse.fitted()
         fixed = np.ones(len(self.prior), dtype=bool)
         fixed[self._winds] = False
-        found = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
+        candidates = [(coarse.cost(np.zeros(len(self.prior)), fitted), np.zeros(len(self.prior)))]
         for level in starts:
             theta = self._started(np.zeros(len(self.prior)), np.full(len(coarse._spans), level), fixed, progress)
-            found.append((coarse.cost(theta, fitted), theta))
+            candidates.append((coarse.cost(theta, fitted), theta))
         if flown is not None and flown.any():
             theta = self._started(flown, None, np.ones(len(flown), dtype=bool), progress)
-            found.append((coarse.cost(theta, fitted), theta))
-        best = sorted(found, key=lambda start: start[0])[:REFINED]
+            candidates.append((coarse.cost(theta, fitted), theta))
+        best = sorted(candidates, key=lambda start: start[0])[:REFINED]
         return [self._refined(theta, levels, used, progress) for cost, theta in best if cost < best[0][0] + CLOSE]
 
     def _started(
@@ -462,7 +464,7 @@ class Search:
                 known.setdefault(name, []).append(value)
         return np.array([np.mean(known.get(name, [0.0])) for name in self.named()])
 
-    def of_model(self, airframe: Airframe) -> FloatArray:
+    def model_errors(self, airframe: Airframe) -> FloatArray:
         """Theta, (p,), of a model in the winds and with the delay of theta = 0, within the bounds."""
         A = airframe.matrix_a()
         B = airframe.matrix_b()
@@ -470,16 +472,16 @@ class Search:
         theta = np.zeros(len(self.prior))
         for k, entry in enumerate(self.nominal_entries()):
             row = airframe.index(entry.row)
-            own = A[row, airframe.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
-            theta[k] = (own - entry.nominal) / entry.unit
+            value = A[row, airframe.index(entry.column)] if entry.matrix == "A" else B[row, inputs.index(entry.column)]
+            theta[k] = (value - entry.nominal) / entry.unit
         return np.clip(theta, self._lower, self._upper)
 
     def entries(self, fit: Fit) -> list[Entry]:
         """The identified entries of A and B."""
-        found = zip(
+        errors = zip(
             self.nominal_entries(), fit.theta.tolist(), fit.deviation.tolist(), strict=False
         )  # winds follow the entries
-        return [entry._replace(error=error, deviation=deviation) for entry, error, deviation in found]
+        return [entry._replace(error=error, deviation=deviation) for entry, error, deviation in errors]
 
     def known(self) -> NDArray[np.bool_]:
         """Mask of the samples that count, (T,): with a y, after the transient of the filter."""
@@ -505,11 +507,11 @@ class Search:
         return ~np.repeat(left_out, self._spans[0].stop)[: len(self._y)]
 
     def _costs(
-        self, found: Normalised, used: NDArray[np.bool_], thetas: FloatArray
+        self, innovations: Normalised, used: NDArray[np.bool_], thetas: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Costs of some models, the normalised innovations used, (N, samples, m), and their sum log det S / 2."""
-        e = found.e[:, used]
-        total = np.sum(found.half_log_det[:, used], axis=1)
+        e = innovations.e[:, used]
+        total = np.sum(innovations.half_log_det[:, used], axis=1)
         costs = e.shape[1] / 2.0 * np.sum(np.log(np.mean(e**2, axis=1)), axis=1) + total
         costs = costs + np.sum((thetas / self.prior) ** 2, axis=1) / 2.0
         return np.where(np.isfinite(costs), costs, np.inf), e, total
@@ -578,7 +580,7 @@ class Identification(NamedTuple):
     @property
     def entries(self) -> tuple[Entry, ...]:
         """Those of all parts."""
-        return tuple(entry for part in self.parts for entry in part.entries)
+        return tuple(chain.from_iterable(part.entries for part in self.parts))
 
     @property
     def refusal(self) -> str:
@@ -609,7 +611,7 @@ def identify(
     require(not still, "record", f"a constant {', '.join(still)}", "outputs that move, or the noise of their sensors")
     validating = known & held_out(len(recorded.t), span_length(recorded))
     every = blocks(model)
-    done = count(1)
+    step_count = count(1)
     starts = len(STARTS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
@@ -618,7 +620,7 @@ def identify(
         return Search(recorded, model, block, airframe, actuation.delay, unknown, coupled=coupled)
 
     def step() -> None:
-        progress(completed=next(done), total=total)
+        progress(completed=next(step_count), total=total)
 
     def part_of(search: Search, fit: Fit) -> Part:
         outputs = search.names.outputs
@@ -636,17 +638,18 @@ def identify(
         delay_deviation = unknown.delay * float(fit.deviation[-1])
         return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
 
-    found = []
+    fits = []
     for search in map(search_of, every):
-        also = None if flown is None else search.of_model(flown)
-        found.append((search, search.fit(known & ~validating, step, flown=also)))
-    parts = [part_of(*each) for each in found]
-    first, last = (joined([getattr(fit, key) for _, fit in found], every) for key in ("before", "after"))
+        also = None if flown is None else search.model_errors(flown)
+        fits.append((search, search.fit(known & ~validating, step, flown=also)))
+    parts = [part_of(*each) for each in fits]
+    first = joined([fit.before for _, fit in fits], every)
+    last = joined([fit.after for _, fit in fits], every)
     others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
-    follows = [correlation(fit.after.normalised, u, known) for (_, fit), u in zip(found, others, strict=True)]
+    follows = [correlation(fit.after.normalised, u, known) for (_, fit), u in zip(fits, others, strict=True)]
     if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
-        search = search_of(whole(model), coupled=True)
-        fit = search.fit(known & ~validating, step, begin=search.joined(found))
+        search = search_of(whole_aircraft(model), coupled=True)
+        fit = search.fit(known & ~validating, step, begin=search.joined(fits))
         part = part_of(search, fit)
         gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
         white = part.after.whiteness.max() <= MAX_WHITENESS
@@ -654,7 +657,7 @@ def identify(
             parts = [part]
             first = fit.before
             last = fit.after
-    identified = with_entries(airframe, (entry for part in parts for entry in part.entries))
+    identified = with_entries(airframe, chain.from_iterable(part.entries for part in parts))
     figures = prediction(first, validating), prediction(last, validating)
     return Identification(identified, recorded, validating, (first.r, last.r), *figures, tuple(parts))
 
@@ -672,9 +675,9 @@ def with_entries(airframe: Airframe, entries: Iterable[Entry]) -> Airframe:
     return airframe.with_matrices(A, B, wind_factors(airframe, A[None], AIR_RELATIVE)[0])
 
 
-def joined(parts: Sequence[Innovations], of: Sequence[Block]) -> Innovations:
+def joined(parts: Sequence[Innovations], blocks: Sequence[Block]) -> Innovations:
     """Innovations of all outputs from those of the blocks."""
-    order = np.argsort(np.concatenate([block.outputs for block in of]))
+    order = np.argsort(np.concatenate([block.outputs for block in blocks]))
     r = np.concatenate([part.r for part in parts], axis=1)[:, order]
     normalised = np.concatenate([part.normalised for part in parts], axis=1)[:, order]
     return Innovations(r, normalised, np.sum([part.log_likelihood for part in parts], axis=0))
@@ -710,21 +713,23 @@ def correlation(e: FloatArray, before: FloatArray, used: NDArray[np.bool_]) -> F
     return np.asarray(total / LAGS)
 
 
-def model_yaml(found: Identification, origin: str) -> str:
+def model_yaml(identified: Identification, origin: str) -> str:
     """The identified airframe as the text of an airframe file. The header has its origin, held-out figures and deviations."""
-    lines = [f"The airframe {found.airframe.name}, with A and B identified from {origin}.", ""]
+    lines = [f"The airframe {identified.airframe.name}, with A and B identified from {origin}.", ""]
     lines.append("Held-out samples, one of three seconds: rms of the innovations in SI, whiteness (1 is white)")
-    for name, prediction in (("nominal", found.before), ("identified", found.after)):
-        figures = zip(found.airframe.outputs, prediction.rms, prediction.whiteness, strict=True)
+    for name, prediction in (("nominal", identified.before), ("identified", identified.after)):
+        figures = zip(identified.airframe.outputs, prediction.rms, prediction.whiteness, strict=True)
         lines.append(f"  {name}: " + ", ".join(f"{output} {rms:.3g}, {white:.3g}" for output, rms, white in figures))
     lines += ["", f"Changes of entries and their standard deviations in %, {100 * PRIOR:g} before the flight:"]
     lines += [
-        f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}" for entry in found.entries if entry.nominal
+        f"  {entry.name}: {100 * entry.error:+.1f}, {100 * entry.deviation:.1f}"
+        for entry in identified.entries
+        if entry.nominal
     ]
-    if between := [entry for entry in found.entries if not entry.nominal]:
+    if between := [entry for entry in identified.entries if not entry.nominal]:
         lines += ["", "Entries between parts that do not couple in the nominal airframe, and their standard deviations, SI:"]
         lines += [f"  {entry.name}: {entry.value:.3g}, {entry.unit * entry.deviation:.3g}" for entry in between]
-    return comment(lines) + as_yaml(found.airframe)
+    return comment(lines) + as_yaml(identified.airframe)
 
 
 # Reasons against a model, each a sentence, or empty where there is none
@@ -733,7 +738,11 @@ def model_yaml(found: Identification, origin: str) -> str:
 def best_known(entries: Iterable[Entry], outputs: Iterable[str]) -> list[Entry]:
     """The best known effect of an input on each output."""
     effects = [entry for entry in entries if entry.matrix == "B" and entry.nominal]
-    return [min((entry for entry in effects if entry.row == output), key=lambda effect: effect.deviation) for output in outputs]
+    best = []
+    for output in outputs:
+        on_output = [entry for entry in effects if entry.row == output]
+        best.append(min(on_output, key=lambda effect: effect.deviation))
+    return best
 
 
 def too_little_excitation(entries: Iterable[Entry], outputs: Iterable[str]) -> str:
@@ -761,14 +770,17 @@ def another_airframe(entries: Iterable[Entry], name: str, allowed: int = 0) -> s
     return ""
 
 
+def _minor_signs(Omega: FloatArray) -> list[float]:
+    """The signs of the leading minors."""
+    return [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
+
+
 def other_signs(nominal: Airframe, identified: Airframe, channels: ChannelPairing) -> str:
     """D of the law where the identified model has another: D follows from the signs of the leading minors of C B."""
     columns = [list(nominal.inputs).index(name) for name in channels.inputs]
     order = np.ix_([nominal.outputs.index(name) for name in channels.outputs], columns)
-    before, after = (
-        [np.sign(np.linalg.det(Omega[:k, :k])) for k in range(1, len(Omega) + 1)]
-        for Omega in ((frame.matrix_c() @ frame.matrix_b())[order] for frame in (nominal, identified))
-    )
+    before = _minor_signs((nominal.matrix_c() @ nominal.matrix_b())[order])
+    after = _minor_signs((identified.matrix_c() @ identified.matrix_b())[order])
     return "" if before == after else "C B: found other signs of its minors than in the nominal airframe, expected the same D"
 
 

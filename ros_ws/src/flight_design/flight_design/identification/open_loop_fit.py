@@ -91,8 +91,8 @@ class ChannelModel(NamedTuple):
         steps = 1e-6 * np.maximum(np.abs(theta), 1e-3)
         slope = np.array([logarithm(theta + step) - logarithm(theta - step) for step in np.diag(steps)]) / (2.0 * steps)
         gain, phase = (float(np.sqrt(part @ self.covariance @ part)) for part in (slope.real, slope.imag))
-        found = logarithm(theta)
-        return Estimate(float(np.exp(found.real)), gain * float(np.exp(found.real))), Estimate(-found.imag, phase)
+        log_ratio = logarithm(theta)
+        return Estimate(float(np.exp(log_ratio.real)), gain * float(np.exp(log_ratio.real))), Estimate(-log_ratio.imag, phase)
 
 
 def fit_channel(

@@ -115,8 +115,8 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     outputs = [number for number in range(1, SERVOS + 1) if values.get(f"SERVO{number}_FUNCTION") == function]
     sticks_instead = "or the sticks in MANUAL, without --servos"
     if not outputs:
-        found = f"found no servo with SERVOn_FUNCTION {function} in the log"
-        raise ParameterError(f"inputs.{name}: {found}, expected one, {sticks_instead}")
+        missing = f"found no servo with SERVOn_FUNCTION {function} in the log"
+        raise ParameterError(f"inputs.{name}: {missing}, expected one, {sticks_instead}")
     keys = ["MIN", *(["TRIM"] if stick.is_centred else []), "MAX", "REVERSED"]
     names = [f"SERVO{outputs[0]}_{key}" for key in keys]
     absent = [key for key in names if key not in values]
@@ -145,9 +145,12 @@ def require_agreement(name_of_map: str, sticks: Iterable[Stick], recorded: Param
         if name in known and not abs(known[name] - value) <= tolerance
     }
     if differing:
-        found, expected = (", ".join(f"{name} {side[name]:g}" for name in differing) for side in (known, differing))
-        mends = dict.fromkeys(mend for name in differing for end, mend in MENDS.items() if end in name.split("_"))
-        raise ParameterError(f"the log: found {found}, expected {expected} as in the map {name_of_map}: {'; '.join(mends)}")
+        logged = ", ".join(f"{name} {known[name]:g}" for name in differing)
+        expected = ", ".join(f"{name} {value:g}" for name, value in differing.items())
+        mends: dict[str, None] = {}
+        for name in differing:
+            mends |= dict.fromkeys(mend for end, mend in MENDS.items() if end in name.split("_"))
+        raise ParameterError(f"the log: found {logged}, expected {expected} as in the map {name_of_map}: {'; '.join(mends)}")
     absent = [name for name in parameters if name not in values]
     return f"the log has no {', '.join(absent)} before the samples: compare the map with them yourself" if absent else ""
 
@@ -157,18 +160,18 @@ def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) ->
 
     `start_ns` is the begin of the log. Raises ParameterError for a change between the samples.
     """
-    within = []
+    between = []
     outside = []
     for name, records in sorted(recorded.items()):
         for before, after in pairwise(records if DECISIVE.fullmatch(name) else ()):
             if before.value == after.value:
                 continue
-            at = seconds(after.stamp_ns - start_ns)
-            change = f"{name} changes from {before.value:g} to {after.value:g} at {at:.1f} s of the log"
+            instant = seconds(after.stamp_ns - start_ns)
+            change = f"{name} changes from {before.value:g} to {after.value:g} at {instant:.1f} s of the log"
             if first_ns < after.stamp_ns <= last_ns:
-                within.append(change)
+                between.append(change)
             else:
                 side, value = ("before", after.value) if after.stamp_ns <= first_ns else ("after", before.value)
                 outside.append(f"{change}, {side} the samples: signs and effects are those of {value:g}")
-    require(not within, "the log", "; ".join(within), "no change between the samples: leave it out by --from and --until")
+    require(not between, "the log", "; ".join(between), "no change between the samples: leave it out by --from and --until")
     return outside

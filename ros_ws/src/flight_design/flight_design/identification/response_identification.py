@@ -10,7 +10,7 @@ Y. Zhu, "Multivariable System Identification for Process Control", 2001, 6 (a hi
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -94,8 +94,8 @@ class Response(NamedTuple):
             return self.refusal[i]
         if ratio >= MIN_RATIO:
             return ""
-        found = f"{output} by {name}: found a response of {ratio:.1f} standard errors, expected {MIN_RATIO:g} or more"
-        return f"{found}: {_more_excitation(name, ratio)}"
+        uncertain = f"{output} by {name}: found a response of {ratio:.1f} standard errors, expected {MIN_RATIO:g} or more"
+        return f"{uncertain}: {_more_excitation(name, ratio)}"
 
 
 def identify_response(
@@ -118,7 +118,7 @@ def identify_response(
         missing = [name for name in names if name not in signal.names]
         require(not missing, f"{topic} of the log", ", ".join(signal.names), f"the channels {', '.join(names)}")
     require(len(y.stamp_ns) > 1 and len(u.stamp_ns) > 1, "the log", f"{len(y.stamp_ns)} samples of y", "a flight")
-    layout = Layout.of(float(np.median(np.diff(y.stamp_ns))) / NANOSECONDS)
+    layout = Layout.from_period(float(np.median(np.diff(y.stamp_ns))) / NANOSECONDS)
     spans = [(int(y.stamp_ns[0]), int(y.stamp_ns[-1]))] if engaged is None else engaged
     rows = [_rows(y, u, outputs, inputs, layout, span) for span in spans]
     predictor = _fit(rows, layout, len(outputs))
@@ -140,7 +140,7 @@ class Layout(NamedTuple):
     u_windows: tuple[tuple[int, int], ...]  # (a, b): the mean of u from t_k - b period to t_k - a period
 
     @classmethod
-    def of(cls, period: float) -> "Layout":
+    def from_period(cls, period: float) -> "Layout":
         """The layout for a period of y in s."""
 
         def windows(first: int, fine: float) -> tuple[tuple[int, int], ...]:
@@ -186,10 +186,10 @@ def _within(signal: Signal, names: Sequence[str], span: tuple[int, int]) -> tupl
     return (signal.stamp_ns[inside] - span[0]) / NANOSECONDS, np.stack([signal[name][inside] for name in names], axis=1)
 
 
-def _integral(t: FloatArray, steps: FloatArray, at: FloatArray) -> FloatArray:
-    """Integral from t[0] to the instants `at` of a signal with the means `steps` from t to t."""
+def _integral(t: FloatArray, steps: FloatArray, instants: FloatArray) -> FloatArray:
+    """Integral from t[0] to the `instants` of a signal with the means `steps` from t to t."""
     sums = np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps * np.diff(t)[:, None], axis=0)])
-    return np.stack([np.interp(at, t, column) for column in sums.T], axis=1)
+    return np.stack([np.interp(instants, t, column) for column in sums.T], axis=1)
 
 
 def _rows(y: Signal, u: Signal, outputs: Sequence[str], inputs: Sequence[str], layout: Layout, span: tuple[int, int]) -> _Rows:
@@ -203,7 +203,8 @@ def _rows(y: Signal, u: Signal, outputs: Sequence[str], inputs: Sequence[str], l
     sums = np.concatenate([np.zeros((1, m)), np.cumsum(values, axis=0)])
     columns = [values[k - lag] for lag in range(1, layout.recent + 1)]
     columns += [(sums[k - a] - sums[k - b]) / (b - a) for a, b in layout.y_windows]
-    ends = [_integral(t_u, held[:-1], t[k] - edge * layout.period) for edge in (0, *(b for _, b in layout.u_windows))]
+    edges = [0, *(b for _, b in layout.u_windows)]
+    ends = [_integral(t_u, held[:-1], t[k] - edge * layout.period) for edge in edges]
     for (new, old), (a, b) in zip(pairwise(ends), layout.u_windows, strict=True):
         columns.append((new - old) / ((b - a) * layout.period))
     return _Rows(np.concatenate(columns, axis=1), values[k], held)
@@ -229,15 +230,15 @@ class _Predictor(NamedTuple):
         blocks = np.swapaxes(every.reshape(len(every), -1, m, m), -1, -2)
         windows = len(layout.y_windows)
         steps = round(HORIZON / layout.period)
-        own = np.zeros((len(every), max(layout.past, steps), m, m))
-        own[:, : layout.recent] = blocks[:, : layout.recent]
+        feedback = np.zeros((len(every), max(layout.past, steps), m, m))
+        feedback[:, : layout.recent] = blocks[:, : layout.recent]
         for number, (first, last) in enumerate(layout.y_windows, layout.recent):
-            own[:, first:last] += blocks[:, number : number + 1] / (last - first)
+            feedback[:, first:last] += blocks[:, number : number + 1] / (last - first)
         s = np.zeros((len(every), steps + 1, m, m))
         for k in range(1, steps + 1):
             for number, (first, last) in enumerate(layout.u_windows, layout.recent + windows):
                 s[:, k] += min(max((k - first) / (last - first), 0.0), 1.0) * blocks[:, number]
-            s[:, k] += np.einsum("dlij,dljn->din", own[:, : k - 1], s[:, k - 1 : 0 : -1])
+            s[:, k] += np.einsum("dlij,dljn->din", feedback[:, : k - 1], s[:, k - 1 : 0 : -1])
         return s[:, 1:]
 
 
@@ -247,8 +248,8 @@ def _fit(rows: Sequence[_Rows], layout: Layout, m: int) -> _Predictor:
     samples = sum(len(part.y) for part in used)
     coefficients = m * (layout.recent + len(layout.y_windows) + len(layout.u_windows))
     least = MIN_ROWS_PER_COEFFICIENT * coefficients
-    found = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
-    require(samples >= least, "the log", found, f"{least * layout.period:.3g} s or more")
+    known = f"{samples * layout.period:.3g} s in which u acts and {FAR:g} s before are known"
+    require(samples >= least, "the log", known, f"{least * layout.period:.3g} s or more")
     X = np.concatenate([part.regressors - part.regressors.mean(axis=0) for part in used])
     Y = np.concatenate([part.y - part.y.mean(axis=0) for part in used])
     first_u = m * (layout.recent + len(layout.y_windows))
@@ -283,7 +284,7 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
     are predicted with coefficients from the rest. Source of the cross-validation: M. Stone, J. Royal Statistical Society B 36,
     1974.
     """
-    left = np.zeros((len(RIDGES), len(names)))
+    residual = np.zeros((len(RIDGES), len(names)))
     total = np.zeros(len(names))
     for span in spans:
         before = int(excitation.stamp_ns[0])
@@ -291,28 +292,28 @@ def explained(signal: Signal, names: Sequence[str], excitation: Signal, spans: S
         t_w = t_w + seconds(before - span[0])
         if len(t) < 2 or len(t_w) < 2 or t_w[-1] - t[0] < FOLDS * PERIOD:
             continue
-        at = np.arange(t[0], min(t[-1], t_w[-1]), PERIOD)
+        instants = np.arange(t[0], min(t[-1], t_w[-1]), PERIOD)
         edges = [0.0]
         while edges[-1] < LOOP_MEMORY:
             edges.append(edges[-1] + PERIOD * 2.0 ** max(len(edges) - LOOP_FINE, 0))
-        ends = [_integral(t_w, (w[:-1] + w[1:]) / 2.0, at - edge) for edge in edges]
+        ends = [_integral(t_w, (w[:-1] + w[1:]) / 2.0, instants - edge) for edge in edges]
         means = [(new - old) / (b - a) for (new, old), (a, b) in zip(pairwise(ends), pairwise(edges), strict=True)]
         Z = np.concatenate([*means, ends[0]], axis=1)
         Z = Z - Z.mean(axis=0)
         Z = Z / np.maximum(np.linalg.norm(Z, axis=0), np.finfo(float).tiny)
-        X = values[np.searchsorted(t, at, side="right") - 1]
+        X = values[np.searchsorted(t, instants, side="right") - 1]
         X = X - X.mean(axis=0)
-        fold = np.arange(len(at)) * FOLDS // len(at)
+        fold = np.arange(len(instants)) * FOLDS // len(instants)
         for number in range(FOLDS):
             others = Z[fold != number]
-            own = fold == number
+            in_fold = fold == number
             normal = others.T @ others
             product = others.T @ X[fold != number]
             for k, ridge in enumerate(RIDGES):
                 fit = np.linalg.solve(normal + ridge * np.eye(len(normal)), product)
-                left[k] += np.sum((X[own] - Z[own] @ fit) ** 2, axis=0)
+                residual[k] += np.sum((X[in_fold] - Z[in_fold] @ fit) ** 2, axis=0)
         total += np.sum(X**2, axis=0)
-    return np.asarray(1.0 - left.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (total > 0.0)
+    return np.asarray(1.0 - residual.min(axis=0) / np.where(total > 0.0, total, np.inf)) * (total > 0.0)
 
 
 # The step response
@@ -326,6 +327,11 @@ class _Column(NamedTuple):
     delay: float
     delay_deviation: float
     sign_ratio: float
+
+
+def _moves(parts: Iterable[FloatArray]) -> bool:
+    """Whether a channel moves in any part of the log."""
+    return any(len(part) and np.ptp(part) > 0.0 for part in parts)
 
 
 def _responses(
@@ -343,9 +349,7 @@ def _responses(
     refusal = []
     for j in range(len(inputs)):
         recorded = {inputs[j]: [part.u[:, j] for part in rows], outputs[j]: [part.y[:, j] for part in rows]}
-        still = next(
-            (name for name, parts in recorded.items() if not any(len(part) and np.ptp(part) > 0.0 for part in parts)), ""
-        )
+        still = next((name for name, parts in recorded.items() if not _moves(parts)), "")
         usable = not still and bool(np.isfinite(responses[..., j]).all())
         columns.append(_column(t, responses[..., j], j) if usable else _no_column(len(outputs)))
         refusal.append(_refusal(outputs[j], inputs[j], columns[-1], j, still, float(share[j])))
@@ -381,19 +385,18 @@ def _refusal(output: str, name: str, column: _Column, j: int, still: str, share:
     ratio = abs(column.Omega[j]) / column.deviation[j]
     if ratio >= MIN_RATIO:
         return ""
-    found = f"found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected {100.0 / MIN_RATIO:.0f} % or less"
-    return f"{output} by {name}: {found}: {_more_excitation(name, ratio)}"
+    inaccurate = f"found Omega within {100.0 / max(ratio, 0.1):.0f} %, expected {100.0 / MIN_RATIO:.0f} % or less"
+    return f"{output} by {name}: {inaccurate}: {_more_excitation(name, ratio)}"
 
 
 def _too_little_share(output: str, name: str, share: float) -> str:
     """The share is P / (P + Q) with P the power of the excitation and Q the power of the disturbances."""
     factor = math.sqrt((1.0 - share) / max(share, 0.05) / (1.0 / MIN_SHARE - 1.0))
-    found = (
+    excited = (
         f"found {100.0 * max(share, 0.0):.0f} % of the motion of {output} and {name} by the excitation, the rest by feedback"
     )
-    return (
-        f"{found} of disturbances, expected {100.0 * MIN_SHARE:.0f} % or more: command {output} {factor:.1f} times as strongly"
-    )
+    remedy = f"command {output} {factor:.1f} times as strongly"
+    return f"{excited} of disturbances, expected {100.0 * MIN_SHARE:.0f} % or more: {remedy}"
 
 
 def _more_excitation(name: str, ratio: float) -> str:
@@ -470,8 +473,8 @@ def _significance(t: FloatArray, responses: FloatArray, theta: FloatArray, size:
     fitted = size * (theta[2] * first + theta[5] * second)
     whiten = _whitener(responses[:, early])
     none = whiten @ responses[0, early]
-    left = whiten @ (responses[0, early] - fitted)
-    return max(float(none @ none - left @ left) - len(theta), 0.0) if begins_with_Omega(t, theta) else 0.0
+    misfit = whiten @ (responses[0, early] - fitted)
+    return max(float(none @ none - misfit @ misfit) - len(theta), 0.0) if begins_with_Omega(t, theta) else 0.0
 
 
 def _whitener(responses: FloatArray) -> FloatArray:
@@ -500,13 +503,13 @@ def _search(
     """Least squares over the free entries, from several delays and lags and from `start`."""
     fitted = np.array(free, dtype=bool)
 
-    def whole(theta: FloatArray) -> FloatArray:
+    def expanded(theta: FloatArray) -> FloatArray:
         values = np.zeros(len(free))
         values[fitted] = theta
         return values
 
     def residuals(theta: FloatArray) -> FloatArray:
-        delay, lag, Omega, damping, stiffness, slow = whole(theta)
+        delay, lag, Omega, damping, stiffness, slow = expanded(theta)
         first, second = second_order(t, delay, lag, damping, stiffness)
         return np.concatenate([size * (whiten @ (Omega * first + slow * second - step)), theta / SPREAD[fitted]])
 
@@ -527,4 +530,4 @@ def _search(
     )
     jacobian = np.zeros((len(best.fun), len(free)))
     jacobian[:, fitted] = best.jac
-    return _Curve(whole(best.x), free, 2.0 * float(best.cost), jacobian)
+    return _Curve(expanded(best.x), free, 2.0 * float(best.cost), jacobian)

@@ -168,10 +168,10 @@ def check_effectors(
     channels = []
     sentences = []
     for j, (name, i) in enumerate(zip(effectors, largest, strict=True)):
-        found = int(np.sign(mapped[i, j]))
+        actual = int(np.sign(mapped[i, j]))
         expected = int(np.sign(effect[i, j]))
-        channels.append(Channel(outputs[i], name, float(mapped[i, j]), found, expected, None, None))
-        if found != expected:
+        channels.append(Channel(outputs[i], name, float(mapped[i, j]), actual, expected, None, None))
+        if actual != expected:
             sentences.append(
                 f"with the map {channel_map.name} {name} has {mapped[i, j]:+.3g} on {outputs[i]}_dot, allocation.effect has"
                 f" {effect[i, j]:+.3g}: a positive {name} means {motion_as_channel_grows(channel_map.inputs[name])}"

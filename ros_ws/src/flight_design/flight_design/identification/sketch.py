@@ -65,10 +65,13 @@ def sketch(name: str, Omega: FloatArray, outputs: Sequence[str], inputs: Sequenc
         "r": {"beta": 6.0 * size["r"], "p": -0.05 * P, "r": -R},
         "phi": {"p": 1.0},
     }
-    A = np.array([[rows[row].get(column, 0.0) for column in STATES] for row in STATES])
+    places = list(STATES)
+    A = np.zeros((len(STATES), len(STATES)))
+    for row, effects in rows.items():
+        for column, effect in effects.items():
+            A[places.index(row), places.index(column)] = effect
     gravity = np.zeros_like(A)
     B = np.zeros((len(STATES), len(inputs)))
-    places = list(STATES)
     gravity[places.index("beta"), places.index("phi")] = n
     for part in PARTS:
         columns = [outputs.index(output) for output in part]
@@ -120,7 +123,7 @@ def _airframe(
         "source": source,
         "speed": speed,
         "states": {state: STATES[state] for state in states},
-        "inputs": {given: {"unit": "1", "positive": INPUTS[given].positive} for given in inputs},
+        "inputs": {input_name: {"unit": "1", "positive": INPUTS[input_name].positive} for input_name in inputs},
         "outputs": list(outputs),
         "A": A.tolist(),
         "B": B.tolist(),
