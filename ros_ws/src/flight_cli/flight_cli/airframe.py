@@ -67,7 +67,7 @@ def new(
     with Console().status("selecting gains and flying"), options(*ARGUMENTS, "Ixx", "Iyy", "Izz", "Ixz"):
         if lag is not None:
             require(bool(parse_numbers(lag)), "lag", repr(lag), "seconds separated by commas")
-        made = new_airframe(
+        draft = new_airframe(
             source,
             folder=folder,
             name=name,
@@ -81,10 +81,12 @@ def new(
             replace=replace,
             **{key: value for key, value in figures.items() if value is not None},
         )
-    frame = made.airframe
-    print(f"read:     {made.note}")
-    print(f"inputs:   {', '.join(f'{key} ({given.unit}, positive: {given.positive})' for key, given in frame.inputs.items())}")
+    frame = draft.airframe
+    print(f"read:     {draft.note}")
+    print(
+        f"inputs:   {', '.join(f'{key} ({channel.unit}, positive: {channel.positive})' for key, channel in frame.inputs.items())}"
+    )
     print(f"outputs:  {', '.join(frame.outputs)}")
-    print(f"airframe: {display_path(made.airframe_file)}")
-    print(f"scenario: {display_path(made.scenario_file)}")
-    print(f"fly it:   rise-di fly {display_path(made.scenario_file)} --in-process")
+    print(f"airframe: {display_path(draft.airframe_file)}")
+    print(f"scenario: {display_path(draft.scenario_file)}")
+    print(f"fly it:   rise-di fly {display_path(draft.scenario_file)} --in-process")

@@ -59,7 +59,7 @@ def airframes(
 
 
 def _table(title: str, *headings: str) -> Table:
-    return new_table(title, headings, left=headings, wrapped=("poles", "zeros at", "minors"))
+    return new_table(title, headings, left_aligned=headings, wrapped=("poles", "zeros at", "minors"))
 
 
 def _format_roots(roots: ComplexArray) -> str:
@@ -72,19 +72,19 @@ def _format_roots(roots: ComplexArray) -> str:
     return "  ".join(shown) or "none"
 
 
-def _as_json(one: AirframeFacts) -> dict[str, Any]:
+def _as_json(facts: AirframeFacts) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "n": one.n,
-        "m": one.m,
-        "poles": [[root.real, root.imag] for root in one.poles],
-        "zeros": [[root.real, root.imag] for root in one.zeros],
-        "integrated": list(one.integrated),
-        "zero_dynamics": str(one.zero_dynamics),
-        "minors": one.minors.tolist(),
-        "D": None if one.D is None else [int(sign) for sign in one.D],
-        "for_D_I": one.remedy,
-        "coupling": one.coupling,
-        "controllable": one.controllable,
-        "in_theorem": one.in_theorem,
+        "name": facts.name,
+        "n": facts.n,
+        "m": facts.m,
+        "poles": [[root.real, root.imag] for root in facts.poles],
+        "zeros": [[root.real, root.imag] for root in facts.zeros],
+        "integrated": list(facts.integrated),
+        "zero_dynamics": str(facts.zero_dynamics),
+        "minors": facts.minors.tolist(),
+        "D": None if facts.D is None else [int(sign) for sign in facts.D],
+        "for_D_I": facts.remedy,
+        "coupling": facts.coupling,
+        "controllable": facts.controllable,
+        "in_theorem": facts.in_theorem,
     }

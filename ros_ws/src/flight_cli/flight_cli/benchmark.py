@@ -73,15 +73,15 @@ def benchmark(
 def _fly(run: Benchmark, flights: Flights, engine: engines.Engine, *, quiet: bool) -> None:
     total = run.definition.flights
     missing = run.missing()
-    done = total - sum(map(run.definition.size, missing))
+    completed = total - sum(map(run.definition.size, missing))
     try:
         with progress_bar(*COUNT_COLUMNS, quiet=quiet) as bar:
-            task = bar.add_task("flights", total=total, completed=done)
+            task = bar.add_task("flights", total=total, completed=completed)
             for flown in run.fly(flights, engine):
-                done += flown
-                bar.update(task, completed=done)
+                completed += flown
+                bar.update(task, completed=completed)
     except KeyboardInterrupt:
-        print(f"interrupted after {done} of {total} flights; the same command continues")
+        print(f"interrupted after {completed} of {total} flights; the same command continues")
         raise typer.Exit(INTERRUPTED) from None
 
 
@@ -89,17 +89,17 @@ def _show(console: Console, scores: Mapping[str, Any]) -> None:
     entry = scores["entry"]
     seeds = scores["benchmark"]["release"] or "fixed"
     title = f"Benchmark {VERSION}, seeds {seeds}: {entry['name']} sees {entry['sees']}, knows {entry['knows']}"
-    table = new_table(title, ("set", "flights", "score", "worst", "lost"), left=("set",), wrapped=("set",))
-    for of in scores["sets"].values():
-        if "not_flown" not in of:
-            figures = (f"{of['score']['mean']:.2f}", f"{of['score']['worst']:.2f}", str(of["lost"]))
-            table.add_row(of["title"], str(of["aircraft"]), *figures)
+    table = new_table(title, ("set", "flights", "score", "worst", "lost"), left_aligned=("set",), wrapped=("set",))
+    for scored in scores["sets"].values():
+        if "not_flown" not in scored:
+            figures = (f"{scored['score']['mean']:.2f}", f"{scored['score']['worst']:.2f}", str(scored["lost"]))
+            table.add_row(scored["title"], str(scored["aircraft"]), *figures)
     console.print(table)
-    for of in scores["sets"].values():
-        if "over_time" in of:
-            windows = ", ".join(f"{window} s {value:.2f}" for window, value in of["over_time"].items())
-            console.print(f"over time, damage at 60 s: {windows}; recovery {of['recovery']:.2f}", highlight=False)
-    for of in scores["sets"].values():
-        if "not_flown" in of:
-            console.print(f"not flown: {of['title']}: {of['not_flown']}", highlight=False, markup=False)
+    for scored in scores["sets"].values():
+        if "over_time" in scored:
+            windows = ", ".join(f"{window} s {value:.2f}" for window, value in scored["over_time"].items())
+            console.print(f"over time, damage at 60 s: {windows}; recovery {scored['recovery']:.2f}", highlight=False)
+    for scored in scores["sets"].values():
+        if "not_flown" in scored:
+            console.print(f"not flown: {scored['title']}: {scored['not_flown']}", highlight=False, markup=False)
     console.print(LEGEND, style="dim", highlight=False)

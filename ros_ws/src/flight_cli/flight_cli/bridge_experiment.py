@@ -4,6 +4,7 @@
 
 import shlex
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -69,23 +70,23 @@ def identify_behind_bridge(
     run = _excite(console, channel_map, map_name, speed, folder, amplitude) if log is None else log
     tape, spans, ended = _engaged(run, channel_map)
     try:
-        trims, response, found = _identified(console, channel_map, tape, spans, speed)
+        trims, response, channels = _identified(console, channel_map, tape, spans, speed)
     except ParameterError as error:
         raise ParameterError("; ".join(filter(None, (str(error), ended)))) from None
     channel_map, narrower = within_range(channel_map, trims)
     for sentence in narrower:
         console.print(sentence, highlight=False, soft_wrap=True)
     airframe = folder / "airframe.yaml"
-    flyable = flying_scenario(channel_map, found, speed, str(airframe.resolve()), needed)
+    flyable = flying_scenario(channel_map, channels, speed, str(airframe.resolve()), needed)
     require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --accept beside --bridge")
     written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
     _write(folder, files)
     load_scenario(folder / "scenario.yaml")
     if as_json:
-        print_json(_as_json(response, found, flyable, trims, folder))
+        print_json(_as_json(response, channels, flyable, trims, folder))
         return
-    _show_gains(console, found, response, flyable)
+    _show_gains(console, channels, response, flyable)
     scenario, copied = (shlex.quote(str(folder / f"{name}.yaml")) for name in ("scenario", "map"))
     console.print(f"to fly it: rise-di fly {scenario} --bridge {copied} --send", highlight=False, soft_wrap=True)
 
@@ -143,7 +144,7 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
     table = new_table(
         f"Excitation, {controller.duration:.0f} s open loop after engagement, one input after another",
         ("input", "amplitude", "doublets, s", "multisine, s", "Hz"),
-        left=("input",),
+        left_aligned=("input",),
     )
     for i, name in enumerate(controller.inputs):
         width = controller.width[i]
@@ -197,7 +198,7 @@ def _show_response(console: Console, name_of_map: str, response: Response, trims
         f"Response of the aircraft behind {name_of_map}, {response.seconds:.0f} s without gaps of {engaged:.0f} s engaged;"
         " SI, standard errors",
         headings,
-        left=("input", "moves"),
+        left_aligned=("input", "moves"),
     )
     table.collapse_padding = True  # nine columns in a terminal of 80
     for i, (name, output) in enumerate(zip(response.inputs, response.outputs, strict=True)):
@@ -206,49 +207,53 @@ def _show_response(console: Console, name_of_map: str, response: Response, trims
             (response.lag[i], response.lag_deviation[i]),
             (response.delay[i], response.delay_deviation[i]),
         )
-        numbers = (text for value, deviation in pairs for text in (_digits(value, 3), _digits(deviation, 2)))
-        table.add_row(name, f"{trims[name]:.3g}", f"{output}_dot", *numbers)
+        cells = [f"{trims[name]:.3g}", f"{output}_dot"]
+        for value, deviation in pairs:
+            cells += [_digits(value, 3), _digits(deviation, 2)]
+        table.add_row(name, *cells)
     console.print(table)
 
 
 def _show_models(console: Console, response: Response, models: list[ChannelModel | None]) -> None:
     parameters = ("input", "Omega", "lag", "delay", "damping", "stiffness", "zero", "misfit")
-    table = new_table("Models of the channels, SI, fitted to the output error", parameters, left=("input",))
+    table = new_table("Models of the channels, SI, fitted to the output error", parameters, left_aligned=("input",))
     estimates = ("channel", "abs(y / u)", "+-", "y behind u, rad", "+-", "used")
-    loop = new_table("The models at the frequency of the loop, standard errors", estimates, left=("channel", "used"))
+    loop = new_table("The models at the frequency of the loop, standard errors", estimates, left_aligned=("channel", "used"))
     for output, name, model in zip(response.outputs, response.inputs, models, strict=True):
         channel = f"{output} by {name}"
         if model is not None:
             values = (model.Omega, model.lag, model.delay, model.damping, model.stiffness, model.slow / model.Omega)
             table.add_row(name, *(f"{value:.3g}" for value in values), f"{100 * model.misfit:.0f} %")
-            numbers = [value for estimate in model.at_loop_frequency() for value in estimate]
+            numbers = chain.from_iterable(model.at_loop_frequency())
             loop.add_row(channel, *(f"{value:.3g}" for value in numbers), "model" if model.usable else "step response")
     console.print(table, loop)
-    without = [name for name, model in zip(response.outputs, models, strict=True) if model is None or not model.usable]
-    if without:
+    uncertain = [name for name, model in zip(response.outputs, models, strict=True) if model is None or not model.usable]
+    if uncertain:
         console.print(
-            f"{', '.join(without)}: no certain model without a zero above {FASTEST_ZERO:g} 1/s, so that the law has"
-            f" {without[0]}_dot = Omega u from the step response: no damping in its feedforward, and the integral by bandwidth"
-            " alone.",
+            f"{', '.join(uncertain)}: no certain model without a zero above {FASTEST_ZERO:g} 1/s, so that the law has"
+            f" {uncertain[0]}_dot = Omega u from the step response: no damping in its feedforward, and the integral by"
+            " bandwidth alone.",
             highlight=False,
             soft_wrap=True,
         )
 
 
-def _show_gains(console: Console, found: Channels, response: Response, flyable: Flyable) -> None:
+def _show_gains(console: Console, channels: Channels, response: Response, flyable: Flyable) -> None:
     controller = flyable.controller
     params = flyable.controller.law_params()
-    table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"), left=("channel",))
+    table = new_table("Gains by lag and delay", ("channel", "bandwidth, rad/s", "Lambda, 1/s"), left_aligned=("channel",))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         place = response.outputs.index(output)
-        bandwidth = params.K[i] * params.input_scale[i] * abs(found.Omega[place, place])
+        bandwidth = params.K[i] * params.input_scale[i] * abs(channels.Omega[place, place])
         table.add_row(f"{output} by {name}", f"{bandwidth:.3g}", f"{params.Lambda[i]:.3g}")
     console.print(table)
     if flyable.delay_margin is not None:
         console.print(f"delay margin beyond the identified delay: {1e3 * flyable.delay_margin:.0f} ms", highlight=False)
 
 
-def _as_json(response: Response, found: Channels, flyable: Flyable, trims: dict[str, float], folder: Path) -> dict[str, object]:
+def _as_json(
+    response: Response, channels: Channels, flyable: Flyable, trims: dict[str, float], folder: Path
+) -> dict[str, object]:
     def numbers(values: Any) -> dict[str, Any]:
         arrays = {key: value for key, value in values._asdict().items() if isinstance(value, np.ndarray)}
         return {key: value.tolist() for key, value in arrays.items()}
@@ -257,7 +262,7 @@ def _as_json(response: Response, found: Channels, flyable: Flyable, trims: dict[
         "outputs": list(response.outputs),
         "inputs": list(response.inputs),
         "step_response": numbers(response),
-        "channels": numbers(found),
+        "channels": numbers(channels),
         "trim": trims,
         "delay_margin": flyable.delay_margin,
         "controller": flyable.controller.model_dump(exclude_defaults=True),

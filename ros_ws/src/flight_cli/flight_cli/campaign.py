@@ -111,9 +111,9 @@ def campaign(
         require(rows.parent.is_dir(), "--rows", rows, "a file in a folder that exists")
     if resume is not None:
         for name in OF_DEFINITION:
-            given = context.get_parameter_source(name)
-            own = given is None or given.name != "COMMANDLINE"
-            require(own, f"--{name}", "it beside --resume", "none: the folder of a campaign holds its definition")
+            source = context.get_parameter_source(name)
+            is_default = source is None or source.name != "COMMANDLINE"
+            require(is_default, f"--{name}", "it beside --resume", "none: the folder of a campaign holds its definition")
         monte_carlo = Campaign.resume(resume)
     else:
         chosen = find_scenario(str(scenario), duration)
@@ -174,32 +174,32 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     definition = monte_carlo.definition
     total = definition.aircraft * definition.cases
     missing = monte_carlo.missing()
-    there = total - sum(definition.size(job) for job in missing)
+    stored = total - sum(definition.size(job) for job in missing)
     if not missing:
         return None
     seconds = definition.scenario().flight.duration
     begin = time.monotonic()
-    done = 0
+    flown = 0
     try:
         with progress_bar(*COUNT_COLUMNS, SHOWN_COLUMN, quiet=quiet) as bar:
-            task = bar.add_task("aircraft", total=total, completed=there, shown="starting")
+            task = bar.add_task("aircraft", total=total, completed=stored, shown="starting")
             for flights in monte_carlo.fly(engine, learner):
-                done += flights
-                speed = done * seconds / (time.monotonic() - begin)
-                bar.update(task, completed=there + done, shown=f"{speed:,.0f} aircraft-seconds per second")
+                flown += flights
+                speed = flown * seconds / (time.monotonic() - begin)
+                bar.update(task, completed=stored + flown, shown=f"{speed:,.0f} aircraft-seconds per second")
     except KeyboardInterrupt:
         print(
-            f"interrupted after {there + done} of {total}; continue with:"
+            f"interrupted after {stored + flown} of {total}; continue with:"
             f" rise-di campaign --resume {shlex.quote(display_path(monte_carlo.folder))}"
         )
         raise typer.Exit(INTERRUPTED) from None
-    return done * seconds / (time.monotonic() - begin)
+    return flown * seconds / (time.monotonic() - begin)
 
 
 def _print(console: Console, results: Table, first: str) -> None:
     """Print a table of the page; `first` heads the names of the rows."""
     table = new_table(
-        escape(f"\n{results.caption}"), (first, *(escape(column.head) for column in results.columns)), left=(first,)
+        escape(f"\n{results.caption}"), (first, *(escape(column.head) for column in results.columns)), left_aligned=(first,)
     )
     for name, *values in results.rows:
         table.add_row(escape(name), *values)
@@ -213,15 +213,15 @@ def _show(console: Console, definition: Definition, case: int, tally: Tally, fig
     title += f", effect of wind {WIND_EFFECTS[definition.wind]}"
     if definition.sweep is not None:
         title += f", {definition.sweep.parameter} times {definition.factor(case):g}"
-    table = new_table(escape(title), ("figure", *FIGURE_HEADINGS), left=("figure",))
+    table = new_table(escape(title), ("figure", *FIGURE_HEADINGS), left_aligned=("figure",))
     for row in figure_rows(tally, units):
         table.add_row(*row)
     console.print(table)
     for word, count in (("diverged", tally.diverged), (f"lost track (score above {LOSS_OF_TRACK_SCORE:g})", tally.lost)):
         share, low, high = tally.share(count)
         console.print(f"{word}: {count} of {tally.flights}, {100 * share:.3g} % (95 %: {100 * low:.2g} to {100 * high:.2g})")
-    if (without := tally.without_model()) is not None:
-        console.print(f"without a model: {without} of {tally.flights}; fallbacks: to the law of the start")
+    if (unmodelled := tally.without_model()) is not None:
+        console.print(f"without a model: {unmodelled} of {tally.flights}; fallbacks: to the law of the start")
     for flight in figures["fly_again"]:
         score = "diverged" if flight["score"] is None else f"score {flight['score']:.3g}"
         console.print(

@@ -34,9 +34,11 @@ def check_map(
     channel_map = load_map(map_name)
     kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
     installed = installed_definitions(kinds)
-    of_mavlink = {kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")}
+    mavlink_types = {kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")}
     names = ["installed"] if not definitions else [folder.resolve().name for folder in definitions]
-    releases = [installed] if not definitions else [{**definitions_below(at, kinds), **of_mavlink} for at in definitions]
+    releases = (
+        [installed] if not definitions else [{**definitions_below(folder, kinds), **mavlink_types} for folder in definitions]
+    )
     rows = checked_rows(channel_map, releases)
     if as_json:
         print_json({"map": channel_map.name, "releases": names, "rows": [row._asdict() for row in rows]})
@@ -45,7 +47,7 @@ def check_map(
         for name, types in zip(names, releases, strict=True):
             if absent := sorted({kind.partition("/")[0] for kind in kinds if not is_known(types, kind)}):
                 print(f"note: {name}: no definition of {', '.join(absent)}: make messages, or --definitions", file=sys.stderr)
-    if any(fault for row in rows for fault in row.faults):
+    if any(any(row.faults) for row in rows):
         raise typer.Exit(DOES_NOT_HOLD)
 
 
@@ -53,16 +55,16 @@ def _show(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -> Non
     """Print a row for each row of the map, and a sentence for each that does not hold."""
     faults: dict[str, list[dict[str, None]]] = {}
     for row in rows:
-        of_row = faults.setdefault(row.key, [{} for _ in releases])
-        for of_release, fault in zip(of_row, row.faults, strict=True):
-            of_release.update({fault: None} if fault else {})
-    table = new_table(f"Map {name}: which rows hold", ("row", *releases), left=("row", *releases), wrapped=releases)
-    for key, of_row in faults.items():
-        table.add_row(key, *("no" if fault else "holds" for fault in of_row))
+        by_release = faults.setdefault(row.key, [{} for _ in releases])
+        for sentences, fault in zip(by_release, row.faults, strict=True):
+            sentences.update({fault: None} if fault else {})
+    table = new_table(f"Map {name}: which rows hold", ("row", *releases), left_aligned=("row", *releases), wrapped=releases)
+    for key, by_release in faults.items():
+        table.add_row(key, *("no" if fault else "holds" for fault in by_release))
     Console().print(table)
     for k, release in enumerate(releases):
-        held = sum(not of_row[k] for of_row in faults.values())
+        held = sum(not by_release[k] for by_release in faults.values())
         print(f"{release}: {held} of {len(faults)} rows hold")
-        for key, of_row in faults.items():
-            if of_row[k]:
-                print(f"    {key}: {', '.join(of_row[k])}")
+        for key, by_release in faults.items():
+            if by_release[k]:
+                print(f"    {key}: {', '.join(by_release[k])}")

@@ -62,7 +62,7 @@ def check_signs(
 def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airframe: str) -> None:
     title = f"Map {channel_map.name}, airframe {airframe}: what a positive u does"
     headings = ("u", "moves", "seen in", "effect", "D", "of law", *(["recorded"] if checked.seconds else []))
-    table = new_table(title, headings, left=("u", "moves", "seen in"))
+    table = new_table(title, headings, left_aligned=("u", "moves", "seen in"))
     for channel in checked.channels:
         cells = [
             channel.input,
@@ -77,12 +77,12 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
         table.add_row(*cells)
     console.print(table)
     headings = ("channel", "raw value", "topic")
-    fields = new_table("", headings, left=headings)
+    fields = new_table("", headings, left_aligned=headings)
     for channel in checked.channels:
-        given = channel_map.inputs[channel.input]
-        taken = channel_map.outputs[channel.output]
-        fields.add_row(f"u.{channel.input}", _format_field(given), channel_map.messages[given.message].topic)
-        fields.add_row(f"y.{channel.output}", _format_field(taken), taken.topic)
+        command = channel_map.inputs[channel.input]
+        output = channel_map.outputs[channel.output]
+        fields.add_row(f"u.{channel.input}", _format_field(command), channel_map.messages[command.message].topic)
+        fields.add_row(f"y.{channel.output}", _format_field(output), output.topic)
     console.print(fields)
     if checked.seconds:
         console.print(

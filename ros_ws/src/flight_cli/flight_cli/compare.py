@@ -4,6 +4,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -106,15 +107,14 @@ def compare(
     controllers = registered_laws.find_laws(names, chosen, others)
     entries = registered_laws.entries(controllers)
     path = gains or tuned_gains.tuned_file(chosen)
-    wanted = [(name, aim) for name in names for aim in aims if aim not in tuned_gains.load(path).get(name, {})]
+    stored = tuned_gains.load(path)
+    wanted = [(name, aim) for name, aim in product(names, aims) if aim not in stored.get(name, {})]
     results = []
     with progress_bar(*COUNT_COLUMNS) as bar:
         if tune:
             _tune(wanted, entries, chosen, path, command, bar, controllers)
         known = tuned_gains.load(path)
-        tuned = {name: {aim: known[name][aim] for aim in aims if aim in known.get(name, {})} for name in names}
-        own = {name: registered_laws.as_tuned(controller) for name, controller in controllers.items() if controller is not None}
-        tuned |= {name: {aim: tuned[name].get(aim, gains_) for aim in aims} for name, gains_ in own.items()}
+        tuned = {name: _tuned(known.get(name, {}), aims, controllers[name]) for name in names}
         require(any(tuned.values()), "--laws", "tuned gains for none of them", f"gains in {path}, or --tune, which finds them")
         benchmark = registered_laws.with_courses(gain_tuning.build_benchmark(chosen, turbulence_seed), controllers)
         task = bar.add_task("comparing", total=sum(len(by_aim) for by_aim in tuned.values()))
@@ -124,8 +124,8 @@ def compare(
     console = Console()
     console.width = max(console.width, WIDTH)
     for aim in aims:
-        if found := [result for result in results if result.objective == aim]:
-            console.print(_table(gain_tuning.OBJECTIVES[aim].title, found, entries, chosen))
+        if shown := [result for result in results if result.objective == aim]:
+            console.print(_table(gain_tuning.OBJECTIVES[aim].title, shown, entries, chosen))
     notes = _notes(chosen, benchmark, {name: entries[name] for name in tuned if tuned[name]}, aims)
     flown = f"{aircraft} aircraft a level, seed {seed}; effect of wind on x_dot {WIND_EFFECTS[effect]}"
     turbulence = f"turbulence of seed {turbulence_seed}, that of the tuning {tuning_seed}"
@@ -148,8 +148,8 @@ def _check_options(aims: Sequence[str], levels: Sequence[float], uncertainty: st
         require(aim in gain_tuning.OBJECTIVES, "--tuning", repr(aim), ", ".join(gain_tuning.OBJECTIVES))
     fits = bool(levels) and all(0.0 <= level < 1.0 for level in levels)
     require(fits, "--uncertainty", repr(uncertainty), "parts of each entry, each at least 0 and below 1: 0.3,0.5")
-    other = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
-    require(other, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
+    differs = turbulence_seed != gain_tuning.TUNING_TURBULENCE_SEED
+    require(differs, "--turbulence-seed", turbulence_seed, "another seed than that of the tuning")
 
 
 def _require_one_law(names: Sequence[str], aims: Sequence[str]) -> None:
@@ -166,6 +166,16 @@ def _write(path: Path, name: str, aim: str, result: TuningResult, benchmark: Ben
     margins = loop_assessment(scenario_loop(benchmark.scenario, controller)) if has_margins(LAWS[name]) else None
     comments = {"delay": "s, beyond sampling: topics have none in the benchmark"}
     write_text("--write", path, LICENCE + section_yaml(controller, airframe, margins, origin, comments))
+
+
+def _tuned(
+    known: Mapping[str, TuningResult], aims: Sequence[str], controller: ControllerConfig | None
+) -> dict[str, TuningResult]:
+    """The gains of a law by objective: those of a search, else those of its controller."""
+    searched = {aim: known[aim] for aim in aims if aim in known}
+    if controller is None:
+        return searched
+    return dict.fromkeys(aims, registered_laws.as_tuned(controller)) | searched
 
 
 def _tune(
@@ -191,21 +201,21 @@ def _tune(
         tuned_gains.save(path, known, list(gain_tuning.OBJECTIVES), command)
 
 
-def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario) -> Table:
+def _table(tuned_on: str, results: Sequence[LawResult], entries: Mapping[str, Law], scenario: Scenario) -> Table:
     units = display_units(scenario)
-    of = " / ".join
-    levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in found[0].levels))
-    delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *found[0].lost_late))
+    join_names = " / ".join
+    levels = ("nominal", *(f"+-{100.0 * level.uncertainty:g} %" for level in results[0].levels))
+    delays = "/".join(f"{1e3 * delay:g}" for delay in (0.0, *results[0].lost_late))
     heads = (
         *("law", "sees", "knows"),
-        *(f"{wind}\n{level}" for wind in found[0].scores for level in levels),
+        *(f"{wind}\n{level}" for wind, level in product(results[0].scores, levels)),
         f"lost, %, at {levels[1]},\nu late by, ms:\n{delays}",
-        "slew\n" + of(name[:4] for name in scenario.controller.inputs),
+        "slew\n" + join_names(name[:4] for name in scenario.controller.inputs),
         "margins:\ndeg, S",
         "cost",
     )
-    table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left=("law", "sees", "knows"))
-    for result in found:
+    table = new_table(f"{scenario.name}, each law tuned on {tuned_on}", heads, left_aligned=("law", "sees", "knows"))
+    for result in results:
         law = entries[result.law]
         lost = (result.levels[0].scores[gain_tuning.GUST].lost, *result.lost_late.values())
         slew = zip(scenario.controller.inputs, result.slew.tolist(), strict=True)
@@ -213,7 +223,7 @@ def _table(tuned_on: str, found: Sequence[LawResult], entries: Mapping[str, Law]
             *(result.law, law.measurements, law.model_data),
             *law_comparison.score_cells(result),
             "/".join(f"{100.0 * share:.3g}" for share in lost),
-            of(f"{value * units[name].factor:.0f}" for name, value in slew),
+            join_names(f"{value * units[name].factor:.0f}" for name, value in slew),
             "none" if result.margins is None else _format_margins(result.margins),
             f"{min(result.costs):.2f} +{max(result.costs) - min(result.costs):.2f}" if result.costs else "own gains",
         )
@@ -254,23 +264,23 @@ def _notes(scenario: Scenario, benchmark: Benchmark, laws: Mapping[str, Law], ai
     )
 
 
-def _as_json(one: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
+def _as_json(result: LawResult, law: Law, scenario: Scenario) -> dict[str, Any]:
     """Figures of a law for JSON: SI, null for an infinite figure, and for the cost of gains that no search found."""
     controller = scenario.controller
-    levels = [
-        {"uncertainty": level.uncertainty} | {wind: scores._asdict() for wind, scores in level.scores.items()}
-        for level in one.levels
-    ]
-    row = {"law": one.law, "sees": law.measurements, "knows": law.model_data, "tuned_on": one.objective}
+    levels = []
+    for level in result.levels:
+        by_wind = {wind: scores._asdict() for wind, scores in level.scores.items()}
+        levels.append({"uncertainty": level.uncertainty} | by_wind)
+    row = {"law": result.law, "sees": law.measurements, "knows": law.model_data, "tuned_on": result.objective}
     return row | {
-        "cost": min(one.costs, default=None),
-        "spread": max(one.costs) - min(one.costs) if one.costs else None,
-        "score": finite_or_null(one.scores),
+        "cost": min(result.costs, default=None),
+        "spread": max(result.costs) - min(result.costs) if result.costs else None,
+        "score": finite_or_null(result.scores),
         "levels": finite_or_null(levels),
-        "late": [{"delay": delay, "lost": lost} for delay, lost in one.lost_late.items()],
-        "rms": dict(zip(controller.outputs, one.rms.tolist(), strict=True)),
-        "slew": dict(zip(controller.inputs, one.slew.tolist(), strict=True)),
-        "margins": None if one.margins is None else _margins_as_json(one.margins),
+        "late": [{"delay": delay, "lost": lost} for delay, lost in result.lost_late.items()],
+        "rms": dict(zip(controller.outputs, result.rms.tolist(), strict=True)),
+        "slew": dict(zip(controller.inputs, result.slew.tolist(), strict=True)),
+        "margins": None if result.margins is None else _margins_as_json(result.margins),
     }
 
 

@@ -93,8 +93,8 @@ def fly(
     require(autopilot is None or not composed, "--composed", "a flight with a bridge", "one process a node")
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     files = route or fence
-    of_route = (("--simplify", simplify or None, route), ("--line", line, route))
-    for option, value, file in (("--origin", origin, files), ("--altitude", altitude, files), *of_route):
+    route_options = (("--simplify", simplify or None, route), ("--line", line, route))
+    for option, value, file in (("--origin", origin, files), ("--altitude", altitude, files), *route_options):
         require(value is None or file is not None, option, "no --route", "the file of a route: --route FILE")
     if files is not None:
         chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)

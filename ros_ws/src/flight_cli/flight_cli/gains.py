@@ -3,6 +3,7 @@
 """`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a scenario."""
 
 import math
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -112,8 +113,8 @@ def gains(
     answers: dict[str, Assessment]
     with console.status("selecting gains on uncertain airframes") as status, options(*loop, *PARTS):
         if check:
-            for option, given in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
-                require(not given, option, "it beside --check", "one of them: --check selects nothing to write")
+            for option, requested in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
+                require(not requested, option, "it beside --check", "one of them: --check selects nothing to write")
             own_loop = all(value is None for value in loop.values())
             require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
             answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
@@ -148,13 +149,13 @@ def gains(
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
                 write_text("--write", write, LICENCE + gain_selection.as_yaml(selection, theorem=theorem))
-    found = next(iter(answers.values())).study
+    study = next(iter(answers.values())).study
     if page is not None:
         _write_page(page, [*answers.values()][-1])
     if as_json:
-        print_json(_as_json(found, answers, seed))
+        print_json(_as_json(study, answers, seed))
     else:
-        _show(console, found, answers)
+        _show(console, study, answers)
         if not check and not observer and selection.engineering.has_requirement:
             _show_trade(console, selection)
         if origin:
@@ -174,10 +175,10 @@ def _write_page(path: Path, answer: Assessment) -> None:
         write_loop_page(path, f"Loop of {study.airframe.name}", loop)
 
 
-def _require_margins(found: Assessment, accept: bool) -> None:
+def _require_margins(assessment: Assessment, accept: bool) -> None:
     """Raises ParameterError for gains whose margins fall short of the requirement, without --accept."""
-    if found.unmet and not accept:
-        lacking = "; ".join(condition.sentence(found.controller.outputs) for condition in found.unmet)
+    if assessment.unmet and not accept:
+        lacking = "; ".join(condition.sentence(assessment.controller.outputs) for condition in assessment.unmet)
         raise ParameterError(f"--write: {lacking}; --accept writes them all the same")
 
 
@@ -186,13 +187,13 @@ def _show_trade(console: Console, selection: Selection) -> None:
     controller = selection.chosen
     frame = selection.study.airframe
     outputs = controller.outputs
-    of_outputs = frame.units_of_outputs()
-    shown = [display_unit(of_outputs[name]) for name in outputs]
-    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in of_outputs.values())  # no score of a height
-    units = score_units(outputs, of_outputs) if counted else np.full(len(outputs), np.nan)
+    output_units = frame.units_of_outputs()
+    shown = [display_unit(output_units[name]) for name in outputs]
+    counted = all(quantity(unit).dimension in SCORE_UNIT for unit in output_units.values())  # no score of a height
+    units = score_units(outputs, output_units) if counted else np.full(len(outputs), np.nan)
     headings = (f"{name},\n{unit.unit}" for name, unit in zip(outputs, shown, strict=True))
     heads = ["phase margin,\ndeg", "least\nfound", "delay\nmargin", *headings, "score"]
-    table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left=())
+    table = new_table("\nTrade: rms of the error of the linear loop along the manoeuvre", heads, left_aligned=())
     for row in trade(selection):
         errors = (f"{rms * unit.factor:.3g}" for rms, unit in zip(row.rms.tolist(), shown, strict=True))
         margins = f"{row.phase_margin:g}", f"{row.reached:.0f}", _milliseconds(row.delay_margin)
@@ -207,32 +208,28 @@ def _parse_lags(text: str) -> list[float]:
     return values
 
 
-def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> None:
+def _show(console: Console, study: Study, answers: dict[str, Assessment]) -> None:
     first = next(iter(answers.values()))
     outputs = first.controller.outputs
-    samples = len(found.A) - 1
-    aircraft = f"{found.airframe.name}, A and B +-{100 * found.uncertainty:g} % ({samples} samples)"
+    samples = len(study.A) - 1
+    aircraft = f"{study.airframe.name}, A and B +-{100 * study.uncertainty:g} % ({samples} samples)"
     console.print(_gain_table(answers, aircraft) if first.theorem else _own_gains(first.controller, aircraft))
     for name, answer in answers.items():
         if answer.margins is not None and answer.margins.nominal.stable:
             heads = ("input", *(f"{column.group}\n{column.head}" for column in MARGIN_COLUMNS))
-            table = new_table(f"\nMargins, {name}: nominal (worst sample)", heads, left=("input",))
+            table = new_table(f"\nMargins, {name}: nominal (worst sample)", heads, left_aligned=("input",))
             for row in margin_rows(answer.margins):
                 table.add_row(*row)
             console.print(table)
             console.print(modes_text(answer.margins), highlight=False, soft_wrap=True)
-        console.print(f"{name}: {_format_delay_margin(found, answer)}", highlight=False, soft_wrap=True)
+        console.print(f"{name}: {_format_delay_margin(study, answer)}", highlight=False, soft_wrap=True)
     console.print(MARGIN_LEGEND, style="dim", highlight=False, soft_wrap=True)
 
     for part, heading in (("theorem", "Theorem 1"), ("loop", "The loop")):
         if not getattr(first, part):
             continue
-        headings = [text for name in answers for text in (f"{name}\nvalue and bound", "\nmargin")]
-        table = new_table(f"\n{heading}", ["condition", *headings], left=("condition",), wrapped=("condition",))
-        for row_ in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
-            table.add_row(_condition_name(row_, outputs), *(cell for condition in row_ for cell in _cells(condition)))
-        console.print(table)
-    if first.theorem and (marginal := marginal_sentence([airframe_facts(found.airframe)])):
+        console.print(_condition_table(answers, part, heading))
+    if first.theorem and (marginal := marginal_sentence([airframe_facts(study.airframe)])):
         console.print(marginal, highlight=False, soft_wrap=True)
     estimate = "" if first.bounds is None else f"; ~ is an estimate: gamma_2 = {first.bounds.gamma_2[0]:g} 1/s is an assumption"
     console.print(f"margin: a condition holds above 1 and fails (!) below{estimate}", soft_wrap=True)
@@ -245,11 +242,26 @@ def _show(console: Console, found: Study, answers: dict[str, Assessment]) -> Non
             console.print(f"  {condition.sentence(outputs)}", highlight=False)
 
 
+def _condition_table(answers: dict[str, Assessment], part: str, title: str) -> Table:
+    """The conditions of a part, a row each."""
+    headings = ["condition"]
+    for name in answers:
+        headings += [f"{name}\nvalue and bound", "\nmargin"]
+    table = new_table(f"\n{title}", headings, left_aligned=("condition",), wrapped=("condition",))
+    outputs = next(iter(answers.values())).controller.outputs
+    for conditions in zip(*(getattr(answer, part) for answer in answers.values()), strict=True):
+        cells = chain.from_iterable(map(_cells, conditions))
+        table.add_row(_condition_name(conditions, outputs), *cells)
+    return table
+
+
 def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
     """K, Lambda and beta of RISE-DI, a row a channel."""
-    headings = [heading for name in answers for heading in (f"{name}\nK", "\nLambda", "\nbeta")]
+    headings = []
+    for name in answers:
+        headings += [f"{name}\nK", "\nLambda", "\nbeta"]
     title = f"Gains for {aircraft}; K, Lambda in 1/s, beta in units of y / s^2, for inputs scaled by 1 / abs(Omega_ii)"
-    table = new_table(title, ["channel", "D", *headings], left=("channel",))
+    table = new_table(title, ["channel", "D", *headings], left_aligned=("channel",))
     first = next(iter(answers.values())).controller
     for i, (output, name) in enumerate(zip(first.outputs, first.inputs, strict=True)):
         row = [f"{output} by {name}", f"{first.D[i]:+d}"]
@@ -264,7 +276,7 @@ def _gain_table(answers: dict[str, Assessment], aircraft: str) -> Table:
 def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
     """The parameters of a law other than RISE-DI."""
     table = new_table(
-        f"Law {controller.law} for {aircraft}", ("parameter", "value"), left=("parameter", "value"), wrapped=("value",)
+        f"Law {controller.law} for {aircraft}", ("parameter", "value"), left_aligned=("parameter", "value"), wrapped=("value",)
     )
     for name in type(controller).model_fields:
         if name not in ControllerConfig.model_fields:
@@ -279,7 +291,7 @@ def _condition_name(row: tuple[Condition, ...], outputs: tuple[str, ...]) -> str
     return row[0].name + (f" of {channel}" if channel else "") + (" ~" if row[0].estimate else "")
 
 
-def _format_delay_margin(found: Study, answer: Assessment) -> str:
+def _format_delay_margin(study: Study, answer: Assessment) -> str:
     if answer.delay_margin is None:
         return "no linear loop (literal sign)"
     if answer.delay_margin == 0.0:
@@ -287,24 +299,24 @@ def _format_delay_margin(found: Study, answer: Assessment) -> str:
     each = zip(answer.controller.outputs, answer.channel_margins, strict=True)
     alone = ", ".join(f"{output} {_milliseconds(margin)}" for output, margin in each)
     margin = f"predicted delay margin {_milliseconds(answer.delay_margin)}; in one channel alone: {alone}"
-    return f"{margin}; {speed_of_margin(found, answer)}"
+    return f"{margin}; {speed_of_margin(study, answer)}"
 
 
-def speed_of_margin(found: Study, answer: Assessment) -> str:
+def speed_of_margin(study: Study, answer: Assessment) -> str:
     """Up to which speed a delay margin above 0 lasts with fixed gains."""
-    if found.airframe.speed == 0.0:
+    if study.airframe.speed == 0.0:
         return "the airframe has no trim speed"
-    ratio = gain_selection.stable_speed_ratio(found, answer.controller)
+    ratio = gain_selection.stable_speed_ratio(study, answer.controller)
     if math.isinf(ratio):
         return f"it lasts beyond {gain_selection.MAX_SPEED_RATIO:g} times the trim speed"
-    return f"it lasts up to {ratio * found.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
+    return f"it lasts up to {ratio * study.airframe.speed:.3g} m/s, {ratio:.3g} of the trim speed, without a schedule"
 
 
-def _stable_speed_ratio(found: Study, answer: Assessment) -> float | None:
+def _stable_speed_ratio(study: Study, answer: Assessment) -> float | None:
     """The ratio; None where the literal sign has no linear loop, or without a limit."""
     if answer.delay_margin is None:
         return None
-    ratio = gain_selection.stable_speed_ratio(found, answer.controller)
+    ratio = gain_selection.stable_speed_ratio(study, answer.controller)
     return ratio if math.isfinite(ratio) else None
 
 
@@ -318,39 +330,44 @@ def _cells(condition: Condition) -> tuple[str, str]:
     return f"{condition.value:.4g} {side} {condition.bound:.4g}", margin if condition.holds else f"[red]{margin} ![/red]"
 
 
-def _as_json(found: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
-    inputs = list(found.airframe.inputs)
+def _as_json(study: Study, answers: dict[str, Assessment], seed: int) -> dict[str, Any]:
+    inputs = list(study.airframe.inputs)
     return {
-        "airframe": found.airframe.name,
-        "uncertainty": found.uncertainty,
-        "samples": len(found.A) - 1,
+        "airframe": study.airframe.name,
+        "uncertainty": study.uncertainty,
+        "samples": len(study.A) - 1,
         "seed": seed,
-        "slew": dict(zip(inputs, found.slew.tolist(), strict=True)),
-        "slew_calm": dict(zip(inputs, found.slew_undisturbed.tolist(), strict=True)),
-    } | {
-        name: {
-            "controller": answer.controller.model_dump(exclude_none=True),
-            "delay_margin": answer.delay_margin,
-            "channel_margins": answer.channel_margins,
-            "stable_speed_ratio": _stable_speed_ratio(found, answer),
-            "margins": None if answer.margins is None else margins_as_json(answer.margins),
-            "bounds": None
-            if answer.bounds is None
-            else {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {"rho": answer.bounds.rho},
-            "conditions": [
-                {
-                    "name": condition.name,
-                    "part": part,
-                    "channel": None if condition.channel is None else answer.controller.outputs[condition.channel],
-                    "found": condition.value,
-                    condition.side.replace(" ", "_"): condition.bound,
-                    "margin": condition.margin,
-                    "holds": condition.holds,
-                    "estimate": condition.estimate,
-                }
-                for part in ("theorem", "loop")
-                for condition in getattr(answer, part)
-            ],
-        }
-        for name, answer in answers.items()
+        "slew": dict(zip(inputs, study.slew.tolist(), strict=True)),
+        "slew_calm": dict(zip(inputs, study.slew_undisturbed.tolist(), strict=True)),
+    } | {name: _assessment_as_json(study, answer) for name, answer in answers.items()}
+
+
+def _assessment_as_json(study: Study, answer: Assessment) -> dict[str, Any]:
+    outputs = answer.controller.outputs
+    bounds = None
+    if answer.bounds is not None:
+        bounds = {key: getattr(answer.bounds, key).tolist() for key in ("U", "N_d", "gamma_2")} | {"rho": answer.bounds.rho}
+    conditions = [_condition_as_json("theorem", condition, outputs) for condition in answer.theorem]
+    conditions += [_condition_as_json("loop", condition, outputs) for condition in answer.loop]
+    return {
+        "controller": answer.controller.model_dump(exclude_none=True),
+        "delay_margin": answer.delay_margin,
+        "channel_margins": answer.channel_margins,
+        "stable_speed_ratio": _stable_speed_ratio(study, answer),
+        "margins": None if answer.margins is None else margins_as_json(answer.margins),
+        "bounds": bounds,
+        "conditions": conditions,
+    }
+
+
+def _condition_as_json(part: str, condition: Condition, outputs: tuple[str, ...]) -> dict[str, Any]:
+    return {
+        "name": condition.name,
+        "part": part,
+        "channel": None if condition.channel is None else outputs[condition.channel],
+        "found": condition.value,
+        condition.side.replace(" ", "_"): condition.bound,
+        "margin": condition.margin,
+        "holds": condition.holds,
+        "estimate": condition.estimate,
     }

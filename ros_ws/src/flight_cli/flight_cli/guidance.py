@@ -21,7 +21,7 @@ Namespace = Annotated[str, typer.Option(help="Namespace of the aircraft.")]
 guidance = typer.Typer(no_args_is_help=True)
 
 
-def _ask(namespace: str, request: "Callable[[GuidanceClient], str]", done: str) -> None:
+def _ask(namespace: str, request: "Callable[[GuidanceClient], str]", success: str) -> None:
     """Send a request to guidance. Exit status: 0 done, 1 refused, 2 bad input or no guidance."""
     from flight_guidance.client import GuidanceClient  # noqa: PLC0415 - loads rclpy, which other commands do not need
 
@@ -30,14 +30,14 @@ def _ask(namespace: str, request: "Callable[[GuidanceClient], str]", done: str) 
     if refusal:
         print(f"error: refused: {refusal}", file=sys.stderr)
         raise typer.Exit(REFUSED)
-    print(done)
+    print(success)
 
 
-def _command(service: str, help_text: str, done: str) -> None:
+def _command(service: str, help_text: str, success: str) -> None:
     """Add a command that calls a service of guidance."""
 
     def call(namespace: Namespace = "") -> None:
-        _ask(namespace, lambda client: client.call(service), done)
+        _ask(namespace, lambda client: client.call(service), success)
 
     guidance.command(service, help=help_text)(call)
 

@@ -6,6 +6,7 @@ import math
 import sys
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -124,16 +125,16 @@ def identify(
     with options("phase_margin"):
         needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
     if bridge is not None:
-        of_others = {
+        unused = {
             "aircraft": aircraft,
             "--altitude": altitude,
             "--output": output,
             "--airframe": airframe,
             "--margin": margin,
         }
-        of_others |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
-        of_others |= {"--guidance": guidance or None, "--learn": learn or None}
-        for name, value in (of_others | {"--namespace": namespace}).items():
+        unused |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
+        unused |= {"--guidance": guidance or None, "--learn": learn or None}
+        for name, value in (unused | {"--namespace": namespace}).items():
             require(value is None, name, f"{value}", "none beside --bridge")
         if write is None:
             raise ParameterError("identify: found too few arguments, expected --write beside --bridge")
@@ -142,7 +143,7 @@ def identify(
         identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
         return
     require(amplitude is None, "--amplitude", amplitude, "--bridge beside it")
-    of_tests = {
+    test_options = {
         "aircraft": aircraft,
         "--speed": speed,
         "--altitude": altitude,
@@ -153,11 +154,11 @@ def identify(
         "--phase-margin": phase_margin,
         "--accept": accept or None,
     }
-    of_log = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
-    of_log |= {"--refly": refly or None}
+    log_options = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
+    log_options |= {"--refly": refly or None}
     require(margin is None or refly or observer or learn, "--margin", margin, "--refly, --observer or --learn beside it")
     require(not (observer and learn), "--observer", "--learn beside it", "one of the two: a learner designs its own observer")
-    for name, value in (of_log if log is None else of_tests).items():
+    for name, value in (log_options if log is None else test_options).items():
         require(value is None, name, f"{value}", "--log with it" if log is None else "none beside --log")
     if log is not None:
         require(airframe is not None, "--airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
@@ -201,7 +202,7 @@ def _identify_by_steps(
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
-            found = identify_aircraft(
+            identified = identify_aircraft(
                 name,
                 speed,
                 altitude,
@@ -214,17 +215,17 @@ def _identify_by_steps(
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY) from None
-    chosen = found.selection.engineering
+    chosen = identified.selection.engineering
     lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
     require(accept or not lacking, "identify", lacking, "the margins, or --accept, which writes the gains all the same")
-    write_text("--output", path, found.text)
+    write_text("--output", path, identified.text)
     if as_json:
-        print_json(_as_json(found, path))
+        print_json(_as_json(identified, path))
     else:
-        _show(console, found)
+        _show(console, identified)
         console.print(f"scenario: {display_path(path)}", highlight=False)
-    if found.failure:
-        print(f"error: {found.condition.title} does not fly: {found.failure}", file=sys.stderr)
+    if identified.failure:
+        print(f"error: {identified.condition.title} does not fly: {identified.failure}", file=sys.stderr)
         raise typer.Exit(CANNOT_FLY)
 
 
@@ -254,23 +255,25 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
     with progress_bar(*COUNT_COLUMNS, quiet=as_json) as bar:
         task = bar.add_task("search")
         show = partial(bar.update, task)
-        found = identify_model(samples, nominal, actuation, ChannelPairing(controller.outputs, controller.inputs), show)
+        identification = identify_model(
+            samples, nominal, actuation, ChannelPairing(controller.outputs, controller.inputs), show
+        )
         show(completed=1, total=1)
-    _show_model(console, found)
-    if found.refusal:
-        raise ParameterError(f"{source.log}: {found.refusal}")
+    _show_model(console, identification)
+    if identification.refusal:
+        raise ParameterError(f"{source.log}: {identification.refusal}")
     if write is not None:
-        write_text("--write", write, model_yaml(found, str(source.log)))
+        write_text("--write", write, model_yaml(identification, str(source.log)))
         page = write.with_suffix(".html")
-        write_text("--write", page, page_html(_innovation_page(found, source.log.name)))
+        write_text("--write", page, page_html(_innovation_page(identification, source.log.name)))
         console.print(f"model: {display_path(write)}, innovations: {display_path(page)}", highlight=False)
     again = None
     if refly_margin is not None:
         with console.status("flying with the model"):
-            again = _refly(recorded_scenario(recorded.scenario), recorded.tape, found.airframe, refly_margin)
-        _show_flights_of_model(console, again, _units(found))
+            again = _refly(recorded_scenario(recorded.scenario), recorded.tape, identification.airframe, refly_margin)
+        _show_flights_of_model(console, again, _units(identification))
     if as_json:
-        print_json(_model_as_json(found, write) | ({} if again is None else {"refly": again._asdict()}))
+        print_json(_model_as_json(identification, write) | ({} if again is None else {"refly": again._asdict()}))
 
 
 class _Reflight(NamedTuple):
@@ -291,7 +294,7 @@ def _refly(scenario: Scenario, tape: Tape, model: Airframe, margin: float) -> _R
 
 def _show_flights_of_model(console: Console, again: _Reflight, units: dict[str, DisplayUnit]) -> None:
     headings = ["flight", *(f"{name}\n{unit.unit}" for name, unit in units.items())]
-    table = new_table("\nRms of the error", headings, left=("flight",))
+    table = new_table("\nRms of the error", headings, left_aligned=("flight",))
     for title, rms in (("recorded", again.recorded), ("with the model", again.again)):
         table.add_row(title, *(f"{rms[name] * unit.factor:.3g}" for name, unit in units.items()))
     console.print(table)
@@ -310,73 +313,78 @@ def _actuation(controller: ControllerConfig, nominal: Airframe, delay: float) ->
     return Actuation(np.array([lag[name] for name in nominal.inputs]), delay)
 
 
-def _show_model(console: Console, found: Identification) -> None:
-    console.print(entry_table(f"A and B of {found.airframe.name}", found.entries))
+def _show_model(console: Console, identification: Identification) -> None:
+    console.print(entry_table(f"A and B of {identification.airframe.name}", identification.entries))
     headings = ("output", "nominal\nrms", "\nwhiteness", "identified\nrms", "\nwhiteness")
-    table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left=("output",))
-    for i, (name, unit) in enumerate(_units(found).items()):
-        figures = [(model.rms[i] * unit.factor, model.whiteness[i]) for model in (found.before, found.after)]
-        table.add_row(f"{name} ({unit.unit})", *(f"{figure:.3g}" for pair in figures for figure in pair))
+    table = new_table("\nInnovations of the held-out samples, one of three seconds", headings, left_aligned=("output",))
+    for i, (name, unit) in enumerate(_units(identification).items()):
+        figures = [(model.rms[i] * unit.factor, model.whiteness[i]) for model in (identification.before, identification.after)]
+        table.add_row(f"{name} ({unit.unit})", *(f"{figure:.3g}" for figure in chain.from_iterable(figures)))
     console.print(table)
-    gain = found.after.log_likelihood - found.before.log_likelihood
+    gain = identification.after.log_likelihood - identification.before.log_likelihood
     console.print(f"whiteness: 1 for white noise; change of the log-likelihood of a sample: {gain:+.3g}", highlight=False)
 
 
-def _units(found: Identification) -> dict[str, DisplayUnit]:
-    units = found.airframe.units_of_outputs()
+def _units(identification: Identification) -> dict[str, DisplayUnit]:
+    units = identification.airframe.units_of_outputs()
     return {name: display_unit(unit) for name, unit in units.items()}
 
 
-def _innovation_page(found: Identification, name: str) -> Page:
+def _innovation_page(identification: Identification, name: str) -> Page:
     """Innovations of the nominal and of the identified model over the flight, the held-out seconds shaded."""
-    t = found.recorded.t - found.recorded.t[0]
-    before, after = (Signal(np.round(t * NANOSECONDS).astype(np.int64), found.airframe.outputs, r) for r in found.innovations)
-    held_out = [Interval("held out", start, stop, GUST, False) for start, stop in mask_spans(t, found.held_out)]
-    context = PlotContext(Tape({}), _units(found), held_out, float(t[-1]), SampleStore())
+    t = identification.recorded.t - identification.recorded.t[0]
+    before, after = (
+        Signal(np.round(t * NANOSECONDS).astype(np.int64), identification.airframe.outputs, r)
+        for r in identification.innovations
+    )
+    held_out = [Interval("held out", start, stop, GUST, False) for start, stop in mask_spans(t, identification.held_out)]
+    context = PlotContext(Tape({}), _units(identification), held_out, float(t[-1]), SampleStore())
     figure = time_series_figure(context, {"nominal": Curve(before, ERROR), "identified": Curve(after, PLANT)})
     section = Section("Innovations", "y less its prediction from the samples before; shaded: not in the fit", figure)
-    likelihoods = f"{found.before.log_likelihood:.4g} nominal, {found.after.log_likelihood:.4g} identified"
+    likelihoods = f"{identification.before.log_likelihood:.4g} nominal, {identification.after.log_likelihood:.4g} identified"
     line = Line(f"log-likelihood of a held-out sample: {likelihoods}")
-    return Page(f"Model of {found.airframe.name} from {name}", [line], [], [section], context.samples)
+    return Page(f"Model of {identification.airframe.name} from {name}", [line], [], [section], context.samples)
 
 
-def _model_as_json(found: Identification, path: Path | None) -> dict[str, Any]:
-    outputs = found.airframe.outputs
+def _model_as_json(identification: Identification, path: Path | None) -> dict[str, Any]:
+    outputs = identification.airframe.outputs
     return {
-        "airframe": found.airframe.name,
-        "entries": entries_as_json(found.entries),
+        "airframe": identification.airframe.name,
+        "entries": entries_as_json(identification.entries),
         "held_out": {
             model: {
                 "rms": dict(zip(outputs, innovations.rms.tolist(), strict=True)),
                 "whiteness": dict(zip(outputs, innovations.whiteness.tolist(), strict=True)),
                 "log_likelihood": innovations.log_likelihood,
             }
-            for model, innovations in (("nominal", found.before), ("identified", found.after))
+            for model, innovations in (("nominal", identification.before), ("identified", identification.after))
         },
         "model": None if path is None else str(path),
     }
 
 
-def _show(console: Console, found: IdentifiedAircraft) -> None:
-    trim = found.trim
-    steps = found.responses
+def _show(console: Console, identified: IdentifiedAircraft) -> None:
+    trim = identified.trim
+    steps = identified.responses
     states = dict(zip(STATES, trim.states, strict=True))
     degrees = {name: states[name] / si_per_unit("deg") for name in ("alpha", "beta", "phi")}
     console.print(
-        f"{found.condition.title} in trim: V {states['V']:.4g} m/s, altitude {states['altitude']:.5g} m, "
+        f"{identified.condition.title} in trim: V {states['V']:.4g} m/s, altitude {states['altitude']:.5g} m, "
         + ", ".join(f"{name} {value:.3g} deg" for name, value in degrees.items())
         + f"; largest residual acceleration {np.max(np.abs(trim.residuals[:3])):.1g} m/s^2,"
         f" {np.max(np.abs(trim.residuals[3:])):.1g} rad/s^2",
         highlight=False,
         soft_wrap=True,
     )
-    stops = new_table("\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up"), left=("input",))
-    headings = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
-    responses = new_table("\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", headings, left=("input",))
+    stops = new_table(
+        "\nCommands: trim, and range down and up from trim", ("input", "trim", "down", "up"), left_aligned=("input",)
+    )
+    columns = ("input", "steps of", *(f"{name}_dot" for name in OUTPUTS), "lag, s", "D")
+    responses = new_table("\nStep responses: Omega per unit of a command, rad/s^2 and m/s^2", columns, left_aligned=("input",))
     for j, name in enumerate(INPUTS):
         stops.add_row(name, *(f"{value + 0.0:.3f}" for value in (trim.commands[j], trim.lower[j], trim.upper[j])))
         column = [f"{value:.3g}" if abs(value) > 1e-3 else "0" for value in steps.Omega[:, j]]
-        responses.add_row(name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{found.D[j]:+d}")
+        responses.add_row(name, f"{steps.size[j]:.3g}", *column, f"{steps.lag[j]:.3f}", f"{identified.D[j]:+d}")
     console.print(stops)
     console.print(responses)
     for name, spread in zip(INPUTS, steps.spread, strict=True):
@@ -386,11 +394,11 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
     for sentence in steps.rejected:
         console.print(f"rejected: {sentence}", highlight=False, soft_wrap=True)
 
-    answer = found.selection.engineering
+    answer = identified.selection.engineering
     controller = answer.controller
     params = answer.controller.law_params()
     headings = ("channel", "bandwidth", "Lambda", "beta", "lag, s")
-    table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings, left=("channel",))
+    table = new_table("\nGains: bandwidth and Lambda in 1/s, beta in units of y / s^2", headings, left_aligned=("channel",))
     for i, (output, name) in enumerate(zip(controller.outputs, controller.inputs, strict=True)):
         response = abs(steps.Omega[list(OUTPUTS).index(output), list(INPUTS).index(name)]) * params.input_scale[i]
         figures = (params.K[i] * response, params.Lambda[i], params.beta[i], controller.lag[i])
@@ -398,30 +406,30 @@ def _show(console: Console, found: IdentifiedAircraft) -> None:
     console.print(table)
     margin = "" if answer.delay_margin is None else f"; delay margin {1e3 * answer.delay_margin:.0f} ms"
     if answer.delay_margin:
-        margin += f", {speed_of_margin(found.selection.study, answer)}"
-    if found.sideslip_zero > 0.0:
+        margin += f", {speed_of_margin(identified.selection.study, answer)}"
+    if identified.sideslip_zero > 0.0:
         console.print(
-            f"with p and r constant, sideslip grows at {found.sideslip_zero:.2g} 1/s:"
+            f"with p and r constant, sideslip grows at {identified.sideslip_zero:.2g} 1/s:"
             " a zero in the right half plane, outside the theorem; the sideslip feedback of --guidance flies it",
             highlight=False,
             soft_wrap=True,
         )
     sign = controller.sampled_sign()[0].name.lower()
-    console.print(f"coupling max abs(U - I) = {found.coupling:.2g}; {sign} sign{margin}", highlight=False, soft_wrap=True)
-    _show_flights(console, found)
+    console.print(f"coupling max abs(U - I) = {identified.coupling:.2g}; {sign} sign{margin}", highlight=False, soft_wrap=True)
+    _show_flights(console, identified)
 
 
-def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
+def _show_flights(console: Console, identified: IdentifiedAircraft) -> None:
     headings = [f"{name}\n{display_unit(unit).unit}" for name, unit in OUTPUTS.items()]
-    alone = ", with the gains alone" if found.scenario().rise_di().learn is not None else ""
+    alone = ", with the gains alone" if identified.scenario().rise_di().learn is not None else ""
     flights = new_table(
         f"\nFlights of 60 s in one process{alone}: rms of the error",
         ["flight", *headings, "outcome"],
         ("flight", "outcome"),
         ("outcome",),
     )
-    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left=("flight",))
-    for title, flight in found.flights.items():
+    largest = new_table("\nLargest deviation of a command from trim", ["flight", *INPUTS], left_aligned=("flight",))
+    for title, flight in identified.flights.items():
         errors = [f"{flight.rms[name] * display_unit(unit).factor:.3g}" for name, unit in OUTPUTS.items()]
         flights.add_row(title, *errors, flight.text)
         largest.add_row(title, *(f"{flight.largest[name]:.2g}" for name in INPUTS))
@@ -429,9 +437,9 @@ def _show_flights(console: Console, found: IdentifiedAircraft) -> None:
     console.print(largest)
 
 
-def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
-    trim = found.trim
-    steps = found.responses
+def _as_json(identified: IdentifiedAircraft, path: Path) -> dict[str, Any]:
+    trim = identified.trim
+    steps = identified.responses
     by_input = {
         name: {
             "trim": float(trim.commands[j]),
@@ -441,23 +449,23 @@ def _as_json(found: IdentifiedAircraft, path: Path) -> dict[str, Any]:
             "spread": float(steps.spread[j]),
             "Omega": dict(zip(OUTPUTS, steps.Omega[:, j].tolist(), strict=True)),
             "lag": float(steps.lag[j]),
-            "D": found.D[j],
+            "D": identified.D[j],
         }
         for j, name in enumerate(INPUTS)
     }
     return {
-        "airframe": found.condition.title,
-        "speed": found.condition.speed,
-        "altitude": found.condition.altitude,
+        "airframe": identified.condition.title,
+        "speed": identified.condition.speed,
+        "altitude": identified.condition.altitude,
         "trim": dict(zip(STATES, trim.states.tolist(), strict=True)),
         "residuals": dict(zip(RESIDUALS, trim.residuals.tolist(), strict=True)),
         "inputs": by_input,
         "rejected": list(steps.rejected),
-        "coupling": found.coupling,
-        "sideslip_zero": found.sideslip_zero,
-        "lost": found.failure,
-        "delay_margin": found.selection.engineering.delay_margin,
-        "controller": found.scenario().controller.model_dump(exclude_defaults=True),
-        "flights": {title: flight._asdict() for title, flight in found.flights.items()},
+        "coupling": identified.coupling,
+        "sideslip_zero": identified.sideslip_zero,
+        "lost": identified.failure,
+        "delay_margin": identified.selection.engineering.delay_margin,
+        "controller": identified.scenario().controller.model_dump(exclude_defaults=True),
+        "flights": {title: flight._asdict() for title, flight in identified.flights.items()},
         "scenario": str(path),
     }

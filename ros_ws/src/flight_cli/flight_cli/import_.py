@@ -59,7 +59,7 @@ def import_(
     bag = write_run(tape, folder, LogAttachments(None, (folder / PARAMETERS, find_map(map_name)), folder / PROVENANCE))
     for sentence in notes:
         print(f"warning: {sentence}", file=sys.stderr)
-    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left=("topic",))
+    table = new_table(f"{log.name}, {read.kind}", ("topic", "samples", "Hz", "longest gap, s"), left_aligned=("topic",))
     for topic, signal in tape.signals.items():
         gaps = np.diff(signal.stamp_ns) / NANOSECONDS
         rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0

@@ -28,9 +28,9 @@ def scenario_file(name: str | None) -> Path | None:
 
 def warn_of_lacks(recorded: RecordedRun) -> None:
     """Print what a log lacks, a warning each on standard error, so that no result stands for more than was recorded."""
-    of = log_account(recorded)
+    account = log_account(recorded)
     imported = recorded.metadata.get(IMPORTED, {}).get(COMPARED, "")
-    for sentence in (*recorded.tape.notes, *(() if of is None else of.notes()), *filter(None, [imported])):
+    for sentence in (*recorded.tape.notes, *(() if account is None else account.notes()), *filter(None, [imported])):
         print(f"warning: {sentence}", file=sys.stderr)
 
 

@@ -33,15 +33,15 @@ def network(
     require_ros_environment()
     from flight_bringup.client import NetworkClient, domain_ports, write_profile  # noqa: PLC0415 - loads rclpy
 
-    own, hosts, environment = write_profile(peers, write)
-    print(f"{write}: this host is {own}. In each shell that starts a node, a flight or a tool here:")
+    own_host, hosts, environment = write_profile(peers, write)
+    print(f"{write}: this host is {own_host}. In each shell that starts a node, a flight or a tool here:")
     print(f"  export {' '.join(f'{name}={value}' for name, value in environment.items())}")
     if not check:
         return
     os.environ.update(environment)
-    others = [address for address in hosts if address != own]
+    others = [address for address in hosts if address != own_host]
     print(f"waiting for {', '.join(others)}: rise-di network --peers {peers} --check", flush=True)
-    with NetworkClient(own, hosts) as client:
+    with NetworkClient(own_host, hosts) as client:
         received, clocks = client.exchange(timeout)
     first, last = domain_ports()
     for address in others:

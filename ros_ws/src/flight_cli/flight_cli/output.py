@@ -88,14 +88,14 @@ def _show_imported(console: Console, flight: RecordedFlight) -> None:
 def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
     """What guidance held in each segment: rms and largest error."""
     headings = ("segment", "to (s)", "lateral\nrms", "\nmax", "vertical\nrms", "\nmax", "V\nrms")
-    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings, left=("segment",))
+    table = new_table(f"Guidance by segment, in m, m/s and deg{part}", headings, left_aligned=("segment",))
     for segment in segments:
         held = segment["lateral"], segment["vertical"]
-        units = [QUANTITY_UNITS[each["quantity"]] for each in held]
         names = ", ".join(each["quantity"] for each in held)
-        errors = [
-            format_value(each[name], unit.factor) for each, unit in zip(held, units, strict=True) for name in ("rms", "max")
-        ]
+        errors = []
+        for each in held:
+            factor = QUANTITY_UNITS[each["quantity"]].factor
+            errors += [format_value(each["rms"], factor), format_value(each["max"], factor)]
         leg = "" if segment["leg"] is None else f"leg {segment['leg']}: "
         table.add_row(leg + names, f"{segment['stop']:.1f}", *errors, format_value(segment["V"]["rms"]))
     return table
@@ -104,7 +104,9 @@ def _guidance_table(segments: Sequence[Mapping[str, Any]], part: str) -> Table:
 def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, DisplayUnit]) -> Table:
     """The rms of the error before the first learned model and under each."""
     headings, rows = model_rows(models, units)
-    table = new_table("Rms of the error by model", ["", *(heading.replace(" ", "\n") for heading in headings)], left=("",))
+    table = new_table(
+        "Rms of the error by model", ["", *(heading.replace(" ", "\n") for heading in headings)], left_aligned=("",)
+    )
     for row in rows:
         table.add_row(*row)
     return table
@@ -113,7 +115,7 @@ def model_table(models: Sequence[Mapping[str, Any]], units: Mapping[str, Display
 def entry_table(title: str, entries: Iterable[Entry]) -> Table:
     """Entries of A and B, nominal and identified, with the standard deviation of the change."""
     headings = ("entry", "nominal", "identified", "change %", "deviation %")
-    table = new_table(f"{title}, SI; deviation: of the change, standard", headings, left=("entry",))
+    table = new_table(f"{title}, SI; deviation: of the change, standard", headings, left_aligned=("entry",))
     for entry in entries:
         values = f"{entry.nominal:.4g}", f"{entry.value:.4g}"
         if entry.nominal:
@@ -138,11 +140,11 @@ def entries_as_json(entries: Iterable[Entry]) -> dict[str, dict[str, float]]:
     }
 
 
-def new_table(title: str, headings: Iterable[str], left: Container[str] = (), wrapped: Container[str] = ()) -> Table:
-    """An empty table. Columns are aligned right but for those in `left`, and keep to one line but for those in `wrapped`."""
+def new_table(title: str, headings: Iterable[str], left_aligned: Container[str] = (), wrapped: Container[str] = ()) -> Table:
+    """An empty table: columns outside `left_aligned` are aligned right, columns outside `wrapped` keep to one line."""
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in headings:
-        justify: Literal["left", "right"] = "left" if heading in left else "right"
+        justify: Literal["left", "right"] = "left" if heading in left_aligned else "right"
         table.add_column(heading, justify=justify, no_wrap=heading not in wrapped, overflow="fold")
     return table
 
@@ -225,10 +227,10 @@ def options(*names: str) -> Iterator[None]:
     try:
         yield
     except ParameterError as error:
-        key, colon, rest = str(error).partition(":")
+        key, colon, reason = str(error).partition(":")
         if key not in names:
             raise
-        raise ParameterError(f"--{key.replace('_', '-')}{colon}{rest}") from None
+        raise ParameterError(f"--{key.replace('_', '-')}{colon}{reason}") from None
 
 
 def write_text(option: str, path: Path, text: str) -> None:

@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections import Counter
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,9 +50,9 @@ def replay(
     """
     changed = dict(map(_parse_setting, settings or []))
     require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
-    given = scenario_file(scenario)
+    scenario_source = scenario_file(scenario)
     with Console(stderr=True, quiet=as_json).status(f"computing {printable(str(run))} again"):
-        recorded = read_run(run, namespace, given)
+        recorded = read_run(run, namespace, scenario_source)
         recorded.require()
         parameters = recorded_parameters(recorded.scenario_file())
         others = vary(parameters, changed) if changed else None
@@ -62,15 +63,15 @@ def replay(
     require(bool(result.checked.any()), str(run), "no tick that could be checked", "a log with two successive ticks")
     if csv_file is not None:
         _write_csv(csv_file, result, parameters.inputs)
-    of = log_account(recorded)
-    lacks = () if of is None else of.notes()
-    ticks = max(len(result.number), 0 if of is None else of.topics["internals"].expected or 0)
+    account = log_account(recorded)
+    lacks = () if account is None else account.notes()
+    ticks = max(len(result.number), 0 if account is None else account.topics["internals"].expected or 0)
     notes = (*recorded.tape.notes, *lacks, *result.notes, *_parameter_notes(result, open_loop=others is not None))
     notes += () if guided is None else guided.notes
     if as_json:
-        of_guidance = None if guided is None else _guidance_as_json(guided)
-        found = _as_json(result, notes, parameters.inputs, settings or [])
-        print_json({**found, "expected": ticks, "guidance": of_guidance})
+        guidance_json = None if guided is None else _guidance_as_json(guided)
+        replay_json = _as_json(result, notes, parameters.inputs, settings or [])
+        print_json({**replay_json, "expected": ticks, "guidance": guidance_json})
     else:
         _show(result, notes, parameters.inputs, ticks, open_loop=others is not None)
         if guided is not None:
@@ -82,17 +83,17 @@ def replay(
 
 def _show_guidance(guided: GuidanceReplay) -> None:
     first = guided.first
-    of = f"guidance: {guided.checked} of {guided.steps} steps checked"
+    summary = f"guidance: {guided.checked} of {guided.steps} steps checked"
     if first is None:
-        print(f"{of}, every bit equal")
+        print(f"{summary}, every bit equal")
     else:
-        print(f"{of}, {guided.differing} differ, the first at t = {first.t:.6g} s: {_difference(first)}")
+        print(f"{summary}, {guided.differing} differ, the first at t = {first.t:.6g} s: {_difference(first)}")
 
 
 def _difference(first: Difference) -> str:
     """A difference as a text."""
-    by = "which is not a number" if first.ulps is None else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
-    return f"{first.channel} recorded {first.recorded!r}, computed {first.computed!r}, {by}"
+    distance = "which is not a number" if first.ulps is None else f"{first.computed - first.recorded:+.3g}, {first.ulps} ULP"
+    return f"{first.channel} recorded {first.recorded!r}, computed {first.computed!r}, {distance}"
 
 
 def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
@@ -124,10 +125,10 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
     console = Console(soft_wrap=True, highlight=False)
     first = result.first()
     checked = int(result.compared.sum())
-    of = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
+    summary = f"{checked} ticks" if checked == ticks else f"{checked} of {ticks} ticks checked"
     if first is None:
         console.print(
-            (f"{of}, every bit equal" if checked else f"{of}: the log holds no tick with y and u")
+            (f"{summary}, every bit equal" if checked else f"{summary}: the log holds no tick with y and u")
             + (", yet with other parameters" if result.other_parameters.any() else "")
         )
     else:
@@ -135,10 +136,10 @@ def _show(result: ReplayResult, notes: tuple[str, ...], inputs: tuple[str, ...],
         rows = np.flatnonzero(different.any(axis=1))
         console.print(f"tick {first.number} differs first, at t = {first.t:.6g} s: {_difference(first)}")
         by_group = ", ".join(f"{name} in {count}" for name, count in _count_by_group(result).items())
-        console.print(f"{of}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}")
+        console.print(f"{summary}, {len(rows)} differ, the last at t = {result.t[rows[-1]]:.6g} s; {by_group}")
     if open_loop:
         headings = ("input", "rms", "max", "at t (s)", "rms recorded")
-        table = new_table("u computed minus u recorded", headings, left=("input",))
+        table = new_table("u computed minus u recorded", headings, left_aligned=("input",))
         for name, figures in _u_figures(result, inputs).items():
             table.add_row(name, *(f"{value:.4g}" for value in figures.values()))
         console.print(table)
@@ -164,8 +165,8 @@ def _u_figures(result: ReplayResult, inputs: tuple[str, ...]) -> dict[str, dict[
     for name in inputs:
         difference = computed[name] - recorded[name]
         rms, largest = error_metrics(difference)
-        at = float(result.t[known][np.argmax(np.abs(difference))]) if len(difference) else math.nan
-        figures[name] = {"rms": rms, "max": largest, "t_max": at, "rms_recorded": error_metrics(recorded[name]).rms}
+        t_max = float(result.t[known][np.argmax(np.abs(difference))]) if len(difference) else math.nan
+        figures[name] = {"rms": rms, "max": largest, "t_max": t_max, "rms_recorded": error_metrics(recorded[name]).rms}
     return figures
 
 
@@ -191,7 +192,7 @@ def _write_csv(path: Path, result: ReplayResult, inputs: tuple[str, ...]) -> Non
     columns = [result.names.index(f"u.{name}") for name in inputs]
     text = io.StringIO(newline="")
     writer = csv.writer(text)
-    writer.writerow(["number", "t", *(f"u.{name}.{what}" for name in inputs for what in ("recorded", "computed"))])
+    writer.writerow(["number", "t", *(f"u.{name}.{what}" for name, what in product(inputs, ("recorded", "computed")))])
     pairs = np.dstack([result.recorded[:, columns], result.computed[:, columns]]).reshape(len(result.number), -1)
     rows = zip(result.number.tolist(), result.t.tolist(), pairs.tolist(), strict=True)
     writer.writerows([number, t, *values] for number, t, values in rows)

@@ -51,7 +51,7 @@ def report(
 
     Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
-    given = scenario_file(scenario)
+    scenario_source = scenario_file(scenario)
     with options("html", "output", "png", "csv", "parquet", "figure", "width", "channels", "mat", "tables", "latex"):
         page, flights = write_report(
             *(runs or [LATEST]),
@@ -67,7 +67,7 @@ def report(
             tables=tables,
             latex=latex,
             namespace=namespace,
-            scenario=given,
+            scenario=scenario_source,
         )
     if as_json:
         summaries = [flight.summary for flight in flights]
@@ -88,7 +88,7 @@ def show_comparison(console: Console, flights: Sequence[RecordedFlight]) -> None
     for k, (label, flight) in enumerate(zip(comparison.labels(flights), flights, strict=True), start=1):
         console.print(f"{k}: {label}, {flight.summary['outcome']}", highlight=False, soft_wrap=True)
     headings = ("channel", "", *(str(k + 1) for k in range(len(flights))))
-    table = new_table("Tracking error, and its ratio to the first", headings, left=("channel", ""))
+    table = new_table("Tracking error, and its ratio to the first", headings, left_aligned=("channel", ""))
     for channel in comparison.metric_tables(flights, "errors", ERROR_COLUMNS, lower_is_better=True):
         for k, row in enumerate(channel.rows):
             ratios = ("" if j == 0 or ratio is None else f" x{ratio:.3g}" for j, ratio in enumerate(row.ratios))

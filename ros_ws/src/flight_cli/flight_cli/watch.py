@@ -76,7 +76,7 @@ def watch(
         not (fleet and (text or foxglove or controlled)), "--fleet", "--text, --foxglove or --control beside it", "the page"
     )
     require(not (fleet and namespace is not None), "--fleet", "--namespace beside it", "one of the two")
-    given = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
+    shown_scenario = None if (file := scenario_file(scenario)) is None else stored_scenario(file)
     chosen = run or (_in_progress(runs) if fleet else [_newest(runs, namespace)])
     for folder in chosen:
         if not wait:
@@ -91,8 +91,10 @@ def watch(
         require(len(chosen) == 1 and not controlled, "--foxglove", "a ghost or --control beside it", "RUN alone")
         _serve_foxglove(chosen[0], port)
         return
-    aircraft = [(folder, name) for folder in chosen for name in (namespaces(folder) if fleet else (namespace,))]
-    flights = [Flight(folder, namespace=name, scenario=given, background=lines) for folder, name in aircraft]
+    aircraft: list[tuple[Path, str | None]] = []
+    for folder in chosen:
+        aircraft += [(folder, name) for name in (namespaces(folder) if fleet else (namespace,))]
+    flights = [Flight(folder, namespace=name, scenario=shown_scenario, background=lines) for folder, name in aircraft]
     if text:
         show(flights[0])
     elif controlled:
@@ -111,10 +113,10 @@ def _in_progress(runs: Path) -> list[Path]:
 def _newest(runs: Path, namespace: str | None) -> Path:
     """The run to watch without a RUN; a note names the other aircraft in flight."""
     chosen = newest_run(runs, namespace)
-    beside = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
-    if beside and namespace is None:
+    others = [display_path(folder) for folder in runs_in_recording(runs) if folder != chosen]
+    if others and namespace is None:
         print(
-            f"note: shows {display_path(chosen)}; also in flight: {', '.join(beside)}: name one, or --namespace, or --fleet",
+            f"note: shows {display_path(chosen)}; also in flight: {', '.join(others)}: name one, or --namespace, or --fleet",
             file=sys.stderr,
         )
     return chosen
