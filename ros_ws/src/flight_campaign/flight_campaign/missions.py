@@ -271,7 +271,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], mission.legs)
 
     def passed(leg: Legs, place: path.Point) -> Array:
-        return leg.has_end & path.beyond((leg.end[0], leg.end[1]), leg.end_course, place)
+        return leg.has_end & path.is_beyond((leg.end[0], leg.end[1]), leg.end_course, place)
 
     def entered(leg: Legs, following: Legs, place: path.Point) -> Array:
         return passed(leg, place) & (following.is_line | ~passed(following, place))

@@ -67,12 +67,12 @@ class GuidanceClient(Client):
         known = [endpoint.node_name for endpoint in self._node.get_subscriptions_info_by_topic(publisher.topic_name)]
         return NAME in known and len(known) <= publisher.get_subscription_count()
 
-    def _reason(self, topic: Topic, taken: Callable[[], bool], unknown: str) -> str:
+    def _reason(self, topic: Topic, is_taken: Callable[[], bool], unknown: str) -> str:
         """Wait until guidance has taken a message, or has refused it. Returns the reason, `unknown` after TARGET_TIMEOUT."""
         reasons: list[str] = []
 
         def answered() -> bool:
-            if taken():
+            if is_taken():
                 reasons.clear()
                 return True
             reasons.extend(self._refusals(topic))
@@ -89,18 +89,19 @@ class GuidanceClient(Client):
     def _refusals(self, topic: Topic) -> list[str]:
         """Why guidance has refused messages of a topic since the last call, from the log of the nodes."""
         texts = [received.message.msg for received in self._log.take() if received.message.name.split(".")[-1] == NAME]
-        ours = [text.partition(REFUSED) for text in texts]
+        parts = [text.partition(REFUSED) for text in texts]
         namespace = self._node.get_namespace().rstrip("/")
-        return [reason for before, _, reason in ours if reason and before == f"{namespace}/{topic.name}: "]
+        return [reason for before, _, reason in parts if reason and before == f"{namespace}/{topic.name}: "]
 
     def _has_taken(self, values: Mapping[str, float]) -> bool:
         """Whether a sample of guidance since the last call has taken these commands."""
         mask = sum(1 << TARGETS.index(name) for name in values)
-        return any(
-            int(sample.get("given", 0.0)) & mask == mask
-            and all(sample.get(f"target.{name}") == value for name, value in values.items())
-            for sample in self._received()
-        )
+
+        def has_taken(sample: Mapping[str, float]) -> bool:
+            is_new = int(sample.get("given", 0.0)) & mask == mask
+            return is_new and all(sample.get(f"target.{name}") == value for name, value in values.items())
+
+        return any(map(has_taken, self._received()))
 
     def _received(self) -> list[dict[str, float]]:
         """The channels of the samples of `guidance` since the last call."""

@@ -73,8 +73,8 @@ def flyable(waypoints: Sequence[Waypoint], radius: float, period: float, can: Pe
     expected = f"at least {_up(slowest, 0.1):g} s at this speed, bank and roll rate"
     require(period >= slowest, "guidance.period", f"{period:g} s", expected)
     named = [waypoint._replace(speed=speed) for waypoint, speed in zip(waypoints, flown, strict=True)]
-    kept, notes = _without_short_legs(named, radius, least)
-    return _with_circles(dict(kept), notes, radius, least, can)
+    remaining, notes = _without_short_legs(named, radius, least)
+    return _with_circles(dict(remaining), notes, radius, least, can)
 
 
 def _legs(waypoints: Sequence[Waypoint], radius: float, least: float) -> tuple[Leg, ...]:
@@ -89,21 +89,21 @@ def _without_short_legs(
 
     Raises ShortLegError where none can go.
     """
-    kept = list(enumerate(waypoints))
+    remaining = list(enumerate(waypoints))
     refusal = None
     while True:
         try:
-            legs = _legs([waypoint for _, waypoint in kept], radius, least)
+            legs = _legs([waypoint for _, waypoint in remaining], radius, least)
             break
         except path.ShortLegError as short:
             refusal = refusal or short
-            inner = [k for k in (short.number - 1, short.number) if 0 < k < len(kept) - 1 and not kept[k][1].loiters]
+            inner = [k for k in (short.number - 1, short.number) if 0 < k < len(remaining) - 1 and not remaining[k][1].loiters]
             if not inner:
                 raise refusal from None
-            del kept[min(inner, key=lambda k: _offset(*(waypoint.point for _, waypoint in kept[k - 1 : k + 2])))]
+            del remaining[min(inner, key=lambda k: _offset(*(waypoint.point for _, waypoint in remaining[k - 1 : k + 2])))]
         except ParameterError as error:  # of the rest, which has corners of its own
             raise refusal or error from None
-    numbers = {number for number, _ in kept}
+    numbers = {number for number, _ in remaining}
     notes = []
     for number, waypoint in enumerate(waypoints):
         if number in numbers:
@@ -112,23 +112,23 @@ def _without_short_legs(
         if distance > max(radius, waypoint.speed or 0.0):
             raise refusal or ParameterError("route")
         notes.append(f"route[{number}]: corner cut, {distance:.0f} m from the waypoint: a leg is too short for the fillets")
-    return kept, tuple(notes)
+    return remaining, tuple(notes)
 
 
-def _offset(before: Point, at: Point, after: Point) -> float:
+def _offset(before: Point, point: Point, after: Point) -> float:
     """Distance of a point from the line between two others, m."""
     line = Line(before, after)
-    share = path.nearest(line, at) / max(path.length(line), 1e-9)
-    return math.dist(at, path.along(before, after, share))
+    share = path.nearest(line, point) / max(path.length(line), 1e-9)
+    return math.dist(point, path.along(before, after, share))
 
 
 def _with_circles(
-    kept: Mapping[int, Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
+    numbered: Mapping[int, Waypoint], notes: tuple[str, ...], radius: float, least: float, can: Performance
 ) -> FlyableRoute:
     """The route with a circle for each change of altitude beyond the climb or sink along the leg; waypoints by number."""
-    numbers = list(kept)
-    waypoints = list(kept.values())
-    told = list(notes)
+    numbers = list(numbered)
+    waypoints = list(numbered.values())
+    sentences = list(notes)
     while True:
         legs = _legs(waypoints, radius, least)
         lines: dict[int, float] = {}
@@ -137,25 +137,30 @@ def _with_circles(
                 lines[number] = path.length(leg)
         for k, length in lines.items():
             before = waypoints[k - 1]
-            at = waypoints[k]
-            change = at.altitude - before.departure
+            waypoint = waypoints[k]
+            change = waypoint.altitude - before.departure
             rate = can.climb if change > 0.0 else can.sink
-            reach = rate * length / ((at.speed or can.speed) + can.wind)
+            reach = rate * length / ((waypoint.speed or can.speed) + can.wind)
             if abs(change) <= reach:
                 continue
             rises = change > 0.0
-            found = f"{abs(change):g} m {'above' if rises else 'below'} the waypoint before"
+            difference = f"{abs(change):g} m {'above' if rises else 'below'} the waypoint before"
             expected = f"at most {math.floor(reach)} m at {rate:g} m/s over {length:.0f} m"
-            require(rate > 0.0 and (rises or at.departure == at.altitude), f"route[{numbers[k]}].altitude", found, expected)
+            require(
+                rate > 0.0 and (rises or waypoint.departure == waypoint.altitude),
+                f"route[{numbers[k]}].altitude",
+                difference,
+                expected,
+            )
             if rises:
-                waypoints[k - 1] = before._replace(leave=at.altitude)
+                waypoints[k - 1] = before._replace(leave=waypoint.altitude)
             else:
-                waypoints[k] = at._replace(altitude=before.departure, leave=at.altitude)
+                waypoints[k] = waypoint._replace(altitude=before.departure, leave=waypoint.altitude)
             where = f"round the waypoint {'before' if rises else 'itself'}, where the leg takes {math.floor(reach)} m"
-            told.append(f"route[{numbers[k]}]: {found}, flown on circles {where}")
+            sentences.append(f"route[{numbers[k]}]: {difference}, flown on circles {where}")
             break
         else:
-            return FlyableRoute(legs, tuple(waypoints), tuple(told))
+            return FlyableRoute(legs, tuple(waypoints), tuple(sentences))
 
 
 def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
@@ -163,8 +168,8 @@ def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
     for k, waypoint in enumerate(waypoints):
         north, east, altitude = waypoint[:3]
         known = all(abs(value) <= LARGEST for value in (north, east, altitude, waypoint.departure))
-        found = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
-        require(known, f"route[{k}]", found, f"finite values, at most {LARGEST:g} m either way")
+        position = f"north {north:g}, east {east:g}, altitude {altitude:g} m"
+        require(known, f"route[{k}]", position, f"finite values, at most {LARGEST:g} m either way")
         for value in (altitude, waypoint.departure):
             permitted = can.lowest <= value <= can.highest
             require(permitted, f"route[{k}].altitude", f"{value:g} m", f"{can.lowest:g} to {can.highest:g} m")
@@ -173,8 +178,8 @@ def _require_bounds(waypoints: Sequence[Waypoint], can: Performance) -> None:
         require(speed >= floor, f"route[{k}].V", f"{speed:g} m/s", f"at least {_up(floor, 0.1):g} m/s, the speed floor")
         require(speed <= can.largest_speed, f"route[{k}].V", f"{speed:g} m/s", f"at most {can.largest_speed:g} m/s")
         expected = f"more than {HEADWIND * can.wind:.3g} m/s, or a guidance.wind below {speed / HEADWIND:.3g} m/s"
-        found = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
-        require(speed > HEADWIND * can.wind, f"route[{k}].V", found, expected)
+        speed_in_wind = f"{speed:g} m/s in a wind of {can.wind:g} m/s"
+        require(speed > HEADWIND * can.wind, f"route[{k}].V", speed_in_wind, expected)
 
 
 def require_inside(route: Route, fence: Fence, margin: float) -> None:
@@ -191,8 +196,8 @@ def require_inside(route: Route, fence: Fence, margin: float) -> None:
         if path.turns_back(leg, next(iter(route.legs[number + 1 :]), None)):
             inside[-1] -= TURN_BACK * route.radius
         worst = int(np.argmin(inside))
-        found = f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
-        require(bool(inside[worst] >= margin), "route", found, f"at least {margin:.0f} m inside")
+        outermost = f"leg {number}, {described(inside[worst])} at north {north[worst]:.0f} m, east {east[worst]:.0f} m"
+        require(bool(inside[worst] >= margin), "route", outermost, f"at least {margin:.0f} m inside")
 
 
 TURN_BACK = 3.0

@@ -9,6 +9,7 @@ a fleet.
 """
 
 import math
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,8 +73,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     """
     xp = array_namespace(motion.phi)
     axes = (1,) * np.ndim(motion.phi)
-    turns = [(side, share) for side in (1.0, -1.0) for share in SHARES]
-    side, share = (column.reshape(-1, 1, *axes) for column in np.array(turns).T)
+    turns = np.array([*product((1.0, -1.0), SHARES)])
+    side, share = (column.reshape(-1, 1, *axes) for column in turns.T)
     aim = side * motion.bank
     turn = share * GRAVITY / motion.speed
     rolled = motion.lag + abs(aim - motion.phi) / motion.roll_rate
@@ -90,8 +91,8 @@ def turn_clearance(fence: Fence, motion: Motion) -> tuple[Array, Array]:
     homeward = (remaining < HOMEWARD) & (t > rolled)
     after = xp.cumsum(homeward, axis=1) - homeward > 0
     nearest = xp.min(xp.where(after, math.inf, clearance(fence.zones, north, east)), axis=1)
-    right, left = (xp.min(nearest[k : k + len(SHARES)], axis=0) for k in (0, len(SHARES)))
-    return right, left
+    right_turn, left_turn = (xp.min(nearest[k : k + len(SHARES)], axis=0) for k in (0, len(SHARES)))
+    return right_turn, left_turn
 
 
 def _integral(rate: Array, longest: Array) -> Array:
@@ -145,8 +146,8 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     is_outside = (now < 0.0) | ((action == BACK) & (now < margin))
     homeward = xp.where(straight, HOME, AROUND)
 
-    right, left = turn_clearance(fence, motion)
-    turn = xp.maximum(right, left)
+    right_turn, left_turn = turn_clearance(fence, motion)
+    turn = xp.maximum(right_turn, left_turn)
     flies_home = action != 0.0
     along = flies_home & (xp.cos(bearing - course) > math.cos(AHEAD))
     way = xp.where(along, line_clearance(fence, *place, *aim), -math.inf)
@@ -157,6 +158,6 @@ def last_safe_turn(fence: Fence, action: Scalar, motion: Motion) -> Escape:
     passed = (remaining > math.pi) & (way >= needed)
     turns = (abs(action) == RIGHT) & (remaining >= HOMEWARD) & ~passed
 
-    after = xp.where(must_turn, xp.where(right >= left, RIGHT, LEFT), xp.where(flies_home, homeward, 0.0))
+    after = xp.where(must_turn, xp.where(right_turn >= left_turn, RIGHT, LEFT), xp.where(flies_home, homeward, 0.0))
     after = xp.where(turns, action, xp.where(is_outside, BACK, after))
     return Escape(after, (action == 0.0) & (after != 0.0), now, predicted, bearing)

@@ -87,7 +87,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
             *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.given), *inputs.authority),
+            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.commands), *inputs.authority),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
@@ -109,11 +109,11 @@ def restored(t_ns: int, logged: Mapping[str, float], outputs: Sequence[str]) -> 
 
     target = Target(*group("target", TARGETS))
     mask = int(logged["given"])
-    given = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
+    commanded = {name: getattr(target, name) for k, name in enumerate(TARGETS) if mask >> k & 1}
     begin = Begin(int(logged["begin"]))
     age_ns = nanoseconds(logged["age.pose"])
     inputs = Inputs(
-        t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), given, Authority(*(logged[name] for name in LEARNED))
+        t_ns, begin, group("pose", POSE), age_ns, group("y", outputs), commanded, Authority(*(logged[name] for name in LEARNED))
     )
     phi, theta, alpha, alpha_trim, slip, psi = group("state", STATE)
     state = GuidanceState(
@@ -227,8 +227,12 @@ class Guidance:
         self._digest = digest(route)
         self._given = {}
         self._route_waits = True
-        without = ((start, {name: value for name, value in step.items() if name != "leg"}) for start, step in self._program)
-        self._program = deque((start, step) for start, step in without if step)
+        program = self._program
+        self._program = deque()
+        for start, step in program:
+            targets = {name: value for name, value in step.items() if name != "leg"}
+            if targets:
+                self._program.append((start, targets))
         self.take_target({"leg": 0.0})
 
     def keep_link(self) -> None:
@@ -351,11 +355,11 @@ class Guidance:
         y_values = tuple(y.value.tolist())
         pose_values = tuple(pose.value.tolist())
         inputs = Inputs(now_ns, self._begin, pose_values, max(age_ns, 0), y_values, self._given, self._authority)
-        told = self.route.notes if self.route is not None and self._route_waits else ()
+        route_notes = self.route.notes if self.route is not None and self._route_waits else ()
         self._begin = Begin.NO
         self._given = {}
         self._route_waits = False
         self._state, commands = modes.step(self._state, inputs, self.route, self._params)
         log = row(inputs, self._state, commands, self._digest, seconds(link_age_ns))
         notices = self._notices.take(seconds(t_ns), dict(zip(self.names, log.tolist(), strict=True)))
-        return GuidanceOutput(u_m(self._state), log, (*told, *(notice.text for notice in notices)))
+        return GuidanceOutput(u_m(self._state), log, (*route_notes, *(notice.text for notice in notices)))

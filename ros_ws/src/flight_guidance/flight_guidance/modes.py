@@ -203,13 +203,13 @@ def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
     parts = [f"no {command}: {name} has no input with an effect" for name, command in DEAD.items() if name in now.dead]
     if min(authority.down, authority.up) < reach.LEAST:
         parts.append("no climb: V has no input with an effect")
-    for name, own, limit, unit in (
+    for name, nominal, limit, unit in (
         ("bank", math.degrees(params.limits.bank), math.degrees(now.limits.bank), "deg"),
         ("roll rate", math.degrees(params.attitude.roll_rate), math.degrees(now.attitude.roll_rate), "deg/s"),
         ("climb", params.vertical.climb, now.vertical.climb, "m/s"),
         ("sink", params.vertical.sink, now.vertical.sink, "m/s"),
     ):
-        if 0.0 < limit < own:
+        if 0.0 < limit < nominal:
             parts.append(f"{name} at most {limit:.2g} {unit}")
     return ", ".join(parts)
 
@@ -234,7 +234,7 @@ class Inputs(NamedTuple):
     pose: tuple[float, ...]  # the last pose, in the order of POSE
     pose_age_ns: int
     y: tuple[float, ...]  # the last y, in the order of u_m
-    given: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
+    commands: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
     authority: Authority = Authority()  # of the inputs, as learned in flight
 
 
@@ -296,17 +296,18 @@ def read_target(
 
     `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
     """
-    modes = [{table[name] for name in values if name in table} for table in (LATERAL, VERTICAL)]
+    lateral_modes = {LATERAL[name] for name in values if name in LATERAL}
+    vertical_modes = {VERTICAL[name] for name in values if name in VERTICAL}
     unknown = [name for name in values if name not in TARGETS]
     if unknown or not values:
         raise ChannelError("name", f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of {', '.join(TARGETS)}")
-    if any(len(named) > 1 for named in modes):
+    if len(lateral_modes) > 1 or len(vertical_modes) > 1:
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
-    if Lateral.ORBIT in modes[0] and not {"north", "east", "radius"} <= set(values):
+    if Lateral.ORBIT in lateral_modes and not {"north", "east", "radius"} <= set(values):
         raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
-    for name, beside in (("r", "phi"), ("along", "leg")):
-        if name in values and beside not in values:
-            raise ChannelError("name", f"{what}: found {name} without {beside}, expected {beside} too")
+    for name, needed in (("r", "phi"), ("along", "leg")):
+        if name in values and needed not in values:
+            raise ChannelError("name", f"{what}: found {name} without {needed}, expected {needed} too")
     for name, value in values.items():
         if abs(value) > LARGEST:
             raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
@@ -324,9 +325,9 @@ def read_target(
             factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
             unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
             unit += "/s" * (name == "r")
-            found = f"{values[name] * factor:.6g}"
+            entered = f"{values[name] * factor:.6g}"
             expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
-            raise ChannelError("bounds", f"{what}.{name}: found {found}, expected {expected}")
+            raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
     if "radius" in values and abs(values["radius"]) < limits.radius:
         expected = f"at least {math.ceil(limits.radius)} m either way"
         raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
@@ -361,9 +362,9 @@ def _permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
 
 def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
     """Commands to orbit home clockwise on the least radius, at the altitude of home or of now."""
-    at = params.home
-    altitude = pose["altitude"] if at.altitude is None else at.altitude
-    return {"north": at.north, "east": at.east, "radius": float(math.ceil(params.limits.radius)), "altitude": altitude}
+    place = params.home
+    altitude = pose["altitude"] if place.altitude is None else place.altitude
+    return {"north": place.north, "east": place.east, "radius": float(math.ceil(params.limits.radius)), "altitude": altitude}
 
 
 def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
@@ -440,7 +441,7 @@ def step(
     state = _with_attitude(state, inputs, dt, params)
     pose = dict(zip(POSE, inputs.pose, strict=True))
     y = dict(zip(params.outputs, inputs.y, strict=True))
-    state, missed = _with_commands(state, inputs.given, pose, dt, route)
+    state, missed = _with_commands(state, inputs.commands, pose, dt, route)
     state, escape = _within_fence(state, pose, y, airspeed(inputs.y, params), params)
     wanted, error, to_go = _bank(state, pose, airspeed(inputs.y, params), route, params)
     if state.mode is Mode.ENGAGED:
@@ -602,7 +603,7 @@ def _measured_wind(pose: Mapping[str, Scalar], speed: Scalar) -> Wind:
 
 
 def _with_commands(
-    state: GuidanceState, given: Mapping[str, float], pose: Mapping[str, float], dt: float, route: Route | None
+    state: GuidanceState, commands: Mapping[str, float], pose: Mapping[str, float], dt: float, route: Route | None
 ) -> tuple[GuidanceState, float]:
     """The modes and commands in force: of the next leg once a leg is passed, then the commands given.
 
@@ -610,22 +611,22 @@ def _with_commands(
     from the end of a leg that ends here and is missed, m.
     """
     missed = 0.0
-    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & given.keys()
+    on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & commands.keys()
     if on_route and route is not None:
         state, missed = _along_route(state, pose, dt, route)
-    if not given:
+    if not commands:
         return _on_profile(state, pose, route), missed
-    if LATERAL.keys() & given.keys():
+    if LATERAL.keys() & commands.keys():
         state = state._replace(target=state.target._replace(r=0.0))
-    state = state._replace(target=state.target._replace(**given))
-    if state.fence >= HOME and LATERAL.keys() & given.keys():
+    state = state._replace(target=state.target._replace(**commands))
+    if state.fence >= HOME and LATERAL.keys() & commands.keys():
         state = state._replace(fence=0.0)
-    for name in given:
+    for name in commands:
         state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
-    if "leg" in given and route is not None:
-        state = _joining(state, int(given["leg"]), given.get("along", 0.0), pose, route)
-        state = state._replace(target=state.target._replace(**given))
-        named = [VERTICAL[name] for name in given if name in VERTICAL]
+    if "leg" in commands and route is not None:
+        state = _joining(state, int(commands["leg"]), commands.get("along", 0.0), pose, route)
+        state = state._replace(target=state.target._replace(**commands))
+        named = [VERTICAL[name] for name in commands if name in VERTICAL]
         state = state._replace(vertical=named[0] if named else Vertical.PROFILE)
     if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
         state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
@@ -638,8 +639,8 @@ def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, rou
     leg = route.legs[state.leg]
     near = route.near(state.leg)
     if state.joining:
-        at, course = route.start(state.leg, state.target.along)
-        if path.joined(at, course, near, position, _over_ground(pose)[0]):
+        start, course = route.start(state.leg, state.target.along)
+        if path.joined(start, course, near, position, _over_ground(pose)[0]):
             state = _on_leg(state, state.leg, route)
         return state, 0.0
     if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
@@ -702,9 +703,9 @@ def _joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, fl
     flown = route.legs[leg]
     if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
         return state
-    at, course = route.start(leg, along)
+    start, course = route.start(leg, along)
     position = (pose["north"], pose["east"])
-    side = path.joining(at, course, route.radius, route.near(leg), position, _over_ground(pose)[0])
+    side = path.joining(start, course, route.radius, route.near(leg), position, _over_ground(pose)[0])
     if isinstance(flown, Arc) and side:  # the circle of the arc itself
         side = math.copysign(1.0, flown.radius)
     if side and not along and route.from_V:
@@ -734,12 +735,12 @@ def _bank(
     if state.lateral is Lateral.ROUTE and route is not None:
         leg = route.legs[state.leg]
         if state.joining:
-            at, course = route.start(state.leg, target.along)
+            start, course = route.start(state.leg, target.along)
             radius = state.joining * route.radius
-            error = path.circle_error(path.joining_centre(at, course, radius), radius, position)
-            onto = partial(_joins, at, course, route.near(state.leg), over_ground[0])
-            wanted = follow(error, path.error(leg, at).curvature, onto, state.slip, pose, speed, params)
-            return wanted, error, path.joining_length(at, course, radius, position, over_ground[0])
+            error = path.circle_error(path.joining_centre(start, course, radius), radius, position)
+            onto = partial(_joins, start, course, route.near(state.leg), over_ground[0])
+            wanted = follow(error, path.error(leg, start).curvature, onto, state.slip, pose, speed, params)
+            return wanted, error, path.joining_length(start, course, radius, position, over_ground[0])
         following = route.legs[state.leg + 1] if leg.end is not None else None
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
@@ -752,9 +753,9 @@ def _bank(
     return wanted, error, path.to_go(leg, position)
 
 
-def _joins(at: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
+def _joins(start: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
     """`path.joined` by the position, for `follow`."""
-    return path.joined(at, course, near, position, flown)
+    return path.joined(start, course, near, position, flown)
 
 
 def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:

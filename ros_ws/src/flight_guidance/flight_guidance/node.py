@@ -327,8 +327,8 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         if self.parameters.origin is None:
             return
         latitude, longitude, height = self.parameters.origin
-        there = geographic(place.position.y, place.position.x, Origin(latitude, longitude))
-        fix = NavSatFix(latitude=there.latitude, longitude=there.longitude, altitude=height + place.position.z)
+        position = geographic(place.position.y, place.position.x, Origin(latitude, longitude))
+        fix = NavSatFix(latitude=position.latitude, longitude=position.longitude, altitude=height + place.position.z)
         fix.header.stamp = odometry.header.stamp
         fix.header.frame_id = self._body
         fix.status.status = NavSatStatus.STATUS_FIX

@@ -135,8 +135,8 @@ class Notices:
         if self._blown.due(t, holds=bool(is_blown_back(log))):
             texts.append(f"the ground speed along the path is below 0 for {DWELL:g} s, in a wind of {wind:.1f} m/s")
         if self._strong.due(t, holds=wind > largest):
-            beyond = f"above {largest:.1f} m/s circles of the least radius take more than the largest bank"
-            texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {beyond}")
+            consequence = f"above {largest:.1f} m/s circles of the least radius take more than the largest bank"
+            texts.append(f"wind {wind:.1f} m/s, guidance.wind {self._wind:g} m/s: {consequence}")
         return [Notice(t, text) for text in texts]
 
     def _outside(self, t: float, clearance: float) -> list[str]:
@@ -156,14 +156,16 @@ class Notices:
             return [f"inside of the fence after {lasted:.1f} s outside, {self._farthest:.0f} m at most"]
         return []
 
-    def of_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
+    def read_log(self, t: Array, log: Mapping[str, Array]) -> list[Notice]:
         """The notices of a whole log, with arrays as channels; none where the log is of a version without these channels."""
         if not has_channels([*log]):
             return []
         names = [*self.CHANNELS, *(name for name in (LINK_AGE, *LEARNED) if name in log)]
         columns = [log[name].tolist() for name in names]
-        samples = (dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True))
-        return [notice for at, sample in zip(t.tolist(), samples, strict=True) for notice in self.take(at, sample)]
+        notices: list[Notice] = []
+        for instant, *row in zip(t.tolist(), *columns, strict=True):
+            notices += self.take(instant, dict(zip(names, row, strict=True)))
+        return notices
 
 
 def has_channels(names: Sequence[str]) -> bool:

@@ -108,8 +108,8 @@ class ZoneConfig(Config):
     def _check(self) -> None:
         require_length("east", self.east, [f"corner {k}" for k in range(len(self.north))])
         fits = len(self.north) == 1 if self.radius else len(self.north) >= 3
-        found = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
-        require(fits, "north", found, "three or more corners, or a centre with a radius")
+        shape = f"{len(self.north)} points {'with' if self.radius else 'without'} a radius"
+        require(fits, "north", shape, "three or more corners, or a centre with a radius")
         corners = list(zip(self.north, self.east, strict=True))
         twice = [k for k, corner in enumerate(corners) if len(corners) > 1 and corner == corners[k - 1]]
         require(not twice, "north", f"the corner {corners[twice[0]] if twice else ''} twice in succession", "each corner once")
@@ -365,17 +365,17 @@ class GuidanceConfig(NodeConfig):
         before = [max(k - 1, 0) for k in numbers]
         slopes = self.profile == "slope"
         altitude = []
-        left = []
-        for leg, to, at in zip(legs, numbers, before, strict=True):
+        departures = []
+        for leg, to, start in zip(legs, numbers, before, strict=True):
             fillet = isinstance(leg, Arc) and not is_orbit(leg)
-            left.append(waypoints[to].altitude if is_orbit(leg) else waypoints[at].departure)
+            departures.append(waypoints[to].altitude if is_orbit(leg) else waypoints[start].departure)
             end = waypoints[to].departure if is_orbit(leg) else waypoints[to].altitude
-            altitude.append(left[-1] if fillet and slopes else end)
+            altitude.append(departures[-1] if fillet and slopes else end)
         route = Route(
             legs,
             tuple(altitude),
             tuple(flown[k] for k in numbers),
-            tuple(left),
+            tuple(departures),
             tuple(flown[k] for k in before),
             slopes,
             notes,

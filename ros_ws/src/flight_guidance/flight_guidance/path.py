@@ -165,10 +165,10 @@ def end_course(leg: Leg) -> float:
 
 def passed(leg: Leg, position: Point) -> bool:
     """Whether a position lies beyond the half plane at the end of a leg, across the course there. Never for an orbit."""
-    return leg.end is not None and not is_orbit(leg) and bool(beyond(leg.end, end_course(leg), position))
+    return leg.end is not None and not is_orbit(leg) and bool(is_beyond(leg.end, end_course(leg), position))
 
 
-def beyond(end: Point, course: Scalar, position: Point) -> Any:
+def is_beyond(end: Point, course: Scalar, position: Point) -> Any:
     """Whether a position lies beyond the half plane through a point across a course, rad."""
     xp = array_namespace(course)
     north = position[0] - end[0]
@@ -195,20 +195,20 @@ def to_go(leg: Leg, position: Point) -> float:
 # Joining a leg: the aircraft flies along the tangent to a circle that touches the leg at a point, and round the circle onto it.
 
 
-def joining_centre(at: Point, course: Scalar, radius: Scalar) -> Point:
+def joining_centre(point: Point, course: Scalar, radius: Scalar) -> Point:
     """Centre of the circle that touches a course, rad, at a point; the radius is positive to the right, m."""
     xp = array_namespace(course)
-    return at[0] - radius * xp.sin(course), at[1] + radius * xp.cos(course)
+    return point[0] - radius * xp.sin(course), point[1] + radius * xp.cos(course)
 
 
-def joining_length(at: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar) -> Scalar:
+def joining_length(point: Point, course: Scalar, radius: Scalar, position: Point, flown: Scalar) -> Scalar:
     """Length of the way onto a course at a point, m: R abs(turn) + sqrt(d^2 - R^2) + R sweep.
 
     turn: from the course flown to the tangent; d: distance from the centre of the joining circle; sweep: from the point where
     the tangent touches the circle to the point of the leg. `flown` and `course` in rad.
     """
     xp = array_namespace(radius)
-    centre = joining_centre(at, course, radius)
+    centre = joining_centre(point, course, radius)
     north = position[0] - centre[0]
     east = position[1] - centre[1]
     side = xp.copysign(1.0, radius)
@@ -221,22 +221,22 @@ def joining_length(at: Point, course: Scalar, radius: Scalar, position: Point, f
     return R * abs(turned) + xp.sqrt(xp.maximum(d * d - R * R, 0.0)) + R * xp.maximum(sweep, 0.0)
 
 
-def joining(at: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar) -> Scalar:
+def joining(point: Point, course: Scalar, radius: Scalar, near: Scalar, position: Point, flown: Scalar) -> Scalar:
     """Side of the shorter joining circle onto a course at a point: 1 turns to the right, -1 to the left, 0 needs none.
 
     None is needed within `near`, m, and within OPPOSITE of the course.
     """
-    right, left = (joining_length(at, course, side * radius, position, flown) for side in (1.0, -1.0))
-    xp = array_namespace(right)
-    far = (xp.hypot(position[0] - at[0], position[1] - at[1]) > near) | (xp.cos(flown - course) < math.cos(OPPOSITE))
-    return xp.where(far, xp.where(right <= left, 1.0, -1.0), 0.0)
+    right_way, left_way = (joining_length(point, course, side * radius, position, flown) for side in (1.0, -1.0))
+    xp = array_namespace(right_way)
+    far = (xp.hypot(position[0] - point[0], position[1] - point[1]) > near) | (xp.cos(flown - course) < math.cos(OPPOSITE))
+    return xp.where(far, xp.where(right_way <= left_way, 1.0, -1.0), 0.0)
 
 
-def joined(at: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
+def joined(point: Point, course: Scalar, near: Scalar, position: Point, flown: Scalar) -> Any:
     """Whether an aircraft is beyond a point of a leg, within `near`, m, and within JOINED of the course of the leg."""
     xp = array_namespace(course)
-    is_near = xp.hypot(position[0] - at[0], position[1] - at[1]) <= near
-    return is_near & beyond(at, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
+    is_near = xp.hypot(position[0] - point[0], position[1] - point[1]) <= near
+    return is_near & is_beyond(point, course, position) & (xp.cos(flown - course) >= math.cos(JOINED))
 
 
 def outline(leg: Leg, start: Point) -> list[Point]:
@@ -306,10 +306,10 @@ def turns_back(leg: Leg, following: Leg | None) -> bool:
 def leads(legs: Sequence[Leg]) -> list[int]:
     """Numbers of the waypoints at the ends of the legs of a route; a fillet at a waypoint leads to the next waypoint."""
     numbers = []
-    at = 0
+    number = 0
     for leg in legs:
-        at += isinstance(leg, Line)
-        numbers.append(at + 1 if isinstance(leg, Arc) and not is_orbit(leg) else at)
+        number += isinstance(leg, Line)
+        numbers.append(number + 1 if isinstance(leg, Arc) and not is_orbit(leg) else number)
     return numbers
 
 
@@ -357,8 +357,8 @@ def _between_circles(waypoints: Sequence[Point], radius: float, first: int, *, l
     points = list(waypoints)
     if leaves:
         (centre, after), distance = points[:2], math.dist(*points[:2])
-        found = f"{distance:g} m from the loiter before"
-        require(distance > radius, f"route[{first + 1}]", found, f"more than {radius:g} m, the radius of the circle")
+        gap = f"{distance:g} m from the loiter before"
+        require(distance > radius, f"route[{first + 1}]", gap, f"more than {radius:g} m, the radius of the circle")
         bearing = course_of(centre, after)
         if len(points) == 2:  # to a circle of the same radius
             start, end = (_along(point, bearing - math.pi / 2.0, radius) for point in points)
@@ -376,30 +376,30 @@ def _between_circles(waypoints: Sequence[Point], radius: float, first: int, *, l
 def _filleted(waypoints: Sequence[Point], radius: float, first: int) -> list[Leg]:
     """Lines through waypoints, and the fillets in the corners. Raises as `route`; `first`: number of the first waypoint."""
     turns = [0.0]
-    for before, at, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):
-        turn = math.remainder(course_of(at, after) - course_of(before, at), 2.0 * math.pi)
+    for before, corner, after in zip(waypoints, waypoints[1:], waypoints[2:], strict=False):
+        turn = math.remainder(course_of(corner, after) - course_of(before, corner), 2.0 * math.pi)
         turns.append(turn if abs(turn) <= SHARPEST else 0.0)
     turns.append(0.0)
     cut = [radius * math.tan(abs(turn) / 2.0) for turn in turns]
     legs: list[Leg] = []
     start = waypoints[0]
-    for k, (here, there) in enumerate(pairwise(waypoints)):
-        length = math.dist(here, there)
+    for k, (start_point, end_point) in enumerate(pairwise(waypoints)):
+        length = math.dist(start_point, end_point)
         needed = cut[k] + cut[k + 1]
         if length <= needed:
             expected = f"expected more than {math.ceil(needed)} m, for fillets of {radius:g} m"
             number = first + k + 1
             raise ShortLegError(f"route[{number}]: found {length:g} m from the waypoint before, {expected}", number)
-        course = course_of(here, there)
+        course = course_of(start_point, end_point)
         turn = turns[k + 1]
-        end = _along(there, course, -cut[k + 1])
+        end = _along(end_point, course, -cut[k + 1])
         legs.append(Line(start, end))
         if cut[k + 1] > SHORTEST:
             side = math.copysign(1.0, turn)
-            start = _along(there, course + turn, cut[k + 1])
+            start = _along(end_point, course + turn, cut[k + 1])
             legs.append(Arc(_along(end, course + side * math.pi / 2.0, radius), side * radius, start))
         else:
-            start = there
+            start = end_point
     return legs
 
 

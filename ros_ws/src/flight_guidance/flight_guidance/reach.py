@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping
+from itertools import product
 from typing import NamedTuple
 
 from flight_core.channels import SIDES, UNKNOWN
@@ -35,13 +36,14 @@ class Authority(NamedTuple):
     up: float = UNKNOWN
 
 
-AUTHORITY = tuple(f"{side}.{name}" for side in SIDES for name in ("q", "p", "V"))
+AUTHORITY = tuple(f"{side}.{name}" for side, name in product(SIDES, ("q", "p", "V")))
 """Channels of the topic `authority` that guidance takes."""
 
 
 def authority_of(channels: Mapping[str, float]) -> Authority:
     """From the channels of the topic: the lesser way of q and p."""
-    q, p = (min(channels[f"{side}.{name}"] for side in SIDES) for name in ("q", "p"))
+    q = min(channels[f"{side}.q"] for side in SIDES)
+    p = min(channels[f"{side}.p"] for side in SIDES)
     return Authority(q, p, *(channels[f"{side}.V"] for side in SIDES))
 
 

@@ -8,7 +8,7 @@ latitude and longitude, altitude, and perhaps V, turns, wait and leave of `Waypo
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -96,10 +96,10 @@ def geographic(north: float, east: float, origin: Origin) -> Origin:
     """
     latitude, longitude = origin
     for _ in range(8):
-        there = local(latitude, longitude, origin)
+        offset = local(latitude, longitude, origin)
         out, _up = _meridian(math.radians(latitude))
-        latitude += math.degrees((north - there[0]) / SEMI_MAJOR)
-        longitude += math.degrees((east - there[1]) / out)
+        latitude += math.degrees((north - offset[0]) / SEMI_MAJOR)
+        longitude += math.degrees((east - offset[1]) / out)
     return Origin(latitude, longitude)
 
 
@@ -169,9 +169,9 @@ def read_route_file(
             waypoints.append(waypoint)
     waypoints = _merged(waypoints)
     if simplify > 0.0:
-        kept = thinned(waypoints, simplify)
-        notes.append(f"{len(kept)} of {len(waypoints)} positions: the others are within {simplify:g} m of the line")
-        waypoints = kept
+        thinner = thinned(waypoints, simplify)
+        notes.append(f"{len(thinner)} of {len(waypoints)} positions: the others are within {simplify:g} m of the line")
+        waypoints = thinner
     return RouteFile(tuple(waypoints), tuple(notes))
 
 
@@ -211,12 +211,14 @@ def read_fence_file(
     read = route_formats.read_fence(read_file(path, str(path), "a fence file"), str(path), suffix)
     if origin is None and read.home is not None:
         origin = Origin(read.home.latitude, read.home.longitude)
-    _require_order([place._replace(key=str(path)) for area in read.zones for place in area.places], origin)
+    places = chain.from_iterable(area.places for area in read.zones)
+    _require_order([place._replace(key=str(path)) for place in places], origin)
     zones: dict[str, Any] = {}
     for k, area in enumerate(read.zones):
         key = f"zone_{k}"
         flat = [place._replace(key=f"fence.{key}", altitude=0.0, above=Above.AS_POSE) for place in area.places]
-        points = [waypoint.point for waypoint in _merged([_placed(place, origin, _Heights()) for place in flat])]
+        corners = _merged([_placed(place, origin, _Heights()) for place in flat])
+        points = [waypoint.point for waypoint in corners]
         if len(points) > 1 and points[0] == points[-1]:
             del points[-1]  # of a ring
         zones[key] = {"north": [point[0] for point in points], "east": [point[1] for point in points], "exclude": area.exclude}
@@ -249,9 +251,12 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
     """
     lines = [line for line in route_formats.read_lines(content, key) if line]
     require(bool(lines), key, "no position", "lines, polygons or points")
-    _require_order([place for line in lines for place in line], origin)
-    flat = [[place._replace(key=key, altitude=0.0) for place in line] for line in lines]
-    return [[_placed(place, origin, _Heights()).point for place in line] for line in flat]
+    _require_order([*chain.from_iterable(lines)], origin)
+    placed: list[list[Point]] = []
+    for line in lines:
+        flat = [place._replace(key=key, altitude=0.0) for place in line]
+        placed.append([_placed(place, origin, _Heights()).point for place in flat])
+    return placed
 
 
 def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
@@ -263,9 +268,9 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
     speed: float | None = None
     flown = [waypoint._replace(speed=(speed := waypoint.speed or speed)) for waypoint in waypoints]
     points = np.array([waypoint[:3] for waypoint in flown])
-    changes = {k for k, (here, after) in enumerate(pairwise(flown)) if here.loiters or here.speed != after.speed}
-    kept = {0, len(points) - 1} | changes
-    spans = list(pairwise(sorted(kept)))
+    changes = {k for k, (before, after) in enumerate(pairwise(flown)) if before.loiters or before.speed != after.speed}
+    needed = {0, len(points) - 1} | changes
+    spans = list(pairwise(sorted(needed)))
     while spans:
         first, last = spans.pop()
         if last - first < 2:
@@ -277,38 +282,38 @@ def thinned(waypoints: Sequence[Waypoint], tolerance: float) -> list[Waypoint]:
         distance = np.linalg.norm(inside - share[:, None] * along, axis=1)
         farthest = first + 1 + int(np.argmax(distance))
         if distance.max() > tolerance:
-            kept.add(farthest)
+            needed.add(farthest)
             spans += [(first, farthest), (farthest, last)]
-    return [flown[k] for k in sorted(kept)]
+    return [flown[k] for k in sorted(needed)]
 
 
 class _Heights:
     """Turns the altitude of a place to the altitude of `pose`."""
 
-    def __init__(self, given: float | None = None, home: Home | None = None, *, above_sea: bool | None = None) -> None:
-        self._given = given
+    def __init__(self, fixed: float | None = None, home: Home | None = None, *, above_sea: bool | None = None) -> None:
+        self._fixed = fixed
         self._sea = None if home is None else home.altitude
-        self._zero = given  # altitude of the home, as `pose` counts
-        if given is None and above_sea is not None:
+        self._zero = fixed  # altitude of the home, as `pose` counts
+        if fixed is None and above_sea is not None:
             self._zero = self._sea if above_sea else 0.0
         self._above_sea = above_sea
 
-    def of(self, place: Place) -> Any:
+    def altitude(self, place: Place) -> Any:
         """The altitude in m, not validated yet. Raises ParameterError where the file does not tell."""
         altitude = place.altitude
         above = place.above
         if above is Above.AS_POSE or altitude is None:
-            return self._given if altitude is None else altitude
+            return self._fixed if altitude is None else altitude
         altitude = _number(place.key, altitude, "altitude")
         if above is Above.GROUND:
             way_out = "absolute, or --altitude with the height of the ground: that is not known"
-            require(self._given is not None, place.key, place.found, way_out)
-            return altitude + (self._given or 0.0)
+            require(self._fixed is not None, place.key, place.altitude_text, way_out)
+            return altitude + (self._fixed or 0.0)
         if above is Above.SEA and self._above_sea:
             return altitude
-        found = f"an altitude above the {above.name.lower()}"
-        require(above is Above.HOME or self._sea is not None, place.key, found, "that of the home in the file")
-        require(self._zero is not None, place.key, found, "--altitude with that of the home, as the aircraft counts")
+        reference = f"an altitude above the {above.name.lower()}"
+        require(above is Above.HOME or self._sea is not None, place.key, reference, "that of the home in the file")
+        require(self._zero is not None, place.key, reference, "--altitude with that of the home, as the aircraft counts")
         return altitude + (self._zero or 0.0) - (self._sea or 0.0) * (above is Above.SEA)
 
 
@@ -317,12 +322,14 @@ def _require_order(places: Sequence[Place], origin: Origin | None) -> None:
     if origin is None:
         return
     numbers = [(place.latitude, place.longitude) for place in places]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for pair in numbers for value in pair):
+    if not all(isinstance(value, int | float) and math.isfinite(value) for value in chain.from_iterable(numbers)):
         return
-    exchanged = [(longitude, latitude) for latitude, longitude in numbers]
-    near, near_exchanged = (all(_is_near(*pair, origin) for pair in pairs) for pairs in (numbers, exchanged))
-    found = "latitude and longitude exchanged, by the origin"
-    require(near or not near_exchanged, places[0].key, found, "longitude first in GeoJSON and KML, latitude first in --origin")
+    near = all(_is_near(latitude, longitude, origin) for latitude, longitude in numbers)
+    near_exchanged = all(_is_near(longitude, latitude, origin) for latitude, longitude in numbers)
+    exchange = "latitude and longitude exchanged, by the origin"
+    require(
+        near or not near_exchanged, places[0].key, exchange, "longitude first in GeoJSON and KML, latitude first in --origin"
+    )
 
 
 def _is_near(latitude: float, longitude: float, origin: Origin) -> bool:
@@ -359,9 +366,11 @@ def _read_yaml(content: bytes, key: str, origin: Origin | None) -> Iterator[Wayp
 
 def _placed(place: Place, origin: Origin | None, heights: _Heights) -> Waypoint:
     key = place.key
-    altitude = heights.of(place)
-    if altitude is None and place.found:
-        raise ParameterError(f"{key}: found {place.found}, expected longitude, latitude, altitude, or --altitude to fly at")
+    altitude = heights.altitude(place)
+    if altitude is None and place.altitude_text:
+        raise ParameterError(
+            f"{key}: found {place.altitude_text}, expected longitude, latitude, altitude, or --altitude to fly at"
+        )
     if origin is None:
         raise ParameterError(f"{key}: found a latitude and a longitude, expected an origin, where north and east are 0")
     degrees = (_number(key, place.latitude, "latitude", 90.0), _number(key, place.longitude, "longitude", 180.0))
@@ -378,8 +387,8 @@ def _loiter(key: str, value: Any, name: str) -> float:
 
 def _waypoint(key: str, north: float, east: float, altitude: Any, speed: Any = None) -> Waypoint:
     distance = math.hypot(north, east)
-    found = f"{distance / 1e3:.0f} km from the origin"
-    require(distance <= MAX_DISTANCE, key, found, f"at most {MAX_DISTANCE / 1e3:g} km, on a plane that touches the Earth")
+    remoteness = f"{distance / 1e3:.0f} km from the origin"
+    require(distance <= MAX_DISTANCE, key, remoteness, f"at most {MAX_DISTANCE / 1e3:g} km, on a plane that touches the Earth")
     if speed is not None:
         speed = _number(key, speed, "V")
         require(speed > 0.0, f"{key}.V", f"{speed:g} m/s", "a speed above 0")

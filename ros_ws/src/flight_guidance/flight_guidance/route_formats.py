@@ -47,7 +47,7 @@ class Place(NamedTuple):
     altitude: Any  # m; None without an altitude
     speed: Any = None  # m/s
     above: Above = Above.AS_POSE
-    found: str = ""  # what the file has in place of an altitude, for a sentence
+    altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
     turns: Any = 0.0  # round the place, 1
     wait: Any = 0.0  # round the place, s
     climbs: bool = False  # whether the altitude is reached round the place, and not on the way to the place
@@ -88,27 +88,27 @@ def read(content: bytes, key: str, suffix: str, line: str | None = None) -> Plac
 
 def _one_route(key: str, geometries: Sequence[_Geometry], others: Sequence[str] = (), line: str | None = None) -> Places:
     """The only line, or that of `line`; the points where there is no line. Raises ParameterError that names what is there."""
-    of_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
-    lines = [geometry for geometry in of_lines if geometry.places]
+    joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
+    lines = [geometry for geometry in joined_lines if geometry.places]
     points = [geometry for geometry in geometries if geometry.kind in POINTS]
-    beside = _counted([point.kind for point in points])
+    ignored = _counted([point.kind for point in points])
     if (lines and others) or (lines and line is None and len(lines) > 1):
         kinds = _counted([*(geometry.kind for geometry in lines), *others])
         raise ParameterError(f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}")
     if line is not None:
         chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
-        found = f"{short_repr(line)}, which names {len(chosen)} lines"
-        require(len(chosen) == 1, "--line", found, _choice(lines) if lines else "a file with several lines")
+        mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
+        require(len(chosen) == 1, "--line", mismatch, _choice(lines) if lines else "a file with several lines")
         if len(lines) > 1:
-            beside = " and ".join([f"{len(lines) - 1} further lines", *[beside] * bool(points)])
+            ignored = " and ".join([f"{len(lines) - 1} further lines", *[ignored] * bool(points)])
         lines = chosen
     if lines:
-        return Places(lines[0].places, (f"{beside} beside the {lines[0].kind}: no part of the route",) if beside else ())
+        return Places(lines[0].places, (f"{ignored} beside the {lines[0].kind}: no part of the route",) if ignored else ())
     has = f", but {_counted(others)}" if others else ""
     require(bool(points) and not others, key, f"no LineString and no Point{has}", "a route")
-    found = f"{_counted([geometry.kind for geometry in of_lines])} without a position, and {beside}"
-    require(not of_lines, key, found, "a line, or Points alone")
-    return Places([place for point in points for place in point.places])
+    mixture = f"{_counted([geometry.kind for geometry in joined_lines])} without a position, and {ignored}"
+    require(not joined_lines, key, mixture, "a line, or Points alone")
+    return Places([*chain.from_iterable(point.places for point in points)])
 
 
 def _choice(lines: Sequence[_Geometry]) -> str:
@@ -128,8 +128,8 @@ def _counted(kinds: Sequence[str]) -> str:
     """Kinds with their numbers: "2 LineStrings and 1 Polygon"."""
     counts = []
     for kind, count in Counter(kinds).items():
-        noun, *rest = kind.split(" ", 1)
-        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1 and noun not in GPX)}", *rest]))
+        noun, *suffix = kind.split(" ", 1)
+        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1 and noun not in GPX)}", *suffix]))
     return " and ".join(counts)
 
 
@@ -172,7 +172,8 @@ def _whole(digits: str) -> int | float:
 def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     members = dict(pairs)
     if len(members) < len(pairs):
-        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        counts = Counter(name for name, _ in pairs)
+        twice = next(name for name, count in counts.items() if count > 1)
         raise ValueError(f"the member {short_repr(twice)} twice")
     return members
 
@@ -193,7 +194,9 @@ def _read_json(content: bytes, key: str, line: str | None = None) -> Places:
             parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
             part_kind = kind if len(parts) == 1 else PARTS.get(kind, kind)
             named = name if isinstance(name, str) else ""
-            geometries += [_Geometry(part_kind, [_lon_lat(position, speed) for position in part], named) for part in parts]
+            for part in parts:
+                places = [_lon_lat(position, speed) for position in part]
+                geometries.append(_Geometry(part_kind, places, named))
         elif node is not None:
             others.append(f"geometry of the type {short_repr(kind)}")
     return _one_route(key, geometries, others, line)
@@ -213,8 +216,8 @@ def read_lines(content: bytes, key: str) -> list[list[Place]]:
         require(known, key, f"a geometry of the type {short_repr(kind)}", f"one of {', '.join(GEOJSON)}")
         parts = GEOJSON[kind](coordinates if isinstance(coordinates, list) else [])
         if kind == "MultiPoint":
-            parts = [[position] for part in parts for position in part]
-        lines += [[_lon_lat(position) for position in part] for part in parts]
+            parts = [[position] for position in chain.from_iterable(parts)]
+        lines += [[*map(_lon_lat, part)] for part in parts]
     return lines
 
 
@@ -230,7 +233,7 @@ GEOJSON: Mapping[str, Callable[[list[Any]], list[list[Any]]]] = MappingProxyType
         "LineString": lambda coordinates: [coordinates],
         "MultiLineString": _ring,
         "Polygon": _ring,
-        "MultiPolygon": lambda polygons: [ring for rings in _ring(polygons) for ring in _ring(rings)],
+        "MultiPolygon": lambda polygons: [*chain.from_iterable(map(_ring, _ring(polygons)))],
     }
 )
 """By the type of a geometry: its lines, or its points."""
@@ -271,12 +274,14 @@ def _member(tree: Any, name: str) -> Any:
     return tree.get(name) if isinstance(tree, Mapping) else None
 
 
-def _lon_lat(position: Any, speed: Any = None, above: Above = Above.AS_POSE, found: str = "") -> Place:
+def _lon_lat(position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = "") -> Place:
     """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
     fits = isinstance(position, list) and 2 <= len(position) <= 3
     require(fits, "route", short_repr(position), "longitude, latitude, altitude")
     longitude, latitude, *altitude = position
-    return Place("route", latitude, longitude, altitude[0] if altitude else None, speed, above, found or short_repr(position))
+    return Place(
+        "route", latitude, longitude, altitude[0] if altitude else None, speed, above, altitude_text or short_repr(position)
+    )
 
 
 # KML and GPX
@@ -289,13 +294,13 @@ class _NoDoctype(TreeBuilder):
         raise ParseError("a document type")
 
 
-def _parsed_xml(content: bytes, key: str, of: str) -> Element:
+def _parsed_xml(content: bytes, key: str, kind: str) -> Element:
     parser = XMLParser(target=_NoDoctype())  # noqa: S314 - without a document type there is nothing to expand
     try:
         parser.feed(content)
         root: Element = parser.close()
     except (ParseError, ValueError, LookupError) as error:  # the last two: of an encoding
-        raise ParameterError(f"{key}: found {error}, expected the XML of {of}") from None
+        raise ParameterError(f"{key}: found {error}, expected the XML of {kind}") from None
     return root
 
 
@@ -318,21 +323,29 @@ def _read_kml(content: bytes, key: str, line: str | None = None) -> Places:
     require(not any(DJI in str(element.tag) for element in elements), key, "a mission of DJI (WPML)", way_out)
     kinds = [(_kind(element), element) for element in elements]
     has_line = any(kind in KML_LINES for kind, _ in kinds)
-    of_polygon, of_track, of_mark = (
-        {inside: element for kind, element in kinds if kind == outer for inside in element.iter()}
-        for outer in ("Polygon", "Track", "Placemark")
-    )
-    others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in of_track]  # whose Model is a sign
+    polygons = _outer_elements(kinds, "Polygon")
+    tracks = _outer_elements(kinds, "Track")
+    marks = _outer_elements(kinds, "Placemark")
+    others = [kind for kind, element in kinds if kind in KML_OTHERS and element not in tracks]  # whose Model is a sign
     geometries: list[_Geometry] = []
     for kind, element in kinds:
         if kind == "Point" and has_line:
             geometries.append(_Geometry(kind, []))  # a mark, at any altitude
         elif kind in (*KML_LINES, "Point"):  # the altitudeMode of a Polygon is that of its rings
-            name = _text(of_mark.get(element), "name") or ""
-            geometries.append(_Geometry(kind, _kml_places(key, kind, element, of_polygon.get(element)), name.strip()))
+            name = _text(marks.get(element), "name") or ""
+            geometries.append(_Geometry(kind, _kml_places(key, kind, element, polygons.get(element)), name.strip()))
     if not geometries:
         others += [kind for kind, _ in kinds if kind in KML_VIEWS]
     return _one_route(key, geometries, others, line)
+
+
+def _outer_elements(kinds: Sequence[tuple[str, Element]], outer: str) -> dict[Element, Element]:
+    """The element of a kind round each element in it."""
+    outers: dict[Element, Element] = {}
+    for kind, element in kinds:
+        if kind == outer:
+            outers |= dict.fromkeys(element.iter(), element)
+    return outers
 
 
 def _text(parent: Element | None, kind: str) -> str | None:
@@ -341,10 +354,11 @@ def _text(parent: Element | None, kind: str) -> str | None:
 
 
 def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) -> list[Place]:
-    texts = {_kind(child): child.text or "" for parent in (polygon, element) if parent is not None for child in parent}
+    children = chain(() if polygon is None else polygon, element)
+    texts = {_kind(child): child.text or "" for child in children}
     mode = texts.get("altitudeMode", "clampToGround").strip()  # the default of KML
-    found = f"a {kind} with the altitudeMode {short_repr(mode)}"
-    require(mode in KML_MODES, key, found, "absolute, for the height of the ground is not known")
+    mode_text = f"a {kind} with the altitudeMode {short_repr(mode)}"
+    require(mode in KML_MODES, key, mode_text, "absolute, for the height of the ground is not known")
     if kind == "Track":
         tuples = [(child.text or "").split() for child in element if _kind(child) == "coord"]
     else:
@@ -352,7 +366,7 @@ def _kml_places(key: str, kind: str, element: Element, polygon: Element | None) 
     require(kind != "Point" or len(tuples) == 1, key, f"a Point with {len(tuples)} positions", "one")
     if mode == "clampToGround":  # which ignores the altitude
         tuples = [[*position[:2], "0"] for position in tuples]
-    return [_lon_lat(list(map(_number_of, position)), None, KML_MODES[mode], found) for position in tuples]
+    return [_lon_lat(list(map(_number_of, position)), None, KML_MODES[mode], mode_text) for position in tuples]
 
 
 def _number_of(text: str | None) -> float | str | None:
@@ -393,10 +407,8 @@ def _read_gpx(content: bytes, key: str, line: str | None = None) -> Places:
     """A route (rte), without one a track (trk), without both the waypoints (wpt); with `line` one of all routes and tracks."""
     root = _parsed_xml(content, key, "a GPX file")
     marks = _gpx_places(root, "wpt")
-    routes, tracks = (
-        [(element, _gpx_segments(element, kind)) for element in root.iter() if _kind(element) == kind]
-        for kind in ("rte", "trk")
-    )
+    routes = [(element, _gpx_segments(element, "rte")) for element in root.iter() if _kind(element) == "rte"]
+    tracks = [(element, _gpx_segments(element, "trk")) for element in root.iter() if _kind(element) == "trk"]
     flown = routes + tracks if line is not None or not any(segments for _, segments in routes) else routes
     lines = [
         _Geometry(_kind(element), [*chain(*segments)], (_text(element, "name") or "").strip()) for element, segments in flown
@@ -439,7 +451,7 @@ def _gpx_places(parent: Element, kind: str) -> list[Place]:
     for element in (child for child in parent if _kind(child) == kind):
         latitude, longitude = (_number_of(element.get(name)) for name in ("lat", "lon"))
         height = _text(element, "ele")
-        places.append(Place("route", latitude, longitude, _number_of(height), found=f"a {kind} without ele"))
+        places.append(Place("route", latitude, longitude, _number_of(height), altitude_text=f"a {kind} without ele"))
     return places
 
 
@@ -492,30 +504,33 @@ def _in_order(key: str, items: Sequence[_Item]) -> list[int]:
     ParameterError for a jump to no item, for a loop inside of a loop, which PX4 begins again and ArduPilot does not, and for
     more than MOST_ITEMS.
     """
-    at = {items[k].number: k for k in reversed(range(len(items)))}
-    left: dict[int, float] = {}  # repetitions of a jump
+    places = {items[k].number: k for k in reversed(range(len(items)))}
+    repetitions: dict[int, float] = {}  # repetitions of a jump
     order: list[int] = []
     k = steps = 0
     while k < len(items) and not (order and items[order[-1]].command in LAST):
-        (name, _, command, params, *_), here = items[k], k
-        k = k + 1
-        steps = steps + 1
+        place = k
+        name, _, command, params, *_ = items[place]
+        k += 1
+        steps += 1
         require(steps <= MOST_ITEMS, key, f"more than {MOST_ITEMS} items by the repetitions of {name}", "fewer")
         if command != JUMP:
-            order.append(here)
+            order.append(place)
             continue
         target = params[0]
         count = -0.5 if params[1] is None else float(params[1])
         if not count:
             continue
-        require(target in at and count.is_integer(), key, f"{name} to {target}", "a jump to an item, a whole number of times")
-        if count < 0.0 and at[target] <= here:
+        require(
+            target in places and count.is_integer(), key, f"{name} to {target}", "a jump to an item, a whole number of times"
+        )
+        if count < 0.0 and places[target] <= place:
             break
-        remaining = left.get(here, count)
+        remaining = repetitions.get(place, count)
         require(count < 0.0 or remaining >= 0.0, key, f"{name}, a loop inside of a loop", "loops one after the other")
-        left[here] = remaining - 1.0 if count > 0.0 else count
-        order.append(here)
-        k = at[target] if remaining else k
+        repetitions[place] = remaining - 1.0 if count > 0.0 else count
+        order.append(place)
+        k = places[target] if remaining else k
     return order
 
 
@@ -540,12 +555,12 @@ def _mission(key: str, items: Sequence[_Item], home: Home | None, notes: Sequenc
             continue
         flown.add(k)
     skipped = [item.name for k, item in enumerate(items) if k not in flown]
-    told = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
+    sentences = [f"not flown: {', '.join(dict.fromkeys(skipped))}"] * bool(skipped)
     waits = [item.name for k, item in enumerate(items) if k in flown and not item.goes_on]
-    told += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
-    own = "circles are clockwise, of the radius of the route"
-    told += [f"{own}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
-    return Places(places, (*notes, *told), home)
+    sentences += [f"flown on without autocontinue: {', '.join(dict.fromkeys(waits))}"] * bool(waits)
+    circle_note = "circles are clockwise, of the radius of the route"
+    sentences += [f"{circle_note}, in place of {', '.join(dict.fromkeys(circles))}"] * bool(circles)
+    return Places(places, (*notes, *sentences), home)
 
 
 def _mission_place(key: str, item: _Item, speed: Any, before: Place | None) -> Place:
@@ -556,9 +571,9 @@ def _mission_place(key: str, item: _Item, speed: Any, before: Place | None) -> P
         longitude = before.longitude
         if not altitude:
             return before._replace(turns=0.0, wait=0.0, climbs=False, speed=speed)
-    found = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
+    frame_text = f"the frame {item.frame}{', above the ground' if item.frame in TERRAIN else ''}"
     expected = "0 or 3: above the sea or the home, for the height of the ground is not known"
-    require(item.frame in FRAMES, f"{key}: {item.name}", found, expected)
+    require(item.frame in FRAMES, f"{key}: {item.name}", frame_text, expected)
     return Place("route", latitude, longitude, altitude, speed, FRAMES[item.frame])
 
 
@@ -574,7 +589,7 @@ def _read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
     items = []
     for number, entry in _plan_items(listed or (), key):
         kind = _member(entry, "complexItemType") or _member(entry, "type")
-        jump = number if (given := _member(entry, "doJumpId")) is None else given
+        jump = number if (jump_id := _member(entry, "doJumpId")) is None else jump_id
         require(isinstance(jump, int | float), f"{key}: item {number}", f"doJumpId: {short_repr(jump)}", "a number")
         if kind in LANDINGS:
             items.append(_Item(f"{kind} (item {number})", 0, LAND, [None] * 7, jump))
@@ -721,8 +736,8 @@ def _wpl_fence(content: bytes, key: str) -> FencePlaces:
         elif item.command == RETURN:
             back = place._replace(altitude=None)
     if missing:
-        there = len(zones[-1].places)
-        raise ParameterError(f"{key}: found {there} of the {there + missing} corners of a polygon, expected all")
+        corners = len(zones[-1].places)
+        raise ParameterError(f"{key}: found {corners} of the {corners + missing} corners of a polygon, expected all")
     return FencePlaces(zones, rally, home, back)
 
 

@@ -63,10 +63,10 @@ def onto_orbit(fence: Fence, north: Array, east: Array) -> tuple[Array, Array]:
     y = fence.home[1] - east
     distance = xp.maximum(xp.hypot(x, y), 1e-6)
     # Home is to the right of the tangent. Within the orbit the course is across the bearing of home.
-    left = xp.asin(xp.minimum(fence.radius / distance, 1.0))
+    offset = xp.asin(xp.minimum(fence.radius / distance, 1.0))
     length = xp.maximum(xp.sqrt(xp.maximum(distance**2 - fence.radius**2, 0.0)), 1.0)
-    along = xp.cos(left) * length / distance
-    across = xp.sin(left) * length / distance
+    along = xp.cos(offset) * length / distance
+    across = xp.sin(offset) * length / distance
     return north + along * x + across * y, east + along * y - across * x
 
 
@@ -120,7 +120,9 @@ def _cells(fence: Fence) -> tuple[FloatArray, FloatArray, float]:
     """Centres of the cells, north and east, m, over all zones, home and the surroundings; and the size of a cell, m."""
     sides = list[tuple[float, float]]()
     for axis in ("north", "east"):
-        reach = [(value, zone.radius) for zone in fence.zones for value in getattr(zone, axis)]
+        reach = []
+        for zone in fence.zones:
+            reach += [(value, zone.radius) for value in getattr(zone, axis)]
         reach.append((fence.home[len(sides)], 0.0))
         sides.append((min(value - radius for value, radius in reach), max(value + radius for value, radius in reach)))
     longest = max(most - least for least, most in sides)
@@ -172,10 +174,10 @@ def _shortest(seeds: NDArray[np.bool_], room: FloatArray, cost: FloatArray, cell
         if np.array_equal(shorter, to_go):
             break
         to_go = shorter
-    own = np.arange(room.size).reshape(room.shape)
+    cells = np.arange(room.size).reshape(room.shape)
     best = through.argmin(axis=0)
     moves = np.array([row * room.shape[1] + column for row, column in STEPS])
-    return to_go, np.where(np.isfinite(to_go) & ~seeds, own + moves[best], own)
+    return to_go, np.where(np.isfinite(to_go) & ~seeds, cells + moves[best], cells)
 
 
 def _nearest(north: FloatArray, east: FloatArray, to_north: FloatArray, to_east: FloatArray) -> NDArray[np.intp]:

@@ -93,7 +93,10 @@ def _groups(zones: tuple[Zone, ...]) -> tuple[tuple[Zone, ...], ...]:
 def _deepest(groups: tuple[tuple[Zone, ...], ...], north: Array, east: Array) -> Array:
     """Distance from the border of the deepest group of a place, m, negative outside of the groups."""
     xp = array_namespace(north)
-    depths = [reduce(xp.minimum, [inside(zone, north, east) for zone in group]) for group in groups]
+    depths = []
+    for group in groups:
+        insides = [inside(zone, north, east) for zone in group]
+        depths.append(reduce(xp.minimum, insides))
     return reduce(xp.maximum, depths)
 
 
@@ -111,8 +114,8 @@ def _border(groups: tuple[tuple[Zone, ...], ...]) -> tuple[FloatArray, FloatArra
     start, end = (np.concatenate(column) for column in zip(*pieces, strict=True))
     edge = end - start
     middle = (start + end) / 2.0
-    beside = SEAM * np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
-    sides = [_deepest(groups, *(middle + side * beside).T) >= 0.0 for side in (1.0, -1.0)]
+    shift = SEAM * np.column_stack([-edge[:, 1], edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
+    sides = [_deepest(groups, *(middle + side * shift).T) >= 0.0 for side in (1.0, -1.0)]
     on_border = sides[0] != sides[1]
     return start[on_border, 0], start[on_border, 1], edge[on_border, 0], edge[on_border, 1]
 

@@ -236,7 +236,7 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
     notes = []
     for number, k in zip(*np.unique(log["route"], return_index=True), strict=True):
         notes += [Notice(float(t[k]), text) for text in (flown[int(number)].notes if int(number) in flown else ())]
-    notices = notes + section.notices().of_log(t, {name: log[name] for name in log.names})
+    notices = notes + section.notices().read_log(t, {name: log[name] for name in log.names})
     return [f"guidance at t = {notice.t:.1f} s: {notice.text}" for notice in notices]
 
 
