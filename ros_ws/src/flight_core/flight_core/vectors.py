@@ -130,6 +130,14 @@ def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] 
     return selected
 
 
+def selection_matrix(wanted: Sequence[str], names: Sequence[str]) -> FloatArray:
+    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: its product with values selects."""
+    matrix = np.zeros((len(wanted), len(names)))
+    for row, channel in zip(matrix, wanted, strict=True):
+        row[:] = [name == channel for name in names]
+    return matrix
+
+
 @lru_cache(maxsize=256)
 def _places(wanted: tuple[str, ...], names: tuple[str, ...]) -> NDArray[np.intp]:
     """Places of the wanted channels among the names. Raises ChannelError as `select` does."""

@@ -22,6 +22,7 @@ from flight_core.parameters import (
 )
 from flight_core.rates import nanoseconds, period_ns
 from flight_core.units import GRAVITY
+from flight_core.vectors import selection_matrix
 from reference_model.command import Profile
 from reference_model.live import LiveParams
 from reference_model.model import Model, second_order, stepper
@@ -120,9 +121,9 @@ class ReferenceModelConfig(NodeConfig):
         require(levels, "live.speed", self.live.speed, expected)
 
     def _check_model(self) -> None:
-        one = (self.second_order is None) != (self.linear is None)
-        found = "no model" if self.linear is None else "it beside linear"
-        require(one, "second_order", found, "exactly one model: second_order or linear")
+        has_one = (self.second_order is None) != (self.linear is None)
+        models = "no model" if self.linear is None else "it beside linear"
+        require(has_one, "second_order", models, "exactly one model: second_order or linear")
         key = "second_order.damping"
         if self.second_order is not None:
             for name in ("natural_frequency", "damping"):
@@ -156,7 +157,7 @@ class ReferenceModelConfig(NodeConfig):
             raise ParameterError("second_order: found no model, expected second_order or linear")
         n = len(self.linear.states)
         m = len(self.outputs)
-        C = np.array([[float(state == output) for state in self.linear.states] for output in self.outputs])
+        C = selection_matrix(self.outputs, self.linear.states)
         return Model(np.reshape(self.linear.A_m, (n, n)), np.reshape(self.linear.B_m, (n, m)), C)
 
     def live_params(self) -> LiveParams:

@@ -111,8 +111,8 @@ def _towards(start: FloatArray, moves: list[FloatArray], low: FloatArray, high: 
                 target = halfway
         step = target - u
         room = np.where(step > 0.0, high - u, low - u)
-        beyond = np.abs(step) > np.abs(room)
-        last = float(np.min(np.where(beyond, room, 1.0) / np.where(beyond, step, 1.0), initial=1.0))
+        limited = np.abs(step) > np.abs(room)
+        last = float(np.min(np.where(limited, room, 1.0) / np.where(limited, step, 1.0), initial=1.0))
         u = np.minimum(np.maximum(u + last * step, low), high)
     return u
 

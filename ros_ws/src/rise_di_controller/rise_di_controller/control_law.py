@@ -90,12 +90,12 @@ def fields(state: Any) -> dict[str, Array]:
 
 def restored(law: ControlLaw, values: Any) -> Any:
     """The state of a law from the arrays by name, the inverse of `fields`."""
-    of_inner = {} if law.inner is None else {"law": restored(law.inner, values)}
-    return law.state(**of_inner, **{name: values[name] for name in law.state._fields if name not in of_inner})
+    inner = {} if law.inner is None else {"law": restored(law.inner, values)}
+    return law.state(**inner, **{name: values[name] for name in law.state._fields if name not in inner})
 
 
 @lru_cache(maxsize=64)
 def field_names(law: ControlLaw) -> tuple[str, ...]:
     """Names of the arrays of a law's state, in the order of `fields`."""
-    of_inner = () if law.inner is None else field_names(law.inner)
-    return (*of_inner, *(name for name in law.state._fields if law.inner is None or name != "law"))
+    inner_names = () if law.inner is None else field_names(law.inner)
+    return (*inner_names, *(name for name in law.state._fields if law.inner is None or name != "law"))

@@ -212,12 +212,12 @@ class Controller:
         self._y_m.append(sample)
         return ""
 
-    def _lost(self, taken: deque[StampedVector], sample: StampedVector, now_ns: int) -> str:
+    def _lost(self, earlier: deque[StampedVector], sample: StampedVector, now_ns: int) -> str:
         """Why a sample of m values is beyond the bounds; empty for one inside. Raises ChannelError."""
         require_not_future(sample.stamp_ns, now_ns, self._guard.max_age_ns)
-        if taken:
-            require_newer(sample.stamp_ns, taken[-1].stamp_ns)
-        return samples.beyond(sample.value, self._parameters.outputs, self._guard.samples)
+        if earlier:
+            require_newer(sample.stamp_ns, earlier[-1].stamp_ns)
+        return samples.bound_violation(sample.value, self._parameters.outputs, self._guard.samples)
 
     def restarted(self) -> str:
         """Why the law has engaged again by itself since the last call, as a sentence; empty if it has not."""

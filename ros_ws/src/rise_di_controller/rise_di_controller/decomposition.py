@@ -145,18 +145,18 @@ def _likely_orders(matrix: FloatArray) -> Iterable[Order]:
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - a sixth of a second, which few channels do not need
 
     rows, columns = _sizes(matrix)
-    rest = matrix / rows[:, None] / columns
+    remainder = matrix / rows[:, None] / columns
     m = len(matrix)
     places = tuple(range(m))
-    assigned = linear_sum_assignment(np.log(np.maximum(np.abs(rest), np.finfo(float).tiny)), maximize=True)[1]
+    assigned = linear_sum_assignment(np.log(np.maximum(np.abs(remainder), np.finfo(float).tiny)), maximize=True)[1]
     orders = {(places, places), (places, tuple(assigned.tolist()))}
     outputs = list[int]()
     inputs = list[int]()
-    while rest.any():
-        i, j = (int(place) for place in np.unravel_index(np.argmax(np.abs(rest)), rest.shape))
-        rest = rest - np.outer(rest[:, j], rest[i] / rest[i, j])
-        rest[i] = 0.0
-        rest[:, j] = 0.0
+    while remainder.any():
+        i, j = (int(place) for place in np.unravel_index(np.argmax(np.abs(remainder)), remainder.shape))
+        remainder = remainder - np.outer(remainder[:, j], remainder[i] / remainder[i, j])
+        remainder[i] = 0.0
+        remainder[:, j] = 0.0
         outputs.append(i)
         inputs.append(j)
     return orders | {(tuple(outputs), tuple(inputs))} if len(outputs) == m else orders
@@ -207,16 +207,16 @@ def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, Fl
 
     p_k = (L^-1)_k Omega (W^-1)_k gives the certainty of the sign of p_k.
     """
-    rest = _square(Omega)
-    m = len(rest)
-    rows, columns = _sizes(rest)
+    remainder = _square(Omega)
+    m = len(remainder)
+    rows, columns = _sizes(remainder)
     L = np.eye(m)
     W = np.eye(m)
     L_inverse = np.eye(m)
     W_inverse = np.eye(m)
     p = np.zeros(m)
     for k in range(m):
-        p[k] = rest[k, k]
+        p[k] = remainder[k, k]
         largest = (np.abs(L_inverse[k]) @ rows) * (columns @ np.abs(W_inverse[:, k]))
         if abs(p[k]) <= NEARLY_ZERO * largest:
             raise DecompositionError(
@@ -224,9 +224,9 @@ def _eliminate(Omega: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray, Fl
                 "leading minors away from zero: another order or pairing of the channels may have them",
                 minor=k + 1,
             )
-        L[k + 1 :, k] = rest[k + 1 :, k] / p[k]
-        W[k, k + 1 :] = rest[k, k + 1 :] / p[k]
-        rest[k + 1 :, k + 1 :] -= np.outer(L[k + 1 :, k], rest[k, k + 1 :])
+        L[k + 1 :, k] = remainder[k + 1 :, k] / p[k]
+        W[k, k + 1 :] = remainder[k, k + 1 :] / p[k]
+        remainder[k + 1 :, k + 1 :] -= np.outer(L[k + 1 :, k], remainder[k, k + 1 :])
         L_inverse[k + 1 :] -= np.outer(L[k + 1 :, k], L_inverse[k])
         W_inverse[:, k + 1 :] -= np.outer(W_inverse[:, k], W[k, k + 1 :])
     return L, p, W, L_inverse

@@ -273,8 +273,8 @@ def _nominal(guard: GuardParams, law: Any) -> Nominal | None:
     """The nominal model of the feedforward, at the speed of a schedule if any; None without a feedforward."""
     if guard.nominal is None or guard.over_speed is None:
         return guard.nominal
-    there: Nominal = guard.over_speed.of(law.scale)
-    return there
+    nominal: Nominal = guard.over_speed.at_scale(law.scale)
+    return nominal
 
 
 def _vanes(
@@ -294,12 +294,12 @@ def law_within_limits(
     Arguments: `effectors` (p,) of the last tick, None without an allocation.
     """
     after, u_free = law.control_law.step(state, measured, dt, law.params)
-    u, given = _within_effectors(saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard)
+    u, effector_values = _within_effectors(saturate(u_free, measured.u_before, dt, guard.limits), effectors, dt, guard)
     if not np.array_equal(u, u_free):  # otherwise `limited` gives the same and takes three times as long
         limits = guard.limits if guard.allocation is None else reached(u_free, u)
         after, u_free, u = law.control_law.limited(state, measured, dt, law.params, limits)
-        u, given = _within_effectors(u, effectors, dt, guard)
-    return after, u_free, u, given
+        u, effector_values = _within_effectors(u, effectors, dt, guard)
+    return after, u_free, u, effector_values
 
 
 def _within_effectors(
@@ -345,12 +345,12 @@ def retune(
         if other_model or other_nominal:
             # u_o goes on to -F z at its own rate. Of a channel without an observer before it takes the part of the law: what
             # the law has integrated beside an observer stays there, which would take it long to integrate again.
-            rest = state.u - state.u_trim - state.u_ff
+            law_part = state.u - state.u_trim - state.u_ff
             limits = observers[1].limits
             acted, acts = ((params.limits.upper > 0.0) & np.any(params.F, axis=1) for params in observers)
-            goes_on = np.where(acted, observing.u_o - change, rest)
+            goes_on = np.where(acted, observing.u_o - change, law_part)
             u_o = np.where(acts, np.clip(goes_on, limits.lower, limits.upper), 0.0)
-            inner = shifted(observing.law, rest - u_o - (rest + change - observing.u_o), observers[1].law)
+            inner = shifted(observing.law, law_part - u_o - (law_part + change - observing.u_o), observers[1].law)
             filters = observers_of(new.params, [tick.scale for tick in state.history])
             z = observer.estimates_after(state.history, change, filters)
             started = ObserverState(inner, z, u_o, np.ones_like(observing.sigma))

@@ -46,8 +46,8 @@ def groups(
     (feedforward). Of an observer: estimates z, by input u_o, and sigma, the fade-in. Of vanes: mean, mean square around it,
     1 for a vane in use, the reading, and the reading in the reference motion. Of an allocation: effector, as commanded.
     """
-    of_law = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)]
-    grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *of_law)}
+    state_groups = [name for name in field_names(law) if name not in ("e", *OBSERVER_GROUPS, *VANE_STATE)]
+    grouped = {group: tuple(outputs) for group in (*OUTPUT_GROUPS, *state_groups)}
     grouped |= {group: tuple(inputs) for group in INPUT_GROUPS}
     if "z" in field_names(law):
         grouped |= {"z": tuple(estimates), "u_o": tuple(inputs), "sigma": ("observer",)}
@@ -63,7 +63,10 @@ def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
     at the tick), number (counts the samples from 1 since the start: a gap is a lost sample), parameters
     (ControllerConfig.digest).
     """
-    return (*SCALARS, *(f"{group}.{name}" for group, members in grouped.items() for name in members))
+    channels = list(SCALARS)
+    for group, members in grouped.items():
+        channels += [f"{group}.{name}" for name in members]
+    return tuple(channels)
 
 
 def values(
@@ -83,11 +86,11 @@ def values(
         at_stop = bool(((state.effectors <= stops.lower) | (state.effectors >= stops.upper)).any())
     inside = (state.u_free >= limits.lower) & (state.u_free <= limits.upper) & (not at_stop)
     limited = np.where(state.u == state.u_free, Saturation.NO, np.where(inside, Saturation.RATE, Saturation.MAGNITUDE))
-    of_law = fields(state.law)
-    of_law.pop("e", None)
-    of_observer = [of_law.pop(group) for group in (*OBSERVER_GROUPS, *VANE_STATE) if group in of_law]
+    state_values = fields(state.law)
+    state_values.pop("e", None)
+    observer_values = [state_values.pop(group) for group in (*OBSERVER_GROUPS, *VANE_STATE) if group in state_values]
     readings = () if state.vanes is None else state.vanes
-    by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *of_law.values())
+    by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *state_values.values())
     by_input = (state.u_free, state.u, state.u_trim, limited, state.u_ff)
     effectors = () if state.effectors is None else (state.effectors,)
-    return np.concatenate([scalars, *by_output, *by_input, *of_observer, *readings, *effectors])
+    return np.concatenate([scalars, *by_output, *by_input, *observer_values, *readings, *effectors])

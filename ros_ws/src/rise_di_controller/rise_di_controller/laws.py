@@ -63,9 +63,10 @@ class AnyLaw(ControllerConfig):
             chosen = schema(name)
         except ParameterError as error:
             raise ParameterError(f"{where}.{error}") from None
-        of_default = {} if name == DEFAULT else schema(DEFAULT).model_fields
-        own = [key for key in chosen.model_fields if key not in ControllerConfig.model_fields]
+        default_fields = {} if name == DEFAULT else schema(DEFAULT).model_fields
+        names = [key for key in chosen.model_fields if key not in ControllerConfig.model_fields]
+        expected = f"those of {name}: {', '.join(names) or 'none'}"
         for key in values:
-            foreign = key in of_default and key not in chosen.model_fields
-            require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", f"those of {name}: {', '.join(own) or 'none'}")
+            foreign = key in default_fields and key not in chosen.model_fields
+            require(not foreign, f"{where}.{key}", f"a parameter of {DEFAULT}", expected)
         return chosen.validate_mapping(values, where)

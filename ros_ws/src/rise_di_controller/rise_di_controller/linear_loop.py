@@ -61,10 +61,10 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
     linear anywhere.
     """
     control_law, params = law
-    of_law = params
-    while hasattr(of_law, "law"):  # under an observer or a schedule
-        of_law = of_law.law
-    literal = isinstance(of_law, LawParams) and of_law.sign is Sign.LITERAL
+    core = params
+    while hasattr(core, "law"):  # under an observer or a schedule
+        core = core.law
+    literal = isinstance(core, LawParams) and core.sign is Sign.LITERAL
     require(not literal, "sign", "literal", "soft or implicit, which are linear near e = 0")
     sets = () if candidates is None else (candidates,)
     zero = np.zeros((m, *sets))
@@ -88,9 +88,9 @@ def linear_law(law: TunedLaw, m: int, period: float, candidates: int | None = No
         return np.concatenate([*fields(state).values(), u])
 
     begin = np.concatenate([*at_rest.values(), np.zeros((wide, *sets))])
-    rest = step(begin[:size], begin[size:])
+    equilibrium = step(begin[:size], begin[size:])
     units = SMALL * np.eye(size + wide).reshape(size + wide, size + wide, *(1 for _ in sets))
-    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - rest) / SMALL for unit in units]
+    columns = [(step((begin + unit)[:size], (begin + unit)[size:]) - equilibrium) / SMALL for unit in units]
     matrix = np.array(columns).T
     above = matrix[..., :size, :]
     below = matrix[..., size:, :]
@@ -103,10 +103,10 @@ def zero_order_hold(A: FloatArray, B: FloatArray, period: float) -> tuple[FloatA
     Source: C. Van Loan, IEEE TAC 23(3), 1978.
     """
     n, m = B.shape[-2:]
-    whole = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
-    whole[..., :n, :n] = A
-    whole[..., :n, n:] = B
-    exponential = _exponential((whole * period).tobytes(), whole.shape)
+    block = np.zeros((*np.broadcast_shapes(A.shape[:-2], B.shape[:-2]), n + m, n + m))
+    block[..., :n, :n] = A
+    block[..., :n, n:] = B
+    exponential = _exponential((block * period).tobytes(), block.shape)
     return exponential[..., :n, :n], exponential[..., :n, n:]
 
 
@@ -145,9 +145,9 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     motion[..., n:, n:] = -np.diag(rate)
     drive[..., :n, :] = plant.B * ~has_lag
     drive[..., n:, :] = np.diag(rate * has_lag)
-    whole = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
-    part = np.maximum(loop.delay + extra - whole * loop.period, 0.0)
-    held = int(whole.max()) + 1  # earlier ticks whose u still acts, the newest first
+    ticks = np.floor((loop.delay + extra) / loop.period + 1e-9).astype(int)
+    part = np.maximum(loop.delay + extra - ticks * loop.period, 0.0)
+    held = int(ticks.max()) + 1  # earlier ticks whose u still acts, the newest first
 
     size = n + m + held * m
     A = np.zeros((*batch, size, size))
@@ -157,10 +157,10 @@ def sampled_plant(plant: LinearPlant, loop: Loop, extra: FloatArray) -> SampledP
     A[..., : n + m, : n + m], _ = zero_order_hold(motion, drive, loop.period)
     inputs = np.zeros((*batch, n + m, m + held * m))  # effect of u of this tick, then of earlier ticks
     for i in range(m):
-        rest, new = zero_order_hold(motion, drive, loop.period - part[i])
+        transition, new = zero_order_hold(motion, drive, loop.period - part[i])
         _, old = zero_order_hold(motion, drive, part[i])
-        inputs[..., whole[i] * m + i] += new[..., i]
-        inputs[..., (whole[i] + 1) * m + i] += (rest @ old)[..., i]
+        inputs[..., ticks[i] * m + i] += new[..., i]
+        inputs[..., (ticks[i] + 1) * m + i] += (transition @ old)[..., i]
     B[..., : n + m, :] = inputs[..., :m]
     A[..., : n + m, n + m :] = inputs[..., m:]
     B[..., n + m : n + 2 * m, :] = np.eye(m)

@@ -73,8 +73,8 @@ class Margins(NamedTuple):
         most = {
             name: np.asarray(getattr(self, name).max(axis=0)) for name in ("gain_decrease", "sensitivity", "sensitivity_all")
         }
-        at = np.argmin(self.phase, axis=0)[None]
-        return Margins(**least | most | {"crossover": np.take_along_axis(self.crossover, at, axis=0)[0]})
+        least_phase = np.argmin(self.phase, axis=0)[None]
+        return Margins(**least | most | {"crossover": np.take_along_axis(self.crossover, least_phase, axis=0)[0]})
 
 
 def disk_gain(disk: FloatArray) -> FloatArray:
@@ -170,9 +170,9 @@ def _schur_forms(plant: LinearPlant, law: LinearLaw, loop: Loop) -> Iterator[_Sc
     B = each(plant.B)
     laws = [each(matrix) for matrix in law]
     for k in range(0, count, BATCH):
-        of = slice(k, k + BATCH)
-        aircraft = LinearPlant(A[of], B[of], plant.C)
-        its_law = LinearLaw(*(matrix[of] for matrix in laws))
+        batch = slice(k, k + BATCH)
+        aircraft = LinearPlant(A[batch], B[batch], plant.C)
+        its_law = LinearLaw(*(matrix[batch] for matrix in laws))
         yield _schur_form(aircraft, its_law, loop)
 
 
@@ -290,11 +290,11 @@ def _refined(
     places: tuple[IntArray, IntArray, IntArray],
     values: FloatArray,
     period: float,
-    of_L: Callable[[ComplexArray], FloatArray],
+    residual: Callable[[ComplexArray], FloatArray],
 ) -> tuple[FloatArray, ComplexArray]:
-    """Frequencies of of_L(L_i) = 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
+    """Frequencies of residual(L_i) = 0 in the intervals of some crossings, and L_i there: regula falsi, Illinois."""
     aircraft, place, channel = places
-    of_each = _SchurForm(*(part[aircraft] for part in form))
+    forms = _SchurForm(*(part[aircraft] for part in form))
     low = w[aircraft, place]
     high = w[aircraft, place + 1]
     at_low = values[aircraft, place, channel]
@@ -305,15 +305,15 @@ def _refined(
     for _ in range(8 if len(low) else 0):
         gap = at_high - at_low
         middle = np.where(gap == 0.0, low, low - at_low * (high - low) / np.where(gap == 0.0, 1.0, gap))
-        S = _sensitivity(of_each, np.exp(1j * middle * period)[:, None])[:, 0]
+        S = _sensitivity(forms, np.exp(1j * middle * period)[:, None])[:, 0]
         L = 1.0 / S[np.arange(len(low)), channel, channel] - 1.0
-        value = of_L(L)
+        value = residual(L)
         side = np.where(np.signbit(value) == np.signbit(at_high), 1.0, -1.0)
-        kept = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved
+        share = np.where(side == before, 0.5, 1.0)  # an end kept twice has the value halved
         low = np.where(side > 0.0, low, middle)
         high = np.where(side > 0.0, middle, high)
-        at_low = np.where(side > 0.0, kept * at_low, value)
-        at_high = np.where(side > 0.0, value, kept * at_high)
+        at_low = np.where(side > 0.0, share * at_low, value)
+        at_high = np.where(side > 0.0, value, share * at_high)
         before = side
     return middle, L
 
@@ -327,10 +327,10 @@ def _phase_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: flo
     """Smallest abs(angle(-L_i)) at abs(L_i) = 1 and the frequency, (N, m)."""
     gains = _log_gain(L)
     places = _crossings(gains)
-    frequency, at = _refined(form, w, places, gains, period, _log_gain)
+    frequency, crossing = _refined(form, w, places, gains, period, _log_gain)
     phase = np.full(gains[:, 0].shape, np.inf)
     crossover = np.zeros(gains[:, 0].shape)
-    angle = np.abs(np.angle(-at))
+    angle = np.abs(np.angle(-crossing))
     for k in np.argsort(-angle, kind="stable"):
         phase[places[0][k], places[2][k]] = angle[k]
         crossover[places[0][k], places[2][k]] = frequency[k]
@@ -344,11 +344,11 @@ def _gain_margins(form: _SchurForm, w: FloatArray, L: ComplexArray, period: floa
     places = _crossings(imaginary)
     inside = places[1] < L.shape[1] - 2  # the last point is looked at by itself
     places = (places[0][inside], places[1][inside], places[2][inside])
-    _, at = _refined(form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L)))
+    _, crossing = _refined(form, w, places, imaginary, period, lambda L: np.imag(L) / (1.0 + np.abs(L)))
     ends = np.concatenate([np.where(np.abs(np.angle(-L[:, :1])) < PHASE_AT_ZERO, L[:, :1].real, 0.0), L[:, -1:].real], axis=1)
     decrease = np.zeros(L[:, 0].shape)
     increase = np.full(L[:, 0].shape, np.inf)
-    for row, channel, value in zip(places[0], places[2], at.real, strict=True):
+    for row, channel, value in zip(places[0], places[2], crossing.real, strict=True):
         _narrow(decrease, increase, (row, channel), value)
     for row, end, channel in np.ndindex(ends.shape):
         _narrow(decrease, increase, (row, channel), ends[row, end, channel])

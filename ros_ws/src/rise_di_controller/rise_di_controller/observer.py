@@ -99,18 +99,18 @@ def estimates_after(history: tuple[PastTick, ...], change: Array, filters: Seque
     known = np.array([tick.e is not None for tick in history])
     e = np.array([np.zeros_like(change) if tick.e is None else tick.e for tick in history]).T
     u = np.array([tick.u - change for tick in history]).T
-    of_tick = np.array([id(params) for params in filters])
+    tick_filters = np.array([id(params) for params in filters])
     by_e, by_u = np.zeros((2, len(filters[0].Phi), len(history)))
     steps: dict[int, tuple[Array, Array]] = {}
     for params in {id(params): params for params in filters}.values():
-        own = of_tick == id(params)
+        ticks = tick_filters == id(params)
         gain = product(params.Phi, params.L)
-        by_e[:, own] = product(gain, e[:, own])
-        by_u[:, own] = product(params.Gamma, u[:, own])
+        by_e[:, ticks] = product(gain, e[:, ticks])
+        by_u[:, ticks] = product(params.Gamma, u[:, ticks])
         steps[id(params)] = params.Phi, params.Phi - product(gain, params.H)
     _, corrected = steps[id(filters[0])]
     z = product(inverse(np.eye(len(corrected)) - corrected), np.mean(by_e[:, known], axis=1) + np.mean(by_u, axis=1))
-    for place, has_y, addend in zip(of_tick.tolist(), known, (by_e + by_u).T, strict=True):
+    for place, has_y, addend in zip(tick_filters.tolist(), known, (by_e + by_u).T, strict=True):
         predicted, corrected = steps[place]
         z = product(corrected if has_y else predicted, z) + addend
     return z
@@ -140,10 +140,10 @@ def by_vanes(z: Array, innovation: Array, deviation: Array, measures: Array, par
     Arguments: the innovation of y, (m,); `deviation` of the readings from the reference motion, (k,).
     """
     xp = array_namespace(z)
-    own = deviation - product(params.H, z)
+    residual = deviation - product(params.H, z)
     total = 0.0 * z
     for v in range(len(params.H)):
-        total = total + measures[v] * product(params.L[v], xp.concat([innovation, own[v : v + 1]]))
+        total = total + measures[v] * product(params.L[v], xp.concat([innovation, residual[v : v + 1]]))
     return total
 
 
@@ -198,8 +198,8 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
         state = correct(state, measured, dt, params)
         return state, measured._replace(u_trim=measured.u_trim + state.u_o)
 
-    def predicted(state: Any, of_law: Any, u: Array, measured: Measurements, params: ObserverParams) -> Any:
-        return state._replace(law=of_law, z=predict(state.z, u - measured.u_trim, params))
+    def predicted(state: Any, law_state: Any, u: Array, measured: Measurements, params: ObserverParams) -> Any:
+        return state._replace(law=law_state, z=predict(state.z, u - measured.u_trim, params))
 
     def engage(measured: Measurements, params: ObserverParams) -> Any:
         xp = array_namespace(measured.y)
@@ -213,21 +213,21 @@ def with_observer(law: ControlLaw, *, vanes: bool = False) -> ControlLaw:
 
     def step(state: Any, measured: Measurements, dt: Array, params: ObserverParams) -> tuple[Any, Array]:
         state, inner = corrected(state, measured, dt, params)
-        of_law, u = law.step(state.law, inner, dt, params.law)
-        return predicted(state, of_law, u, measured, params), u
+        law_state, u = law.step(state.law, inner, dt, params.law)
+        return predicted(state, law_state, u, measured, params), u
 
     def limited(
         state: Any, measured: Measurements, dt: Array, params: ObserverParams, limits: Limits
     ) -> tuple[Any, Array, Array]:
         state, inner = corrected(state, measured, dt, params)
-        of_law, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
-        return predicted(state, of_law, u, measured, params), u_free, u
+        law_state, u_free, u = law.limited(state.law, inner, dt, params.law, limits)
+        return predicted(state, law_state, u, measured, params), u_free, u
 
     def retune(state: Any, old: ObserverParams, new: ObserverParams) -> Any:
         return state._replace(law=law.retune(state.law, old.law, new.law))
 
     def missed(state: Any, measured: Measurements, params: ObserverParams) -> Any:
-        of_law = law.missed(state.law, measured, params.law)
-        return predicted(state, of_law, measured.u_before, measured, params)
+        law_state = law.missed(state.law, measured, params.law)
+        return predicted(state, law_state, measured.u_before, measured, params)
 
     return ControlLaw(VaneObserverState if vanes else ObserverState, engage, step, limited, retune, missed, inner=law)

@@ -33,7 +33,7 @@ from flight_core.parameters import (
     require_length,
 )
 from flight_core.rates import divide, nanoseconds, period_ns
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, selection_matrix
 from rise_di_controller import internals, samples
 from rise_di_controller.allocation import Allocation, allocation
 from rise_di_controller.control_law import ControlLaw, Measurements, TunedLaw, fields
@@ -85,7 +85,7 @@ class FeedforwardConfig(Config):
         A = np.reshape(self.A, (n, n))
         B = np.reshape(self.B, (n, m))
         gravity = np.zeros((n, n)) if self.gravity is None else np.reshape(self.gravity, (n, n))
-        C = np.array([[float(state == name) for state in self.states] for name in outputs])
+        C = selection_matrix(outputs, self.states)
         try:
             nominal_D = [int(sign) for sign in signs(C @ B)]
         except DecompositionError as error:
@@ -116,8 +116,8 @@ class VanesConfig(Config):
         known = set(self.channels) <= set(others) and len(set(self.channels)) == k
         require(known, "observer.vanes.channels", ", ".join(self.channels), expected)
         for key, size in (("H", k * s), ("L", k * s * (m + 1)), ("least", k)):
-            found = len(getattr(self, key))
-            require(found == size, f"observer.vanes.{key}", f"{found} values", f"{size} for {k} vanes, {s} estimates")
+            entries = len(getattr(self, key))
+            require(entries == size, f"observer.vanes.{key}", f"{entries} values", f"{size} for {k} vanes, {s} estimates")
         least = np.array(self.least) ** 2
         L = np.reshape(self.L, (k, s, m + 1))
         return VaneParams(np.reshape(self.H, (k, s)), L, least, np.float64(self.time))
@@ -148,9 +148,9 @@ class ObserverConfig(Config):
         """Phi, Gamma, H, L and F. Raises ParameterError for sizes that do not match."""
         s, (n, m) = len(self.states), nominal.B.shape
         for key, rows, columns in (("Phi", s, s), ("Gamma", s, m), ("L", s, m), ("F", m, s)):
-            found = len(getattr(self, key))
+            entries = len(getattr(self, key))
             require(
-                found == rows * columns, f"observer.{key}", f"{found} values", f"{rows * columns}: {rows} rows of {columns}"
+                entries == rows * columns, f"observer.{key}", f"{entries} values", f"{rows * columns}: {rows} rows of {columns}"
             )
         H = np.hstack([nominal.C, np.zeros((m, s - n))])
         Phi, Gamma, L = (np.reshape(values, (s, -1)) for values in (self.Phi, self.Gamma, self.L))
@@ -185,13 +185,13 @@ class AllocationConfig(Config):
         require(p >= m, "allocation.effectors", ", ".join(self.effectors), f"{m} or more, for {', '.join(inputs)}")
         require(len(set(self.effectors)) == p, "allocation.effectors", ", ".join(self.effectors), "different names")
         for key, rows, columns in (("T", p, m), ("effect", m, p)):
-            found = f"{len(getattr(self, key))} values"
-            require(found == f"{p * m} values", f"allocation.{key}", found, f"{p * m}: {rows} rows of {columns}")
+            entries = f"{len(getattr(self, key))} values"
+            require(entries == f"{p * m} values", f"allocation.{key}", entries, f"{p * m}: {rows} rows of {columns}")
         for key in ("lower", "upper", "slew"):
             require_length(f"allocation.{key}", getattr(self, key) or self.effectors, self.effectors)
         for name, low, high in zip(self.effectors, self.lower, self.upper, strict=True):
-            within = low <= 0.0 <= high and low < high
-            require(within, "allocation.lower", f"{low:g} and upper {high:g} of {name}", "a range with trim, 0, inside")
+            spans_trim = low <= 0.0 <= high and low < high
+            require(spans_trim, "allocation.lower", f"{low:g} and upper {high:g} of {name}", "a range with trim, 0, inside")
         priority = self.priority or tuple(inputs)
         require_channels("allocation.priority", priority, inputs, "the inputs of the law")
         T = np.reshape(self.T, (p, m))
@@ -337,22 +337,22 @@ class ControllerConfig(NodeConfig):
         require(flies, "observer.vanes", "part 0 beside it", "a part above 0: the observer flies")
         yield
         (law, params), period, m = self.tuned_law(), 1.0 / self.rate, len(self.inputs)
-        read = [[float(name == state) for state in self._model_states()] for name in self.vanes]
-        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, *read]))
+        read = selection_matrix(self.vanes, self._model_states())
+        plant = LinearPlant(nominal.A + nominal.gravity, nominal.B, np.vstack([nominal.C, read]))
         loop = Loop(np.array(self.lag), 0.0, period)
-        for frozen in (some for count in range(len(read) + 1) for some in combinations(self.vanes, count)):
+        for frozen in _subsets(self.vanes):
             flown = without_frozen(params, [name in frozen for name in self.vanes])
-            without = f" without {' and '.join(frozen)}" if frozen else ""
+            frozen_text = f" without {' and '.join(frozen)}" if frozen else ""
             radius = spectral_radius(filter_matrix(flown))
-            unstable = f"a spectral radius of {radius:.6g}{without}"
+            unstable = f"a spectral radius of {radius:.6g}{frozen_text}"
             require(radius < 1.0, "observer.vanes.L", unstable, "less than 1: it is unstable")
             linear = linear_law(TunedLaw(law, flown), m, period)
             for part in MARGIN_PARTS:
                 late = part * max(observer.margin, self.delay)
                 stable = is_stable(plant, linear, loop, np.full(m, late))
-                found = f"a nominal loop that is unstable with u {1e3 * late:g} ms late{without}"
+                unstable_loop = f"a nominal loop that is unstable with u {1e3 * late:g} ms late{frozen_text}"
                 expected_margin = f"a delay margin of at least {1e3 * observer.margin:g} ms: a smaller F or K"
-                require(stable, "observer.margin", found, expected_margin)
+                require(stable, "observer.margin", unstable_loop, expected_margin)
                 yield
 
     def _model_states(self) -> tuple[str, ...]:
@@ -493,6 +493,12 @@ class ControllerConfig(NodeConfig):
             nominal=self._flown_nominal(),
             vanes=tuple(self._model_states().index(name) for name in self.vanes),
         )
+
+
+def _subsets(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Every subset of the names, the small ones first."""
+    for count in range(len(names) + 1):
+        yield from combinations(names, count)
 
 
 def as_controller(value: object, key: str) -> ControllerConfig:

@@ -187,19 +187,19 @@ class RiseDiConfig(ControllerConfig):
         scale = airspeed + (1.0 - airspeed) / ratio**2
         sections: dict[str, Any] = {}
         for key, matrices, names in (
-            ("feedforward", feedforward.of(scale), ("A", "B", "gravity")),
-            ("observer", observer.of(scale), ("Phi", "Gamma", "L", "F")),
+            ("feedforward", feedforward.at_scale(scale), ("A", "B", "gravity")),
+            ("observer", observer.at_scale(scale), ("Phi", "Gamma", "L", "F")),
         ):
             values = {name: tuple(getattr(matrices, name).ravel().tolist()) for name in names}
             sections[key] = getattr(self, key).model_copy(update=values)
         input_scale = tuple((np.array(self.input_scale) * scale).tolist())
         return self.model_copy(update=sections | {"input_scale": input_scale, "schedule": None})
 
-    def _with_models(self, there: SpeedConfig) -> Self:
-        """The parameters with the models of `there` in place of the models of the trim speed, and no schedule."""
+    def _with_models(self, models: SpeedConfig) -> Self:
+        """The parameters with `models` in place of the models of the trim speed, and no schedule."""
         sections: dict[str, Any] = {"schedule": None}
         for key, names in (("feedforward", ("A", "B", "gravity")), ("observer", ("Phi", "Gamma", "L", "F"))):
-            sections[key] = getattr(self, key).model_copy(update={name: getattr(there, name) for name in names})
+            sections[key] = getattr(self, key).model_copy(update={name: getattr(models, name) for name in names})
         return self.model_copy(update=sections)
 
     def _airspeed(self) -> FloatArray:
@@ -214,9 +214,8 @@ class RiseDiConfig(ControllerConfig):
         assert self.schedule is not None  # noqa: S101 - for the type checker
         airspeed, (slow, fast) = self._airspeed(), self.schedule.models
         at_trim = matrices(self.model_copy(update={"schedule": None}), np.ones(len(self.outputs)))
-        at_slow, at_fast = (
-            matrices(self._with_models(there), airspeed + (1.0 - airspeed) / there.ratio**2) for there in (slow, fast)
-        )
+        at_slow = matrices(self._with_models(slow), airspeed + (1.0 - airspeed) / slow.ratio**2)
+        at_fast = matrices(self._with_models(fast), airspeed + (1.0 - airspeed) / fast.ratio**2)
         return over_speed((slow.ratio, fast.ratio), (at_trim, at_slow, at_fast), airspeed, model)
 
     def _nominal_over_speed(self, at_trim: Nominal) -> OverSpeed:

@@ -64,7 +64,7 @@ def bounds(names: Sequence[str], authority: FloatArray, largest: Sequence[float]
     return SampleLimits(bound, reach, period_ns)
 
 
-def beyond(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
+def bound_violation(value: FloatArray, names: Sequence[str], limits: SampleLimits) -> str:
     """The first of the m values that is beyond its bound, or NaN, as a sentence; empty for values inside."""
     inside = np.abs(value) <= limits.largest
     if inside.all():

@@ -31,20 +31,20 @@ STEPS = 128  # a unit of V / V0: the models change every 0.2 m/s at 25 m/s, so t
 class OverSpeed(NamedTuple):
     """A model over the airspeed, from `least` to `most` of d = V / V0 - 1."""
 
-    at: Callable[[float], Any]  # of d, in whole STEPS
+    model: Callable[[float], Any]  # of d, in whole STEPS
     least: float
     most: float
     airspeed: FloatArray  # (m,) 1 for the output V, else 0
 
-    def of(self, scale: FloatArray) -> Any:
+    def at_scale(self, scale: FloatArray) -> Any:
         """The model where the factors of input_scale are `scale`, (m,): they are (V0 / V)^2 in all channels but V."""
         d = 1.0 / math.sqrt(((1.0 - self.airspeed) * scale).max()) - 1.0
-        return self.at(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
+        return self.model(round(min(max(d, self.least), self.most) * STEPS) / STEPS)
 
-    def of_each(self, scales: FloatArray) -> list[Any]:
-        """The models of T factors, (T, m), as from `of`, at once."""
+    def at_scales(self, scales: FloatArray) -> list[Any]:
+        """The models of T factors, (T, m), as from `at_scale`, at once."""
         d = 1.0 / np.sqrt(((1.0 - self.airspeed) * scales).max(axis=1)) - 1.0
-        return [self.at(place) for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()]
+        return [self.model(place) for place in (np.round(np.clip(d, self.least, self.most) * STEPS) / STEPS).tolist()]
 
 
 def over_speed(
@@ -53,21 +53,21 @@ def over_speed(
     airspeed: FloatArray,
     model: Callable[[FloatArray, FloatArray], Any],
 ) -> OverSpeed:
-    """The model of matrices at + d (slope + d curvature), through `values` at the trim speed and at two ratios to it.
+    """The model of matrices trim + d (slope + d curvature), through `values` at the trim speed and at two ratios to it.
 
     The first ratio is below 1, the second above. What turns y_dot into u, as F of an observer and the inverse of Omega, is over
     the factor of input_scale in `values`: `model` takes the matrices and these factors, (m,).
     """
-    at, slow, fast = values
+    trim, slow, fast = values
     least, most = (ratio - 1.0 for ratio in ratios)
-    curvature = ((fast - at) / most - (slow - at) / least) / (most - least)
-    slope = (slow - at) / least - least * curvature
+    curvature = ((fast - trim) / most - (slow - trim) / least) / (most - least)
+    slope = (slow - trim) / least - least * curvature
 
     @lru_cache(maxsize=512)
-    def of(d: float) -> Any:
-        return model(at + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2)
+    def model_at(d: float) -> Any:
+        return model(trim + d * (slope + d * curvature), airspeed + (1.0 - airspeed) / (1.0 + d) ** 2)
 
-    return OverSpeed(of, least, most, airspeed)
+    return OverSpeed(model_at, least, most, airspeed)
 
 
 class ScheduleParams(NamedTuple):
@@ -136,7 +136,7 @@ def nominal_of(nominal: Nominal, matrices: FloatArray, scale: FloatArray) -> Nom
 
 def law_at(params: ScheduleParams, scale: Array) -> Any:
     """Parameters of the extended law at an airspeed: input_scale times `scale`, with an observer the models there."""
-    return _scaled(params.law if params.observer is None else params.observer.of(scale), scale)
+    return _scaled(params.law if params.observer is None else params.observer.at_scale(scale), scale)
 
 
 def _scaled(params: Any, scale: Array) -> Any:
@@ -150,7 +150,7 @@ def observers_of(params: Any, scales: Sequence[Array | None]) -> list[ObserverPa
     """The observers of some ticks, with the factors of input_scale there beside a schedule."""
     if not isinstance(params, ScheduleParams):
         return [params] * len(scales)
-    return [params.law] * len(scales) if params.observer is None else params.observer.of_each(np.array(scales))
+    return [params.law] * len(scales) if params.observer is None else params.observer.at_scales(np.array(scales))
 
 
 @lru_cache(maxsize=64)
@@ -176,15 +176,15 @@ def with_schedule(law: ControlLaw) -> ControlLaw:
 
     def step(state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams) -> tuple[ScheduleState, Array]:
         state = followed(state, measured.y, dt, params)
-        of_law, u = law.step(state.law, measured, dt, law_at(params, state.scale))
-        return state._replace(law=of_law), u
+        law_state, u = law.step(state.law, measured, dt, law_at(params, state.scale))
+        return state._replace(law=law_state), u
 
     def limited(
         state: ScheduleState, measured: Measurements, dt: Array, params: ScheduleParams, limits: Limits
     ) -> tuple[ScheduleState, Array, Array]:
         state = followed(state, measured.y, dt, params)
-        of_law, u_free, u = law.limited(state.law, measured, dt, law_at(params, state.scale), limits)
-        return state._replace(law=of_law), u_free, u
+        law_state, u_free, u = law.limited(state.law, measured, dt, law_at(params, state.scale), limits)
+        return state._replace(law=law_state), u_free, u
 
     def retune(state: ScheduleState, old: ScheduleParams, new: ScheduleParams) -> ScheduleState:
         return state._replace(law=law.retune(state.law, _scaled(old.law, state.scale), _scaled(new.law, state.scale)))
