@@ -264,7 +264,7 @@ class Applied:
                 value = np.array([PUBLISHED[publisher] if u is None else u])
                 self._input.take(value, now_ns, transfer=publisher != self._publisher)
                 self._publisher = publisher
-            self.u.append(float(self._input.at(now_ns)[0]))
+            self.u.append(float(self._input.u_at(now_ns)[0]))
             self._number += 1
 
 
@@ -303,7 +303,7 @@ def test_overrun_leaves_u_where_aircraft_has_it(duration: float) -> None:
     loop.receive(y=False, y_m=False)
     loop.ticks(1)
     late = np.abs(before) * 2 * guard.period_ns / guard.ramp_ns
-    assert (np.abs(loop.u - aircraft.at(nanoseconds(duration) + guard.period_ns)) <= late + EXACT).all()
+    assert (np.abs(loop.u - aircraft.u_at(nanoseconds(duration) + guard.period_ns)) <= late + EXACT).all()
 
 
 # The bridge

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -20,7 +21,7 @@ from flight_core.fields import Field
 from flight_core.files import find_file, names_in, parse_yaml, read_file
 from flight_core.parameters import Config, Name, Names, NonNegative, Number, Numbers, require
 from flight_core.units import ANGLE, quantity, si_per_unit
-from flight_core.vectors import FloatArray
+from flight_core.vectors import FloatArray, selection_matrix
 
 EXPECTED = "an airframe file"
 
@@ -103,20 +104,21 @@ class Airframe(Config):
         require(not self.gusts or self.speed > 0.0, "speed", self.speed, "above 0 m/s beside gusts, which are per w / V0")
         for gust in self.gusts:
             require(gust in AXES, f"gusts.{gust}", f"{gust!r}", f"an axis of the wind: {', '.join(AXES)}")
-        named |= {f"gusts.{gust}.{state}": state for gust, direction in self.gusts.items() for state in direction}
+        for gust, direction in self.gusts.items():
+            named |= {f"gusts.{gust}.{state}": state for state in direction}
         for key, name in named.items():
             require(name in self.states, key, f"{name!r}", f"a state: {', '.join(self.states)}")
 
     def _units(self) -> list[tuple[str, Unit]]:
         """Units of states and inputs with their keys."""
         states = [(f"states.{name}", unit) for name, unit in self.states.items()]
-        return states + [(f"inputs.{name}.unit", given.unit) for name, given in self.inputs.items()]
+        return states + [(f"inputs.{name}.unit", channel.unit) for name, channel in self.inputs.items()]
 
     def _check_outputs(self, n: int, m: int) -> None:
         """Check C, D and output_units: shapes, a unit for each output, no feedthrough."""
         shape = [len(row) for row in self.C]
         require(shape in ([], [n] * m), "C", f"rows of {shape} values", f"{m} rows of {n}: a row an output, a column a state")
-        largest = max((abs(value) for row in self.D for value in row), default=0.0)
+        largest = max(map(abs, chain.from_iterable(self.D)), default=0.0)
         way_out = "none: take an output that no input moves at once, such as a speed in place of an acceleration"
         require(largest == 0.0, "D", f"a feedthrough of {largest:g}", way_out)
         for name in self.output_units:
@@ -152,9 +154,9 @@ class Airframe(Config):
 
     def no_thrust(self) -> FloatArray:
         """The inputs without thrust, deviations from trim, shape (p,), SI: 0 of a surface, nan where the file has none."""
-        units = [quantity(given.unit) for given in self.inputs.values()]
+        units = [quantity(channel.unit) for channel in self.inputs.values()]
         unsaid = [0.0 if unit.dimension == ANGLE else math.nan for unit in units]
-        said = [given.no_thrust for given in self.inputs.values()]
+        said = [channel.no_thrust for channel in self.inputs.values()]
         pairs = zip(said, units, unsaid, strict=True)
         return np.array([default if value is None else value * unit.si for value, unit, default in pairs])
 
@@ -162,7 +164,7 @@ class Airframe(Config):
         """C, shape (m, n), SI: C_ij unit_i / unit_j; without `C` it selects the outputs."""
         if self.C:
             return np.array(self.C) * _si(self.units_of_outputs().values())[:, None] / _si(self.states.values())
-        return np.array([[float(state == output) for state in self.states] for output in self.outputs])
+        return selection_matrix(self.outputs, [*self.states])
 
     def matrix_gravity(self) -> FloatArray:
         """Matrix of the sine terms, shape (n, n): f = matrix_gravity @ sin(x)."""
@@ -177,7 +179,8 @@ class Airframe(Config):
         gain = np.zeros((len(self.states), len(terms)))
         for k, term in enumerate(terms):
             gain[self.index(term.into), k] = term.gain
-        first, second = (np.array([self.index(term.product[k]) for term in terms], dtype=np.int64) for k in (0, 1))
+        first = np.array([self.index(term.product[0]) for term in terms], dtype=np.int64)
+        second = np.array([self.index(term.product[1]) for term in terms], dtype=np.int64)
         return gain, first, second
 
     def with_matrices(self, A: FloatArray, B: FloatArray, wind_factor: FloatArray) -> Self:
@@ -189,10 +192,9 @@ class Airframe(Config):
         state = _si(self.states.values())
         inputs = _si(i.unit for i in self.inputs.values())
         values = {"A": (A / state[:, None] * state).tolist(), "B": (B / state[:, None] * inputs).tolist()}
-        gusts = {
-            axis: {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
-            for (axis, direction), factor in zip(self.gusts.items(), wind_factor.T, strict=True)
-        }
+        gusts = {}
+        for (axis, direction), factor in zip(self.gusts.items(), wind_factor.T, strict=True):
+            gusts[axis] = {name: value * float(factor[self.index(name)]) for name, value in direction.items()}
         return self.validate_mapping(
             self.model_dump() | values | {"gusts": gusts, "identities": False}, f"airframe {self.name}"
         )
@@ -200,8 +202,8 @@ class Airframe(Config):
     def through(self, T: FloatArray, inputs: Sequence[str]) -> Self:
         """A copy with the m inputs v of u = T v, SI, for its p inputs u, T (p, m) in their order; physics unchecked."""
         B = self.matrix_b() @ T / _si(self.states.values())[:, None]
-        given = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
-        values = {"inputs": given, "B": B.tolist(), "identities": False}
+        channels = {name: {"unit": "1", "positive": f"more {name}"} for name in inputs}
+        values = {"inputs": channels, "B": B.tolist(), "identities": False}
         return self.validate_mapping(self.model_dump() | values, f"airframe {self.name}")
 
     def matrix_gusts(self) -> FloatArray:
@@ -225,8 +227,8 @@ def _si(units: Iterable[Unit]) -> FloatArray:
 def check_identities(airframe: Airframe) -> None:
     """Raise ParameterError for an airframe that contradicts what physics fixes, unless the file says `identities: false`."""
     if airframe.identities:
-        effects = {name: given.positive for name, given in airframe.inputs.items()}
-        units = tuple(given.unit for given in airframe.inputs.values())
+        effects = {name: channel.positive for name, channel in airframe.inputs.items()}
+        units = tuple(channel.unit for channel in airframe.inputs.values())
         A = np.array(airframe.A)
         B = np.array(airframe.B)
         gravity = airframe.matrix_gravity()

@@ -87,22 +87,30 @@ def import_airframe(
     Raises ParameterError with one sentence.
     """
     label = str(source) if isinstance(source, str | Path) else type(source).__name__
-    given_speed = None if speed is None else in_si(speed, "speed", "m/s")
+    entered_speed = None if speed is None else in_si(speed, "speed", "m/s")
     if isinstance(source, str | Path) and Path(source).suffix in {".yaml", ""}:
-        given = {"speed": speed, "states": states, "inputs": inputs, "outputs": outputs, "thrust": thrust, "text": text, **body}
-        for key, value in given.items():
+        options = {
+            "speed": speed,
+            "states": states,
+            "inputs": inputs,
+            "outputs": outputs,
+            "thrust": thrust,
+            "text": text,
+            **body,
+        }
+        for key, value in options.items():
             require(not value, key, f"{value!r} beside an airframe file", "none: the file has it")
         loaded = load_airframe(source)
         return (loaded.model_copy(update={"name": name}) if name else loaded), f"airframe file {label}"
     named_states = _named(states, "states")
     named_inputs = _named(inputs, "inputs")
-    model = _model(source, named_states, named_inputs, given_speed, body)
-    speed_used = given_speed if given_speed is not None else model.speed
+    model = _model(source, named_states, named_inputs, entered_speed, body)
+    speed_used = entered_speed if entered_speed is not None else model.speed
     if speed_used is None:
         raise ParameterError("speed: found none, expected the trim speed, as 53.6 or 176 ft/s")
     title = name or Path(label).stem
-    effects = {key: given.get("positive", "") for key, given in model.inputs.items()}
-    units = tuple(given["unit"] for given in model.inputs.values())
+    effects = {key: channel.get("positive", "") for key, channel in model.inputs.items()}
+    units = tuple(channel["unit"] for channel in model.inputs.values())
     none = np.zeros_like(model.A)
     identities.check(identities.Model(title, model.states, effects, units, speed_used, model.A, model.B, none))
     if thrust:
@@ -123,9 +131,9 @@ def _named(names: Named, key: str) -> dict[str, Any]:
     return dict.fromkeys(names, "")
 
 
-def _states(given: Mapping[str, Any], found: Sequence[str], n: int) -> dict[str, str]:
+def _states(named: Mapping[str, Any], labels: Sequence[str], n: int) -> dict[str, str]:
     """Units of the n states: as given, else by the names that the model carries."""
-    names = given or dict.fromkeys(found, "")
+    names = named or dict.fromkeys(labels, "")
     known = ", ".join(names) or "no names"
     require(len(names) == n, "states", f"{known} beside {n} rows of A", f"{n} names in the order of A: u: ft/s, w: ft/s, ...")
     units = {}
@@ -138,9 +146,9 @@ def _states(given: Mapping[str, Any], found: Sequence[str], n: int) -> dict[str,
     return units
 
 
-def _inputs(given: Mapping[str, Any], found: Sequence[str], m: int) -> dict[str, dict[str, str]]:
+def _inputs(named: Mapping[str, Any], labels: Sequence[str], m: int) -> dict[str, dict[str, str]]:
     """Units and effects of the m inputs: as given ("rad nose down"), else rad, and 1 for thrust."""
-    names = given or dict.fromkeys(found, "")
+    names = named or dict.fromkeys(labels, "")
     known = ", ".join(names) or "no names"
     require(len(names) == m, "inputs", f"{known} beside {m} columns of B", f"{m} names in the order of B: elevator: rad, ...")
     read = {}
@@ -158,14 +166,14 @@ def _inputs(given: Mapping[str, Any], found: Sequence[str], m: int) -> dict[str,
 def _model(
     source: Any, states: Mapping[str, Any], inputs: Mapping[str, Any], speed: float | None, body: Mapping[str, str | float]
 ) -> Model:
-    of_avl = "none: it belongs to AVL's stability derivatives"
+    no_body = "none: it belongs to AVL's stability derivatives"
     if not isinstance(source, str | Path):
-        require(not body, next(iter(body), ""), "it beside a state space", of_avl)
+        require(not body, next(iter(body), ""), "it beside a state space", no_body)
         return _state_space(source, states, inputs)
     path = as_path(source, "source", "a state space, or the path of a file")
     content = read_file(path, f"model {path}", "a model: .mat, .yaml, or a text of AVL or XFLR5")
     if path.suffix == ".mat":
-        require(not body, next(iter(body), ""), "it beside a MAT-file", of_avl)
+        require(not body, next(iter(body), ""), "it beside a MAT-file", no_body)
         return _matlab(path, states, inputs)
     text = content.decode("utf-8", errors="replace")
     if re.search(r"\bCLa\s*=", text) and re.search(r"\bSref\s*=", text):
@@ -173,7 +181,7 @@ def _model(
             not states, "states", "names beside AVL's derivatives", "none: the states are V, alpha, q, theta, beta, p, r, phi"
         )
         return _avl_derivatives(text, inputs, speed, body)
-    require(not body, next(iter(body), ""), f"it beside {path.name}", of_avl)
+    require(not body, next(iter(body), ""), f"it beside {path.name}", no_body)
     if "Longitudinal state matrix" in text or "Lateral state matrix" in text:
         return _xflr5(text, states, inputs)
     if (header := _avl_header(text)) is not None:
@@ -215,8 +223,8 @@ def _state_space(system: Any, states: Mapping[str, Any], inputs: Mapping[str, An
     _square(A, B)
 
     def labels(attribute: str) -> list[str]:
-        found = [str(label) for label in getattr(system, attribute, None) or ()]
-        return [] if any(re.fullmatch(r"[a-z]+\[\d+\]", label) for label in found) else found
+        texts = [str(label) for label in getattr(system, attribute, None) or ()]
+        return [] if any(re.fullmatch(r"[a-z]+\[\d+\]", label) for label in texts) else texts
 
     named = labels("state_labels")
     driven = labels("input_labels")
@@ -235,15 +243,15 @@ def _matlab(path: Path, states: Mapping[str, Any], inputs: Mapping[str, Any]) ->
         way_out = "a MAT-file of version 7 or less: save('model.mat', '-struct', 'model', '-v7')"
         raise ParameterError(f"model {path}: found {type(error).__name__}, expected {way_out}") from None
     groups = [content, *(value for value in content.values() if isinstance(value, dict))]
-    group = next((group for group in groups if {"A", "B"} <= {key.upper() for key in group if len(key) == 1}), None)
+    group = next((group for group in groups if {"A", "B"} <= {*map(str.upper, group)}), None)
     if group is None:
-        found = ", ".join(key for key in content if not key.startswith("__")) or "nothing"
+        keys_text = ", ".join(key for key in content if not key.startswith("__")) or "nothing"
         way_out = "A and B: m = struct('A', sys.A, 'B', sys.B); save('model.mat', '-struct', 'm', '-v7')"
-        raise ParameterError(f"model {path}: found {found}, expected {way_out}")
+        raise ParameterError(f"model {path}: found {keys_text}, expected {way_out}")
     keys = {key.upper(): key for key in group if len(key) == 1}
 
-    def names(*alike: str) -> list[str]:
-        value = next((group[key] for key in alike if key in group), ())
+    def names(*spellings: str) -> list[str]:
+        value = next((group[key] for key in spellings if key in group), ())
         return [str(text).strip() for text in np.atleast_1d(value) if str(text).strip()]
 
     A = _finite(group[keys["A"]], "A")
@@ -283,10 +291,15 @@ def _xflr5(text: str, states: Mapping[str, Any], inputs: Mapping[str, Any]) -> M
     A = np.block([[longitudinal[0], np.zeros((4, 4))], [np.zeros((4, 4)), lateral[0]]])
     B = np.vstack([np.hstack(blocks) for blocks in controls])
     sets = re.findall(r"Control [Mm]atrices for set (\S+)", text)
-    given = _inputs(inputs, [_control(name) for name in sets], B.shape[1])
+    channels = _inputs(inputs, [_control(name) for name in sets], B.shape[1])
     V0 = float(np.hypot(A[1, 2], A[0, 2]))
     return Model(
-        _states(states, ["u", "w", "q", "theta", "v", "p", "r", "phi"], 8), given, A, B, speed=V0, note="XFLR5's matrices"
+        _states(states, ["u", "w", "q", "theta", "v", "p", "r", "phi"], 8),
+        channels,
+        A,
+        B,
+        speed=V0,
+        note="XFLR5's matrices",
     )
 
 
@@ -318,17 +331,17 @@ def _avl_matrix(
     n = len(names)
     m = len(controls)
     table = _rows([row.replace("|", " ") for row in text.splitlines()[line + 1 :]], n, n + m, "system matrix")
-    kept = [i for i, name in enumerate(names) if name not in POSITIONS]
-    A = table[np.ix_(kept, kept)]
-    B = table[kept][:, n:]
-    units = _states(states, [names[i] for i in kept], len(kept))
-    given = _inputs(inputs or {_control(name): "deg" for name in controls}, (), m)
+    dynamic = [i for i, name in enumerate(names) if name not in POSITIONS]
+    A = table[np.ix_(dynamic, dynamic)]
+    B = table[dynamic][:, n:]
+    units = _states(states, [names[i] for i in dynamic], len(dynamic))
+    channels = _inputs(inputs or {_control(name): "deg" for name in controls}, (), m)
     V0 = float(np.hypot(A[1, 2], A[0, 2])) if speed is None else speed
     flip = np.array([-1.0 if name in {"u", "w", "p", "r", "phi"} else 1.0 for name in units])
     aft = Model(
-        units, given, flip[:, None] * A * flip, flip[:, None] * B, speed=V0, note="AVL's system matrix, its axes turned"
+        units, channels, flip[:, None] * A * flip, flip[:, None] * B, speed=V0, note="AVL's system matrix, its axes turned"
     )
-    forward = Model(units, given, A, B, speed=V0, note="AVL's system matrix")
+    forward = Model(units, channels, A, B, speed=V0, note="AVL's system matrix")
     w, q = (list(units).index(name) for name in ("w", "q"))
     return forward if A[w, q] > 0.0 else aft
 
@@ -354,8 +367,7 @@ def _avl_derivatives(text: str, inputs: Mapping[str, Any], speed: float | None, 
     for key, number in (("mass", mass), ("Ixx", Ixx), ("Iyy", Iyy), ("Izz", Izz), ("density", rho)):
         require(number > 0.0, key, f"{number:g}", "more than 0")
     needed = ["Sref", "Cref", "Bref", "Alpha", "CLtot", "CDtot", "CLa", "CYb", "Clb", "Cma", "Cnb"]
-    needed += [f"{coefficient}{rate}" for rate, rows in (("p", "Y l n"), ("q", "L m"), ("r", "Y l n")) for coefficient in
-               ("C" + row for row in rows.split())]  # fmt: skip
+    needed += ["CYp", "Clp", "Cnp", "CLq", "Cmq", "CYr", "Clr", "Cnr"]
     absent = [key for key in needed if key not in value]
     require(not absent, "stability derivatives", f"no {', '.join(absent)}", "the file of the command ST")
     length = in_si(body.get("length", 1.0) if not isinstance(body.get("length"), str) else f"1 {body['length']}", "length", "m")
@@ -383,16 +395,13 @@ def _avl_derivatives(text: str, inputs: Mapping[str, Any], speed: float | None, 
     used = _avl_controls(text, inputs)
     B = np.zeros((8, len(used)))
     for k, number in enumerate(used.values()):
-        of = {
-            row: next((value[key] for key in (f"C{row}d{number}", f"C{row}d{number:02d}") if key in value), 0.0)
-            for row in "LYlmn"
-        }
-        B[1, k], B[2, k], B[4, k] = -per_V * of["L"], qS * c / Iyy * of["m"], per_V * of["Y"]
-        B[0, k] = -2.0 * CL * of["L"] * S / (np.pi * b**2 * value.get("e", 0.8)) * qS / mass
-        B[5:7, k] = qS * b * inverse @ np.array([of["l"], of["n"]])
+        effects = {row: value.get(f"C{row}d{number}", value.get(f"C{row}d{number:02d}", 0.0)) for row in "LYlmn"}
+        B[1, k], B[2, k], B[4, k] = -per_V * effects["L"], qS * c / Iyy * effects["m"], per_V * effects["Y"]
+        B[0, k] = -2.0 * CL * effects["L"] * S / (np.pi * b**2 * value.get("e", 0.8)) * qS / mass
+        B[5:7, k] = qS * b * inverse @ np.array([effects["l"], effects["n"]])
     units = _states({}, ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"], 8)
-    given = _inputs({name: inputs.get(name) or "deg" for name in used}, (), len(used))
-    return Model(units, given, A, B, speed=V0, note="AVL's stability derivatives, without those of alpha_dot")
+    channels = _inputs({name: inputs.get(name) or "deg" for name in used}, (), len(used))
+    return Model(units, channels, A, B, speed=V0, note="AVL's stability derivatives, without those of alpha_dot")
 
 
 def _avl_controls(text: str, inputs: Mapping[str, Any]) -> dict[str, int]:
@@ -412,9 +421,9 @@ def _with_thrust(model: Model) -> Model:
         raise ParameterError(f"thrust: found the states {', '.join(model.states)}, expected V or u")
     column = np.zeros((len(model.A), 1))
     column[list(model.states).index(state)] = GRAVITY / quantity(model.states[state]).si
-    given = {"unit": "1", "positive": "more thrust, in units of the weight"}
+    channel = {"unit": "1", "positive": "more thrust, in units of the weight"}
     D = None if model.D is None else np.hstack([model.D, np.zeros((len(model.D), 1))])
-    return model._replace(inputs=model.inputs | {"thrust": given}, B=np.hstack([model.B, column]), D=D)
+    return model._replace(inputs=model.inputs | {"thrust": channel}, B=np.hstack([model.B, column]), D=D)
 
 
 def _airframe(model: Model, name: str, speed: float, outputs: str | Sequence[str], source: str) -> Airframe:
@@ -455,7 +464,7 @@ def _airframe(model: Model, name: str, speed: float, outputs: str | Sequence[str
         "speed": speed,
         "states": model.states,
         "inputs": {
-            key: given | {"positive": given.get("positive") or _effect(model, key)} for key, given in model.inputs.items()
+            key: channel | {"positive": channel.get("positive") or _effect(model, key)} for key, channel in model.inputs.items()
         },
         "outputs": shown,
         "A": model.A.tolist(),
@@ -477,10 +486,10 @@ def _output(text: str, names: Sequence[str]) -> tuple[str, str, FloatArray | Non
         name, _, unit = (part.strip() for part in text.partition(":"))
         return name, unit, None
     row = np.zeros(len(names))
-    found = re.findall(r"([-+]?)\s*(\d*\.?\d*(?:[eE][-+]?\d+)?)\s*\*?\s*([A-Za-z_]\w*)", terms)
-    spelled = "".join(f"{sign}{factor}{state}" for sign, factor, state in found)
+    parts = re.findall(r"([-+]?)\s*(\d*\.?\d*(?:[eE][-+]?\d+)?)\s*\*?\s*([A-Za-z_]\w*)", terms)
+    spelled = "".join(f"{sign}{factor}{state}" for sign, factor, state in parts)
     require(spelled == re.sub(r"[\s*]", "", terms) != "", "outputs", repr(text), "a sum of states, as V = 0.987 u + 0.163 w")
-    for sign, factor, state in found:
+    for sign, factor, state in parts:
         require(state in names, "outputs", repr(text), f"states: {', '.join(names)}")
         row[names.index(state)] += (-1.0 if sign == "-" else 1.0) * float(factor or 1.0)
     return name, "", row

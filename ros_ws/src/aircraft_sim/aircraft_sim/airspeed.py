@@ -67,10 +67,16 @@ def exponents(airframe: Airframe, thrust: str) -> Exponents:
     kinds = [STATES[name] for name in airframe.states]
     n = len(kinds)
     axes = [WIND_STATE[axis] for axis in airframe.gusts]
-    A = np.array([[EXPONENTS[row][column] for column in kinds] for row in kinds])
-    B = np.array([[(OF_THRUST if name == thrust else OF_SURFACE)[row] for name in airframe.inputs] for row in kinds])
-    gravity = np.array([[EXPONENTS[row][ANGLE]] * n for row in kinds])
-    wind = np.array([[EXPONENTS[row][kind] - float(kind == INCIDENCE) for kind in axes] for row in kinds]).reshape(n, -1)
+    effects = [OF_THRUST if name == thrust else OF_SURFACE for name in airframe.inputs]
+    A = np.zeros((n, n))
+    B = np.zeros((n, len(effects)))
+    gravity = np.zeros((n, n))
+    wind = np.zeros((n, len(axes)))
+    for i, row in enumerate(kinds):
+        A[i] = [EXPONENTS[row][column] for column in kinds]
+        B[i] = [effect[row] for effect in effects]
+        gravity[i] = EXPONENTS[row][ANGLE]
+        wind[i] = [EXPONENTS[row][kind] - float(kind == INCIDENCE) for kind in axes]
     return Exponents(A, B, gravity, wind)
 
 
@@ -106,7 +112,8 @@ def level_flight(airframe: Airframe, ratio: float, thrust: str) -> tuple[FloatAr
     A = airframe.matrix_a()
     gravity = airframe.matrix_gravity()
     B = airframe.matrix_b()
-    faster, higher = (np.array([float(name in some) for name in names]) for some in (("V",), ("alpha", "theta")))
+    faster = np.array([float(name == "V") for name in names])
+    higher = np.array([float(name in ("alpha", "theta")) for name in names])
     x = np.zeros(len(names))
     u = np.zeros(B.shape[1])
     for k in range(TRIM_STEPS):

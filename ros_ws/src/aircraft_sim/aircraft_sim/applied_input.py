@@ -27,17 +27,17 @@ class AppliedInput:
     def take(self, u: FloatArray, now_ns: int, *, transfer: bool) -> None:
         """Take a received u. `transfer`: the publisher is new."""
         if transfer or self._scale(now_ns) < 1.0:
-            self._offset = self.at(now_ns) - u
+            self._offset = self.u_at(now_ns) - u
             self._transfer_ns = now_ns
         self._u = u
         self._u_ns = now_ns
 
-    def at(self, now_ns: int) -> FloatArray:
+    def u_at(self, now_ns: int) -> FloatArray:
         """The applied u at an instant."""
         scale = self._scale(now_ns)
-        rest = failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
+        fading = failsafe_scale(now_ns - self._transfer_ns, 0, self._ramp_ns)
         u = self._u if scale == 1.0 else scale * self._u
-        return u + rest * self._offset if rest > 0.0 and self._offset.any() else u
+        return u + fading * self._offset if fading > 0.0 and self._offset.any() else u
 
     def _scale(self, now_ns: int) -> float:
         return failsafe_scale(now_ns - self._u_ns, self._hold_ns, self._ramp_ns)

@@ -102,7 +102,8 @@ class Model(NamedTuple):
 
     def matrix_b(self) -> FloatArray:
         """B, SI."""
-        row, column = (np.array([quantity(unit).si for unit in units]) for units in (self.states.values(), self.inputs))
+        row = np.array([quantity(unit).si for unit in self.states.values()])
+        column = np.array([quantity(unit).si for unit in self.inputs])
         return np.asarray(self.file_B * row[:, None] / column)
 
     @property
@@ -116,7 +117,7 @@ class Finding(NamedTuple):
     """A contradiction: what the file has, what is expected, and a mend where the numbers tell."""
 
     key: str
-    found: str
+    actual: str
     expected: str
     mend: str = ""
 
@@ -126,11 +127,11 @@ def check(model: Model) -> None:
     findings = list(contradictions(model))
     if not findings:
         return
-    key, found, expected, mend = findings[0]
+    key, actual, expected, mend = findings[0]
     mend = next((text for text, changed in rearranged(model) if not any(contradictions(changed))), mend)
     way_out = f": {mend}" if mend else ""
     skip = "(identities: false in the file skips this check)"
-    raise ParameterError(f"airframe {model.name}: {key}: found {found}, expected {expected}{way_out} {skip}")
+    raise ParameterError(f"airframe {model.name}: {key}: found {actual}, expected {expected}{way_out} {skip}")
 
 
 def contradictions(model: Model) -> Iterator[Finding]:
@@ -170,7 +171,12 @@ def rearranged(model: Model) -> Iterator[tuple[str, Model]]:
 def _orders(count: int) -> Iterator[list[int]]:
     """Orders other than the first: any of a few items, with the fewest moves first; of more items the exchange of two."""
     first = list(range(count))
-    pairs = [[j if k == i else i if k == j else k for k in first] for i, j in combinations(first, 2)]
+    pairs = []
+    for i, j in combinations(first, 2):
+        pair = first.copy()
+        pair[i] = j
+        pair[j] = i
+        pairs.append(pair)
     longer = (list(order) for order in permutations(first)) if count <= MANY else ()
     yield from pairs
     yield from (order for order in longer if order != first and order not in pairs)
@@ -199,20 +205,20 @@ def _entries(model: Model) -> Iterator[Finding]:
         row = "altitude" if row == "h" and "altitude" in names else row  # noqa: PLW2901 - the two names of a height
         if row not in names or column not in names or (V0 == 0.0 and "V0" in symbol):
             continue
-        found = float(model.matrix_a()[names.index(row), names.index(column)])
+        entry = float(model.matrix_a()[names.index(row), names.index(column)])
         expected = sign * values[symbol]
-        left_out = found == 0.0 and (symbol.startswith("2 g") or (symbol == "V0" and not model.angular))  # a multirotor hovers
-        if least <= found / expected <= most or left_out:
+        left_out = entry == 0.0 and (symbol.startswith("2 g") or (symbol == "V0" and not model.angular))  # a multirotor hovers
+        if least <= entry / expected <= most or left_out:
             continue
         right[symbol] = False
         key = "A"
-        mend = _mend(found / expected)
-        if "V0" in symbol and right["g"] and found * sign > 0.0:
-            fits = f", and A fits {abs(found):.4g} m/s" if symbol == "V0" else ""
+        mend = _mend(entry / expected)
+        if "V0" in symbol and right["g"] and entry * sign > 0.0:
+            fits = f", and A fits {abs(entry):.4g} m/s" if symbol == "V0" else ""
             key = "speed"
             mend = f"speed is in m/s{fits}; {row} and {column} need the units of A"
         about = f"{'-' if sign < 0.0 else ''}{symbol} = {expected:.4g}" if symbol else f"{sign:.0f}"
-        yield Finding(key, f"{row}_dot = {found:.4g} {column} in SI", about, mend)
+        yield Finding(key, f"{row}_dot = {entry:.4g} {column} in SI", about, mend)
 
 
 def _mend(ratio: float) -> str:

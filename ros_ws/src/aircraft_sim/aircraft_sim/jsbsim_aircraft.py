@@ -145,10 +145,10 @@ def require_aircraft(airframe: str) -> str:
     if "/" in name or name.endswith(SUFFIX):
         return str(_model_file(Path(name).expanduser().absolute(), airframe))
     near = difflib.get_close_matches(name, aircraft_names(), n=1, cutoff=0.4)
-    own = f"{PREFIX}PATH with a /, the XML file or the folder of your own"
+    form = f"{PREFIX}PATH with a /, the XML file or the folder of your own"
     near = [f"./{name}"] if Path(name).is_dir() else near
     guess = f"{PREFIX}{near[0]} perhaps" if near else f"a name in {root() / 'aircraft'}"
-    require(name in aircraft_names(), "airframe", f"{airframe!r}", f"{guess}, or {own}")
+    require(name in aircraft_names(), "airframe", f"{airframe!r}", f"{guess}, or {form}")
     return name
 
 
@@ -164,9 +164,9 @@ def root_of(model: Path) -> Path:
 
     JSBSim looks for the files of a model beside the model first.
     """
-    own = model.parents[min(2, len(model.parents) - 1)]
-    of_tree = not os.environ.get(ROOT_VARIABLE) and model.parents[1].name == "aircraft" and (own / "engine").is_dir()
-    return own if of_tree else root()
+    folder = model.parents[min(2, len(model.parents) - 1)]
+    is_tree = not os.environ.get(ROOT_VARIABLE) and model.parents[1].name == "aircraft" and (folder / "engine").is_dir()
+    return folder if is_tree else root()
 
 
 def _model_file(path: Path, airframe: str) -> Path:
@@ -181,8 +181,8 @@ def _model_file(path: Path, airframe: str) -> Path:
     if named.is_file():
         return _model_file(named, airframe)
     models = sorted(file for file in path.glob(f"*{SUFFIX}") if _first_element(file) == MODEL_ELEMENT)
-    found = ", ".join(model.name for model in models) or "no model"
-    require(len(models) == 1, "airframe", f"{airframe!r}, a folder with {found}", f"a folder with one model, or {expected}")
+    names = ", ".join(model.name for model in models) or "no model"
+    require(len(models) == 1, "airframe", f"{airframe!r}, a folder with {names}", f"a folder with one model, or {expected}")
     return models[0]
 
 

@@ -10,6 +10,7 @@ FGLinearization.cpp (properties that write a file), sg_path.cxx (a backslash is 
 import io
 import zipfile
 from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import NamedTuple
@@ -97,9 +98,9 @@ def model_files(model: Path) -> ModelFiles:
         members[place.member] = content
         for element in tree.iter():
             if (name := element.get("file")) and (element.tag in ROOT_FOLDERS or element.tag in SECTIONS):
-                found = next(_places(model, element.tag, _relative(name, place.path)), None)
-                waiting += [] if found is None else [found]
-                missing |= {name: element.tag} if found is None else {}
+                source = next(_places(model, element.tag, _relative(name, place.path)), None)
+                waiting += [] if source is None else [source]
+                missing |= {name: element.tag} if source is None else {}
     if missing:
         raise ParameterError(_sentence(model, missing))
     return ModelFiles(first.member, dict(sorted(members.items())), left_out)
@@ -109,8 +110,8 @@ def _places(model: Path, element: str, name: str) -> Iterator[_Place]:
     """The files of a name in the folders of an element, in JSBSim's order. Raises ParameterError for a link to elsewhere."""
     root = root_of(model)
     folders = [(f"aircraft/{model.stem}/{folder}", model.parent, folder) for folder in FOLDERS.get(element, ("",))]
-    if (of_root := ROOT_FOLDERS.get(element)) is not None:
-        folders.append((of_root, root, of_root))
+    if (root_folder := ROOT_FOLDERS.get(element)) is not None:
+        folders.append((root_folder, root, root_folder))
     for member, base, folder in folders:
         path = base / folder / name
         if path.is_file():
@@ -130,10 +131,10 @@ def _relative(name: str, path: Path) -> str:
 def _sentence(model: Path, missing: Mapping[str, str]) -> str:
     """A sentence on missing files, by name with the element: the files of elements like the first."""
     element = next(iter(missing.values()))
-    names = sorted({name.removesuffix(SUFFIX) for name, of in missing.items() if FOLDERS.get(of) == FOLDERS.get(element)})
+    names = sorted({name.removesuffix(SUFFIX) for name, tag in missing.items() if FOLDERS.get(tag) == FOLDERS.get(element)})
     folders = [str(model.parent / FOLDERS.get(element, ("",))[0])]
-    if (of_root := ROOT_FOLDERS.get(element)) is not None:
-        folders.append(str(root_of(model) / of_root))
+    if (root_folder := ROOT_FOLDERS.get(element)) is not None:
+        folders.append(str(root_of(model) / root_folder))
     return f"no {SUFFIX} of {', '.join(names)} is in {' or '.join(folders)}"
 
 
@@ -177,6 +178,7 @@ def _start_tag(element: ElementTree.Element) -> str:
 
 def _require_no_writer(tree: ElementTree.Element, path: Path) -> None:
     """Raise ParameterError for a property whose value JSBSim answers with a file."""
-    text = "".join([*tree.itertext(), *(value for element in tree.iter() for value in element.attrib.values())])
+    attributes = chain.from_iterable(element.attrib.values() for element in tree.iter())
+    text = "".join([*tree.itertext(), *attributes])
     for name in WRITERS:
         require(name not in text, str(path), f"the property simulation/{name}, which writes a file", "a model without it")

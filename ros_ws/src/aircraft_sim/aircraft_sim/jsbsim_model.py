@@ -63,10 +63,12 @@ class JsbsimModel:
         self.condition = condition
         self._fdm, self.trim = jsbsim_trim.trimmed_fdm(condition, jsbsim_trim.trim_solution(condition))
         engines = jsbsim_trim.engine_count(self._fdm)
-        self._commands = [
-            [self._node(path) for path in jsbsim_trim.command_paths(command, engines)] for command in INPUTS.values()
-        ]
-        self._trim_commands = [[node.get_double_value() for node in nodes] for nodes in self._commands]
+        self._commands = []
+        self._trim_commands = []
+        for command in INPUTS.values():
+            nodes = [self._node(path) for path in jsbsim_trim.command_paths(command, engines)]
+            self._commands.append(nodes)
+            self._trim_commands.append([node.get_double_value() for node in nodes])
         self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
         self._state_nodes = [(self._node(quantity.property), quantity.si) for quantity in STATES.values()]
         self._heading, self._height, self._contact = (

@@ -7,6 +7,7 @@ import re
 import tempfile
 from collections.abc import Mapping
 from functools import cache
+from itertools import chain
 from pathlib import Path
 
 import jsbsim
@@ -195,8 +196,8 @@ def engine_count(fdm: jsbsim.FGFDMExec) -> int:
 
 def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
     """The properties that are 1 while a part of the structure, not a wheel, touches the ground."""
-    found = fdm.query_property_catalog("contact/unit")
-    lines = found.splitlines() if isinstance(found, str) else found
+    catalog = fdm.query_property_catalog("contact/unit")
+    lines = catalog.splitlines() if isinstance(catalog, str) else catalog
     return [line.split()[0] for line in lines if "/WOW" in line]
 
 
@@ -244,19 +245,19 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
         if _jsbsim_trim(fdm):
             return None
         nearest = np.inf
-        left = np.inf
+        residual = np.inf
         problem = ""
         for settling, spin_up, by_elevator in ATTEMPTS:
-            if spin_up == SLOW_SPIN_UP and left > NEAR:
+            if spin_up == SLOW_SPIN_UP and residual > NEAR:
                 continue
             solution = (*_solve_accelerations(fdm, settling, by_elevator), spin_up, by_elevator)
-            found, _ = trimmed_fdm(condition, solution)
-            if _is_trimmed(found):
+            attempt, _ = trimmed_fdm(condition, solution)
+            if _is_trimmed(attempt):
                 return solution
-            left = float(np.max(np.abs(_residuals(found)) / TOLERANCE))
-            if left < nearest or not problem:
-                nearest = left
-                problem = _trim_failure(found)
+            residual = float(np.max(np.abs(_residuals(attempt)) / TOLERANCE))
+            if residual < nearest or not problem:
+                nearest = residual
+                problem = _trim_failure(attempt)
             fdm = _load(condition)  # a solver far from a trim may have left it with numbers that are not finite
     except jsbsim.BaseError as error:
         problem = error_text(error)
@@ -312,12 +313,13 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
 
 def _properties(engines: int) -> list[str]:
     """Every property for reading or writing in flight."""
-    commands = [path for command in INPUTS.values() for path in command_paths(command, engines)]
+    commands = chain.from_iterable(command_paths(command, engines) for command in INPUTS.values())
     trims = [command.trim_property for command in INPUTS.values() if command.trim_property is not None]
     states = [quantity.property for quantity in STATES.values()]
     residuals = [f"accelerations/{name}" for name in RESIDUALS]
-    engine = [path(i) for path in (running_property, thrust_property) for i in range(engines)]
-    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *engine, *FROZEN]
+    running = map(running_property, range(engines))
+    thrusts = map(thrust_property, range(engines))
+    return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *thrusts, *FROZEN]
 
 
 def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
@@ -349,8 +351,8 @@ def _solve_accelerations(fdm: jsbsim.FGFDMExec, settling: float, by_elevator: fl
 
         low, high = (1.0 + (np.array(end) - START) / SCALE for end in (LOWEST, HIGHEST))
         steps = np.full(len(START), 1e-3)
-        found = least_squares(weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40)
-        return tuple(found.x.tolist())
+        fit = least_squares(weighted, np.ones(len(START)), bounds=(low, high), diff_step=steps, max_nfev=40)
+        return tuple(fit.x.tolist())
     # Differences over a thousandth of the scales: engines settle more accurately than that.
     scaled, *_ = fsolve(accelerations, np.ones(len(START)), epsfcn=1e-6, xtol=1e-6, maxfev=100, full_output=True)
     return tuple(scaled.tolist())
@@ -398,15 +400,16 @@ def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
         return f"engine {', '.join(stopped)} cannot be started"
     linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)
     _, lower, upper = _commands_and_limits(fdm)
-    beyond = [name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high]
-    at_stops = f", with {' and '.join(beyond)} beyond the stops" if beyond else ""
+    stopped_inputs = [name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high]
+    at_stops = f", with {' and '.join(stopped_inputs)} beyond the stops" if stopped_inputs else ""
     return f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
 
 
 def _commands_and_limits(fdm: jsbsim.FGFDMExec) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Whole commands, the trim's part included, and the distances to the lower and upper stops, shapes (4,)."""
     inputs = INPUTS.values()
-    own = np.array([fdm[command_paths(command, 1)[0]] for command in inputs])
+    commands = np.array([fdm[command_paths(command, 1)[0]] for command in inputs])
     trim = np.array([0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs])
-    lower, upper = (np.array([getattr(command, key) for command in inputs]) for key in ("lower", "upper"))
-    return own + trim, lower - np.minimum(own, own + trim), upper - np.maximum(own, own + trim)
+    lower = np.array([command.lower for command in inputs])
+    upper = np.array([command.upper for command in inputs])
+    return commands + trim, lower - np.minimum(commands, commands + trim), upper - np.maximum(commands, commands + trim)

@@ -74,7 +74,7 @@ class AircraftNode(FlightNode[AircraftConfig]):
 
     def tick(self, tick: Tick, now_ns: int) -> None:
         start_ns = now_ns - tick.number * self.period_ns()
-        for message in self._fly_to(tick.number, start_ns, self._applied.at(now_ns)):
+        for message in self._fly_to(tick.number, start_ns, self._applied.u_at(now_ns)):
             self._publish_y(message)
         self._publish_motion(tick.number, start_ns)
         self._take_u(now_ns)

@@ -4,6 +4,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -78,8 +79,8 @@ class TurbulenceConfig(Config):
             ("sigma", self.altitude > LOW, f"above {LOW:g} m"),
         ):
             value = getattr(self, key)
-            found, expected = ("none", "a value") if value is None else (f"{value:g} m/s", "none")
-            require((value is not None) == acts, key, found, f"{expected} at {self.altitude:g} m: it acts {where}")
+            actual, expected = ("none", "a value") if value is None else (f"{value:g} m/s", "none")
+            require((value is not None) == acts, key, actual, f"{expected} at {self.altitude:g} m: it acts {where}")
 
 
 class BiasConfig(Config):
@@ -275,7 +276,7 @@ class AircraftConfig(NodeConfig):
     @classmethod
     def tunable(cls) -> frozenset[str]:
         """Faults that begin and end in flight: of effectors, of sensors, gusts, and the start of a drift."""
-        gusts = {f"gusts.{axis}.{key}" for axis in AXES for key in Gust.model_fields}
+        gusts = {f"gusts.{axis}.{key}" for axis, key in product(AXES, Gust.model_fields)}
         effectors = {f"actuators.{key}" for key in (*EFFECTOR_FAULTS, *SEVERITIES)}
         sensors = {f"sensors.{key}" for key in ("bias", "noise", "dropout")} | {"vanes.frozen_at", "vanes.dropout"}
         return frozenset(gusts | effectors | sensors | {"drift.start"})
@@ -310,8 +311,8 @@ class AircraftConfig(NodeConfig):
             divide(period_ns(self.pose.rate, "pose.rate"), period, "rate", "1 / pose.rate")
         for name in ("actuators", "sensors", "pose"):
             delay = getattr(self, name).delay
-            whole = f"a whole multiple of 1 / rate ({seconds(period):g} s)"
-            require(nanoseconds(delay) % period == 0, f"{name}.delay", f"{delay:g} s", whole)
+            multiple = f"a whole multiple of 1 / rate ({seconds(period):g} s)"
+            require(nanoseconds(delay) % period == 0, f"{name}.delay", f"{delay:g} s", multiple)
 
     def _check_airframe(self) -> None:
         for key in ("speed", "altitude"):
@@ -386,8 +387,8 @@ class AircraftConfig(NodeConfig):
             positive = {name: command.positive for name, command in INPUTS.items()}
             return AircraftChannels({**OUTPUTS, **vanes}, dict.fromkeys(INPUTS, "1"), positive, self.flight_condition().speed)
         airframe = load_airframe(self.airframe)
-        inputs = {name: given.unit for name, given in airframe.inputs.items()}
-        positive = {name: given.positive for name, given in airframe.inputs.items()}
+        inputs = {name: channel.unit for name, channel in airframe.inputs.items()}
+        positive = {name: channel.positive for name, channel in airframe.inputs.items()}
         return AircraftChannels(airframe.units_of_outputs() | vanes, inputs, positive, airframe.speed)
 
     def sampled_airframe(self) -> Airframe:
@@ -470,7 +471,10 @@ class AircraftConfig(NodeConfig):
     def gust_arrays(self, axes: Sequence[str]) -> Gusts:
         """The gusts as arrays, along these axes."""
         gusts = [self.gusts.get(axis, STILL_AIR) for axis in axes]
-        start, speed, length, every = (np.array([getattr(gust, key) for gust in gusts]) for key in Gust.model_fields)
+        start = np.array([gust.start for gust in gusts])
+        speed = np.array([gust.speed for gust in gusts])
+        length = np.array([gust.length for gust in gusts])
+        every = np.array([gust.every for gust in gusts])
         return Gusts(start, speed, length, every if np.isfinite(every).any() else None)
 
     def _turbulence(self, speed: float, axes: Sequence[str]) -> Turbulence | None:
@@ -514,9 +518,9 @@ class AircraftConfig(NodeConfig):
         pose = self.pose
         if not (pose.delay or any(pose.bias.values()) or any(pose.drift.values()) or any(pose.noise.values())):
             return None
-        bias, drift, noise = (
-            np.array([values.get(name, 0.0) for name in POSE]) for values in (pose.bias, pose.drift, pose.noise)
-        )
+        bias = np.array([pose.bias.get(name, 0.0) for name in POSE])
+        drift = np.array([pose.drift.get(name, 0.0) for name in POSE])
+        noise = np.array([pose.noise.get(name, 0.0) for name in POSE])
         walk = drift * np.sqrt(self.pose_every() / self.rate) if drift.any() else None
         return Sensors(noise, nanoseconds(pose.delay), 0.0, pose.seed + 2**64, bias, walk)
 
@@ -548,4 +552,9 @@ def _array(values: Sequence[float], zero_is_none: bool) -> FloatArray | None:
 
 def _by_state(named: Mapping[str, Config], keys: Sequence[str], airframe: Airframe) -> list[FloatArray]:
     """An array per key, over the states, with 0 for an unnamed state."""
-    return [np.array([float(getattr(named.get(state), key, 0.0)) for state in airframe.states]) for key in keys]
+    sections = [named.get(state) for state in airframe.states]
+    arrays = []
+    for key in keys:
+        values = [float(getattr(section, key, 0.0)) for section in sections]
+        arrays.append(np.array(values))
+    return arrays

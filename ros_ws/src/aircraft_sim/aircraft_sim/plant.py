@@ -86,7 +86,8 @@ def _at_airspeed(x: Array, aircraft: Aircraft, over: OverAirspeed) -> Aircraft:
     A, B, gravity = (
         matrix * r**powers for matrix, powers in ((aircraft.A, over.A), (aircraft.B, over.B), (aircraft.gravity, over.gravity))
     )
-    x_r, u_r = (np.array([np.interp(r, over.ratio, column) for column in of.T]) for of in (over.x, over.u))
+    x_r = np.array([np.interp(r, over.ratio, column) for column in over.x.T])
+    u_r = np.array([np.interp(r, over.ratio, column) for column in over.u.T])
     trim = -(A @ x_r + gravity @ np.sin(x_r) + B @ u_r)
     wind = aircraft.gust_direction * r**over.wind
     return aircraft._replace(A=A, B=B, gravity=gravity, gust_direction=wind, trim=trim)

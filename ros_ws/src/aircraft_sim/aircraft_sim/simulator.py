@@ -250,9 +250,9 @@ class Simulator:
             true = np.concatenate([true, self._vane_state.angle])
         measured, self._error, self._drift = sensors.measure(number, true, self._drift, self._sensors)
         if self._vanes is not None and self._vane_state is not None:
-            of_y = len(measured) - len(self._vanes.places)
-            self._vane_state = vanes.read(number, measured[of_y:], self._vane_state, self._vanes)
-            measured = np.concatenate([measured[:of_y], self._vane_state.reading])
+            size_y = len(measured) - len(self._vanes.places)
+            self._vane_state = vanes.read(number, measured[size_y:], self._vane_state, self._vanes)
+            measured = np.concatenate([measured[:size_y], self._vane_state.reading])
         y = measured if sensors.arrives(number, self._sensors) else None
         self._delay_line, arrived = sensors.transmit(self._delay_line, t_ns, y, self._sensors)
         return arrived
@@ -288,5 +288,5 @@ class Simulator:
     def truth(self) -> FloatArray:
         """The true values at the instant of the last sample, in the order of `truth_names`."""
         t_ns = self._number * self.period_ns
-        of_pose = () if self._pose_sensors is None else (self._pose_error,)
-        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error, *of_pose])
+        pose_errors = () if self._pose_sensors is None else (self._pose_error,)
+        return np.concatenate([[seconds(t_ns)], self._model.truth(t_ns), self._error, *pose_errors])

@@ -17,7 +17,10 @@ def names(airframe: Airframe) -> tuple[str, ...]:
     gusts, 1-cosine gust plus turbulence, m/s), "actuator.input" (the position now).
     """
     groups = (("x", airframe.states), ("f", airframe.states), ("gust", airframe.gusts), ("actuator", airframe.inputs))
-    return tuple(f"{group}.{name}" for group, members in groups for name in members)
+    channels: list[str] = []
+    for group, members in groups:
+        channels += [f"{group}.{name}" for name in members]
+    return tuple(channels)
 
 
 def values(state: AircraftState, wind: FloatArray, rate: FloatArray, plant: PlantParams) -> FloatArray:

@@ -150,7 +150,7 @@ def _spread(h: float) -> FloatArray:
 
 def _axes(matrices: Sequence[FloatArray]) -> FloatArray:
     """Block diagonal of the 2 x 2 matrices of the three axes, (5, 5). Of the first matrix the first entry counts alone."""
-    whole = np.zeros((STATES, STATES))
-    whole[0, 0] = matrices[0][0, 0]
-    whole[1:3, 1:3], whole[3:, 3:] = matrices[1:]
-    return whole
+    block = np.zeros((STATES, STATES))
+    block[0, 0] = matrices[0][0, 0]
+    block[1:3, 1:3], block[3:, 3:] = matrices[1:]
+    return block

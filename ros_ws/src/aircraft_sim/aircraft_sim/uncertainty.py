@@ -51,8 +51,8 @@ def nominal_and_sampled(
 
 def sample_airframe(
     airframe: Airframe,
-    of_A: float,
-    of_B: float,
+    part_A: float,
+    part_B: float,
     seed: int,
     number: int = 0,
     wind: WindEffect = AIR_RELATIVE,
@@ -62,10 +62,10 @@ def sample_airframe(
 
     The effect of wind comes from `wind_factors`; the rest of f stays as published. Raises as `sampled_matrices`.
     """
-    A, B = sampled_matrices(airframe, of_A, of_B, seed, number, 1, spread)
+    A, B = sampled_matrices(airframe, part_A, part_B, seed, number, 1, spread)
     return (
         airframe
-        if of_A == of_B == 0.0 and not spread.entries
+        if part_A == part_B == 0.0 and not spread.entries
         else airframe.with_matrices(A[0], B[0], wind_factors(airframe, A, wind)[0])
     )
 
@@ -95,7 +95,7 @@ def gust_directions(airframe: Airframe, A: FloatArray, wind: WindEffect) -> Floa
 
 
 def sampled_matrices(
-    airframe: Airframe, of_A: float, of_B: float, seed: int, first: int, count: int, spread: Spread = UNIFORM
+    airframe: Airframe, part_A: float, part_B: float, seed: int, first: int, count: int, spread: Spread = UNIFORM
 ) -> tuple[FloatArray, FloatArray]:
     """A and B of the aircraft first, first + 1, ... of a seed, shapes (count, n, n) and (count, n, m), SI.
 
@@ -103,13 +103,13 @@ def sampled_matrices(
     aircraft depends on seed and number alone, not on `count`. Raises ParameterError for an uncertainty outside [0, 1), and for
     an unknown entry.
     """
-    parts = {"A": np.full(airframe.matrix_a().shape, of_A), "B": np.full(airframe.matrix_b().shape, of_B)}
+    parts = {"A": np.full(airframe.matrix_a().shape, part_A), "B": np.full(airframe.matrix_b().shape, part_B)}
     places = _drawn_places(airframe)
     for name, part in spread.entries.items():
         require(name in places, "uncertainty", f"entry {name}", f"an entry of the airframe: {', '.join(places)}")
         matrix, i, j = places[name]
         parts[matrix][i, j] = part
-    for part in (of_A, of_B, *spread.entries.values()):
+    for part in (part_A, part_B, *spread.entries.values()):
         require(0.0 <= part < 1.0, "uncertainty", part, "a part of each entry, 0 <= uncertainty < 1")
     A = airframe.matrix_a()
     B = airframe.matrix_b()
@@ -147,13 +147,13 @@ def drawn_entries(airframe: Airframe, A: FloatArray, B: FloatArray) -> dict[str,
 def _drawn_places(airframe: Airframe) -> dict[str, tuple[str, int, int]]:
     """The entries that `sampled_matrices` draws: matrix, row and column by name."""
     named = {"A": (airframe.matrix_a(), [*airframe.states]), "B": (airframe.matrix_b(), [*airframe.inputs])}
-    return {
-        f"{matrix}[{state},{column}]": (matrix, i, j)
-        for matrix, (published, columns) in named.items()
-        for i, state in enumerate(airframe.states)
-        for j, column in enumerate(columns)
-        if published[i, j] != 0.0 and state not in KINEMATIC
-    }
+    rows = [*airframe.states]
+    places = {}
+    for matrix, (published, columns) in named.items():
+        for i, j in np.argwhere(published).tolist():
+            if rows[i] not in KINEMATIC:
+                places[f"{matrix}[{rows[i]},{columns[j]}]"] = (matrix, i, j)
+    return places
 
 
 def with_entries(airframe: Airframe, deviations: Mapping[str, float], wind: WindEffect = AIR_RELATIVE) -> Airframe:
