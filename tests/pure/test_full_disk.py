@@ -149,7 +149,7 @@ def test_what_kept_for_end_survives_disk_that_fills_up(tmp_path: Path, monkeypat
     file.keep(b", memory")
     assert file.full
     file.keep(b", too")
-    assert file.kept() == b"reserve, memory, too"
+    assert file.kept_data() == b"reserve, memory, too"
     file.close()
 
 

@@ -83,9 +83,8 @@ def new(
         )
     frame = draft.airframe
     print(f"read:     {draft.note}")
-    print(
-        f"inputs:   {', '.join(f'{key} ({channel.unit}, positive: {channel.positive})' for key, channel in frame.inputs.items())}"
-    )
+    effects = (f"{key} ({channel.unit}, positive: {channel.positive})" for key, channel in frame.inputs.items())
+    print(f"inputs:   {', '.join(effects)}")
     print(f"outputs:  {', '.join(frame.outputs)}")
     print(f"airframe: {display_path(draft.airframe_file)}")
     print(f"scenario: {display_path(draft.scenario_file)}")

@@ -27,7 +27,7 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP
     for file in repaired.files:
         if file.damaged is not None:
             damaged = f"the damaged file is {printable(file.damaged.name)}"
-            print(f"{printable(file.path.name)} had {file.faults}: {file.kept} messages kept; {damaged}")
+            print(f"{printable(file.path.name)} had {file.faults}: {file.messages} messages kept; {damaged}")
     if repaired.wrote_metadata:
         print(f"{METADATA} written; {_missing_at_end(run, repaired.files[-1])}")
     elif not any(file.damaged for file in repaired.files) and not repaired.missing:

@@ -116,7 +116,7 @@ class _ChunkIndexes:
         yield self
 
     def write(self, stream: RecordBuilder) -> None:
-        stream.write(self._file.kept())
+        stream.write(self._file.kept_data())
 
 
 class BagWriter:
@@ -214,13 +214,14 @@ class BagWriter:
         write_file(self.directory / METADATA, metadata)
 
 
+def _is_mapping_of_strings(content: object) -> bool:
+    return isinstance(content, dict) and all(isinstance(text, str) for text in (*content.keys(), *content.values()))
+
+
 def read_metadata_records(path: Path) -> dict[str, dict[str, str]]:
     """Named sets of strings from a YAML file. Raises ParameterError for any further content."""
     expected = "a mapping of mappings of strings"
     content = read_yaml(path, str(path), expected)
-    valid = isinstance(content, dict) and all(
-        isinstance(values, dict) and all(isinstance(text, str) for item in values.items() for text in item)
-        for values in content.values()
-    )
+    valid = isinstance(content, dict) and all(map(_is_mapping_of_strings, content.values()))
     require(valid, str(path), "something else", expected)
     return {str(name): values for name, values in content.items()}

@@ -81,9 +81,9 @@ class StampClock:
         return jump_ns, jump_ns > LEAP_NS and has_time and offset_ns > self._offset_ns + LEAP_NS
 
     def _taken(self, stamp_ns: NDArray[np.int64], keep: NDArray[np.bool_], count: int) -> tuple[NDArray[np.bool_], int]:
-        taken = stamp_ns[:count]
+        counted_ns = stamp_ns[:count]
         self._found += count
-        self._repeated += int(np.count_nonzero(np.diff(taken) == 0))
+        self._repeated += int(np.count_nonzero(np.diff(counted_ns) == 0))
         if self._step_ns:
             self._left_out += int(np.count_nonzero(~keep))
         else:

@@ -89,7 +89,7 @@ class ReservedFile:
             self.release()
         self._kept += data
 
-    def kept(self) -> bytes:
+    def kept_data(self) -> bytes:
         """The kept data, once the reserve is free."""
         return bytes(self._kept)
 
@@ -101,11 +101,11 @@ class ReservedFile:
 
     def write(self, data: bytes | memoryview) -> int:
         """Write the data. Raises OSError when the reserve does not suffice, or for any further reason."""
-        rest = memoryview(data)
-        size = rest.nbytes
-        while rest:
+        unwritten = memoryview(data)
+        size = unwritten.nbytes
+        while unwritten:
             try:
-                written = os.write(self._descriptor, rest)
+                written = os.write(self._descriptor, unwritten)
             except OSError as error:
                 if error.errno not in NO_SPACE or self._reserve.closed:
                     raise
@@ -113,7 +113,7 @@ class ReservedFile:
                 self.release()
                 continue
             self._position += written
-            rest = rest[written:]
+            unwritten = unwritten[written:]
         return size
 
     def tell(self) -> int:

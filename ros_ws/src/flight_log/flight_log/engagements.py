@@ -24,16 +24,16 @@ class Engagement(NamedTuple):
 
 def engagements(reports: Iterable[tuple[int, bytes]]) -> list[Engagement] | None:
     """The engagements, in order, from the times of sending and the messages of the reports; None without a report."""
-    found: list[Engagement] | None = None
+    spans: list[Engagement] | None = None
     for sent_ns, data in reports:
         try:
             report: Any = typestore().deserialize_cdr(data, KEY_VALUE)
         except SerdeError:
             continue
-        found = found or []
-        is_open = bool(found) and found[-1].stop_ns is None
+        spans = spans or []
+        is_open = bool(spans) and spans[-1].stop_ns is None
         if report.key == ENGAGED and not is_open:
-            found.append(Engagement(sent_ns, None, ""))
+            spans.append(Engagement(sent_ns, None, ""))
         elif report.key != ENGAGED and is_open:
-            found[-1] = found[-1]._replace(stop_ns=sent_ns, reason=report.value)
-    return found
+            spans[-1] = spans[-1]._replace(stop_ns=sent_ns, reason=report.value)
+    return spans

@@ -26,9 +26,9 @@ class Span(NamedTuple):
     last_ns: int
     samples: int
 
-    def joined(self, other: "Span") -> "Span":
+    def joined(self, later: "Span") -> "Span":
         """The joint span."""
-        return Span(min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns), self.samples + other.samples)
+        return Span(min(self.first_ns, later.first_ns), max(self.last_ns, later.last_ns), self.samples + later.samples)
 
 
 def ready_times(lines: Iterable[bytes]) -> list[tuple[str, int]]:
@@ -51,7 +51,7 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
     sample. A node without samples, as the recorder, has no process id. Beside nodes of the stack every publisher counts, as
     `ros2 topic pub`, which gives no name.
     """
-    of_stack = any(INSTANCE.fullmatch(name) for name in spans)
+    has_stack = any(INSTANCE.fullmatch(name) for name in spans)
     waiting: dict[str, list[int]] = {}
     for node, time_ns in ready:
         if node.rpartition("/")[0] == namespace:
@@ -62,6 +62,6 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
             before = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns <= first_ns + NANOSECONDS]
             processes[name] = Process(before[-1] if before else None, first_ns, last_ns, samples)
             waiting[instance[1]] = [time_ns for time_ns in waiting.get(instance[1], []) if time_ns not in before]
-        elif of_stack:
+        elif has_stack:
             processes[name or UNNAMED] = Process(None, first_ns, last_ns, samples)
     return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}

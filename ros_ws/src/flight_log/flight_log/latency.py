@@ -32,8 +32,8 @@ def latency(sent: Mapping[str, Sequence[Times]]) -> Signal | None:
     if len(sent) != len(TOPICS) or len(topics) != len(TOPICS) or not all(sent.values()):
         return None
     y, u = (_last_of_each(sent[topics[name]]) for name in TOPICS)
-    stamps, of_y, of_u = np.intersect1d(y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True)
-    values = (u.sent_ns[of_u] - y.sent_ns[of_y]) / NANOSECONDS
+    stamps, place_y, place_u = np.intersect1d(y.stamp_ns, u.stamp_ns, assume_unique=True, return_indices=True)
+    values = (u.sent_ns[place_u] - y.sent_ns[place_y]) / NANOSECONDS
     return Signal(stamps, (CHANNEL,), values[:, None]) if values.any() else None
 
 

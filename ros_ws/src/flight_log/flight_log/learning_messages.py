@@ -24,7 +24,7 @@ def learning_message(stamp_ns: int, sentence: str, *, warns: bool) -> bytes:
     return bytes(store.serialize_cdr(types["DiagnosticArray"](header, [status]), DIAGNOSTIC_ARRAY))
 
 
-def told(message: Any) -> tuple[int, str]:
+def stamped_sentence(message: Any) -> tuple[int, str]:
     """Stamp, ns, and sentence of a message of LEARNING; "" for one without."""
     stamp = message.header.stamp
     return stamp.sec * NANOSECONDS + stamp.nanosec, " ".join(status.message for status in message.status)

@@ -89,8 +89,8 @@ def decoder(type_name: str) -> Decoder | None:
 def tables(messages: Iterable[bytes]) -> Iterator[Table]:
     """Messages in their order, successive messages of equal length in a table."""
     for size, group in groupby(messages, len):
-        alike = list(group)
-        yield np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
+        messages_of_size = list(group)
+        yield np.frombuffer(b"".join(messages_of_size), dtype=np.uint8).reshape(len(messages_of_size), size)
 
 
 def stamp_of(data: bytes) -> int:
@@ -174,12 +174,12 @@ class _JointStateDecoder:
         same = self._same_layout(table)
         samples = []
         if same.any():
-            alike = table if same.all() else table[same]
-            values = np.ascontiguousarray(alike[:, self._values]).view("<f8")
-            samples.append(Samples(self._names, stamps_of(alike), values, self._sender))
+            known = table if same.all() else table[same]
+            values = np.ascontiguousarray(known[:, self._values]).view("<f8")
+            samples.append(Samples(self._names, stamps_of(known), values, self._sender))
         unreadable = 0
-        rest = [bytes(message) for message in table[~same]]
-        for message in rest:
+        unknown = [bytes(message) for message in table[~same]]
+        for message in unknown:
             try:
                 vector: Any = self._store.deserialize_cdr(message, JOINT_STATE)
             except SerdeError:
@@ -190,8 +190,8 @@ class _JointStateDecoder:
             stamp = vector.header.stamp
             stamps = np.array([stamp.sec * NANOSECONDS + stamp.nanosec])
             samples.append(Samples(tuple(vector.name), stamps, vector.position[None], vector.header.frame_id))
-        if rest:
-            self._learn(rest[-1])
+        if unknown:
+            self._learn(unknown[-1])
         return Decoded(samples, unreadable)
 
     def _same_layout(self, table: Table) -> NDArray[np.bool_]:

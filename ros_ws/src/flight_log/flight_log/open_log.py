@@ -58,8 +58,8 @@ def _what_is_there(run: Path, files: Sequence[Path], kinds: Sequence[str]) -> st
     content = sorted(run.iterdir())
     runs = [folder.name for folder in content if is_folder(folder) and folder.name != ROSBAG2 and _is_bag(folder)]
     others = [f"{path.name}, {file_kind(path)}" for path in content if is_file(path) and path.name != METADATA]
-    there = f"the folders of runs {_some(runs)}" if runs else _some(others or [path.name for path in content])
-    return f"no .mcap file, but {there}" if there else "no .mcap file"
+    content_text = f"the folders of runs {_some(runs)}" if runs else _some(others or [path.name for path in content])
+    return f"no .mcap file, but {content_text}" if content_text else "no .mcap file"
 
 
 def _is_bag(folder: Path) -> bool:
@@ -71,8 +71,8 @@ def _is_bag(folder: Path) -> bool:
 
 def _some(names: Sequence[str]) -> str:
     """The first names, and the number of the rest."""
-    rest = len(names) - NAMED
-    return "; ".join(names[:NAMED]) + (f"; and {rest} more" if rest > 0 else "")
+    unnamed = len(names) - NAMED
+    return "; ".join(names[:NAMED]) + (f"; and {unnamed} more" if unnamed > 0 else "")
 
 
 def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list[str]:
@@ -82,7 +82,7 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
     """
     paths = information.get("relative_file_paths")
     named = [Path(str(path)).name for path in paths] if isinstance(paths, list) else []
-    there = {plain_name(file.name) for file in files}
+    present = {plain_name(file.name) for file in files}
     numbers = {number for file in files if (number := part_number(file.name)) is not None}
     if not named and len(numbers) == len(files) > 1 and max(numbers) < 2 * len(files) + 100:
         stem = re.sub(r"\d+$", "", Path(plain_name(files[0].name)).stem)
@@ -90,8 +90,8 @@ def missing_parts(files: Sequence[Path], information: Mapping[str, Any]) -> list
         named = [f"{stem}{number}{suffix}" for number in range(max(numbers) + 1)]
     if len(files) >= len(named):
         return []
-    if any(plain_name(name) in there for name in named):
-        return [name for name in named if plain_name(name) not in there]
+    if any(plain_name(name) in present for name in named):
+        return [name for name in named if plain_name(name) not in present]
     return [name for name in named if part_number(name) not in numbers]
 
 
@@ -107,9 +107,9 @@ def open_scan(file: Path) -> Iterator["Scan | SqliteScan"]:
         return
     with TemporaryDirectory(prefix="rise-di-") as folder:
         plain = Path(folder) / plain_name(file.name)
-        whole = _unpack(file, plain, kind)
+        is_complete = _unpack(file, plain, kind)
         scan = SqliteScan(plain, file) if file_kind(plain) == SQLITE else Scan(plain)
-        require(whole or isinstance(scan, Scan), str(file), "a packed file that is truncated", "a whole file")
+        require(is_complete or isinstance(scan, Scan), str(file), "a packed file that is truncated", "a whole file")
         yield scan
 
 
@@ -179,9 +179,9 @@ def plain_batches(batch: MessageBatch) -> Iterator[MessageBatch]:
     rows = [plain_message(row.tobytes()) for row in batch.data]
     begin = 0
     for size, group in groupby(rows, len):
-        alike = list(group)
-        end = begin + len(alike)
-        table = np.frombuffer(b"".join(alike), dtype=np.uint8).reshape(len(alike), size)
+        group_rows = list(group)
+        end = begin + len(group_rows)
+        table = np.frombuffer(b"".join(group_rows), dtype=np.uint8).reshape(len(group_rows), size)
         times = batch.log_ns[begin:end], batch.publish_ns[begin:end]
         yield MessageBatch(batch.channel_id, table, *times, batch.sequence[begin:end])
         begin = end
@@ -219,10 +219,12 @@ class SqliteScan:
                     yield row
             for channel, messages in by_channel.items():
                 for size, group in groupby(messages, lambda message: len(message[1])):
-                    alike = list(group)
-                    table = np.frombuffer(b"".join(data for _, data in alike), dtype=np.uint8).reshape(len(alike), size)
-                    log_ns = np.array([time_ns for time_ns, _ in alike], dtype=np.int64)
-                    unknown = np.zeros(len(alike), dtype=np.int64)
+                    group_rows = list(group)
+                    table = np.frombuffer(b"".join(data for _, data in group_rows), dtype=np.uint8).reshape(
+                        len(group_rows), size
+                    )
+                    log_ns = np.array([time_ns for time_ns, _ in group_rows], dtype=np.int64)
+                    unknown = np.zeros(len(group_rows), dtype=np.int64)
                     yield MessageBatch(channel, table, log_ns, unknown, unknown)
 
     def _rows(self) -> Iterator[Schema | Channel | tuple[int, int, bytes]]:

@@ -64,7 +64,9 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
         inside = names_within(chosen_namespace(all_topics, namespace, str(run)), all_topics).keys() | {*SHARED}
         stored = [message for message in stored if message.topic in inside]
     known = {message.topic: message for message in stored}
-    wanted = {full for name in topics for full in _matching(name, known, str(run))} if topics else set(known) - set(SHARED)
+    wanted = set[str]() if topics else set(known) - set(SHARED)
+    for name in topics:
+        wanted.update(_matching(name, known, str(run)))
     require(bool(wanted), str(run), f"no message{f' to play among {listed(skipped)}' if skipped else ''}", A_FLIGHT)
     begins_stamped = {topic: begins_with_stamp(_definition(message)) for topic, message in known.items()}
     votes = [_is_flight_time(message) for message in stored if message.type_name == JOINT_STATE and stamp_of(message.data)]
@@ -84,8 +86,8 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
     require(begin_ns <= messages[-1].due_ns, "start", f"{start:g} s", f"a flight time before the end of the log, {end:g} s")
-    kept = messages if start <= 0.0 else [message for message in messages if message.due_ns >= begin_ns]
-    return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, kept, start_ns, skipped)
+    played = messages if start <= 0.0 else [message for message in messages if message.due_ns >= begin_ns]
+    return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, played, start_ns, skipped)
 
 
 def _unsendable(message: StoredMessage) -> str:

@@ -36,7 +36,7 @@ class FileRepair(NamedTuple):
     """The result for a file."""
 
     path: Path
-    kept: int  # messages in it now
+    messages: int  # messages in it now
     last_ns: int  # log time of the last message
     known_end_ns: int  # the latest log time in any index or metadata, else 0
     faults: str  # empty for an intact file

@@ -4,6 +4,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,7 +82,8 @@ def bag_files(run: Path) -> list[Path]:
 
 def _several(files: Sequence[Path]) -> str:
     """Files of several bags, for a sentence."""
-    suffixes = " and ".join(suffix for suffix in SUFFIXES if any(suffix in file.suffixes for file in files))
+    present = {*chain.from_iterable(file.suffixes for file in files)}
+    suffixes = " and ".join(suffix for suffix in SUFFIXES if suffix in present)
     return f"{len(files)} {suffixes} files that are not parts of one bag"
 
 
@@ -110,7 +112,7 @@ def bag_metadata_yaml(
     `missing` files of the previous content stay in the lists of files.
     """
     counts: dict[str, TopicCount] = {}
-    for count in (count for file in files for count in file.counts):
+    for count in chain.from_iterable(file.counts for file in files):
         messages = count.messages + (counts[count.topic].messages if count.topic in counts else 0)
         counts[count.topic] = count._replace(messages=messages)
     topics = [
@@ -126,19 +128,19 @@ def bag_metadata_yaml(
         }
         for count in counts.values()
     ]
-    kept = previous or {}
+    previous_content = previous or {}
     described = {file.file: {"path": file.file, **_extent([file])} for file in files}
     information = {
         "version": ROSBAG2_VERSION,
         "storage_identifier": "mcap",
         **_extent(files),
         "topics_with_message_count": topics,
-        "compression_format": kept.get("compression_format", ""),
-        "compression_mode": kept.get("compression_mode", ""),
+        "compression_format": previous_content.get("compression_format", ""),
+        "compression_mode": previous_content.get("compression_mode", ""),
         "relative_file_paths": sorted([*described, *missing], key=_order),
-        "files": sorted([*described.values(), *_entries(kept, missing)], key=lambda entry: _order(entry["path"])),
-        "custom_data": kept.get("custom_data"),
-        "ros_distro": kept.get("ros_distro", "jazzy"),
+        "files": sorted([*described.values(), *_entries(previous_content, missing)], key=lambda entry: _order(entry["path"])),
+        "custom_data": previous_content.get("custom_data"),
+        "ros_distro": previous_content.get("ros_distro", "jazzy"),
     }
     return dump_yaml({INFORMATION: information}, flow=False)
 

@@ -139,7 +139,7 @@ class Scan:
         Schemas and channels of the index come first, so a damaged chunk loses none. Raises OSError for a file that cannot be
         read, and nothing for damaged content.
         """
-        return self._read(lambda parts: (record for part in parts for record in decode(part.opcode, part.content)), 0, map)
+        return self._read(decode_parts, 0, map)
 
     def batches(self) -> Iterator[McapRecord | MessageBatch]:
         """As `records`, many times faster: the messages of a channel in some chunks come together."""
@@ -185,12 +185,11 @@ class Scan:
         ends = [record.message_end_time for record in index if isinstance(record, Statistics | ChunkIndex)]
         self.known_end_ns = max(ends, default=0)
         most = size // INDEX_ENTRY.itemsize  # the message indexes alone take that much
-        self.message_counts = {
-            channel: min(count, most)
-            for record in index
-            if isinstance(record, Statistics)
-            for channel, count in record.channel_message_counts.items()
-        }
+        self.message_counts = {}
+        for record in index:
+            if isinstance(record, Statistics):
+                counts = record.channel_message_counts.items()
+                self.message_counts |= {channel: min(count, most) for channel, count in counts}
         return index
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
@@ -268,8 +267,13 @@ def _decoded(decode: Callable[[Sequence[Part]], Iterator[R]], parts: Sequence[Pa
     except DECODE_ERRORS:
         if len(parts) == 1:
             return [], 1
-    alone = [_decoded(decode, [part]) for part in parts]
-    return [record for records, _ in alone for record in records], sum(damaged for _, damaged in alone)
+    records = []
+    damaged = 0
+    for part in parts:
+        part_records, part_damaged = _decoded(decode, [part])
+        records += part_records
+        damaged += part_damaged
+    return records, damaged
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
@@ -337,7 +341,7 @@ def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterato
 
     A chunk has the places of the messages in their order, by the message indexes.
     """
-    found: list[NDArray[np.int64]] = []
+    joined_places: list[NDArray[np.int64]] = []
     size = 0
     for data, indexed in chunks:
         try:
@@ -345,9 +349,9 @@ def _split_batches(chunks: Sequence[tuple[bytes, NDArray[np.int64]]]) -> Iterato
         except DECODE_ERRORS:  # an index may be wrong, or of another chunk
             others, places = _walk(data, NO_PLACES)
         yield from others
-        found.append(places + size)
+        joined_places.append(places + size)
         size += len(data)
-    data, places = b"".join(data for data, _ in chunks), np.concatenate(found)
+    data, places = b"".join(data for data, _ in chunks), np.concatenate(joined_places)
     places = places[np.argsort(_heads(data)["channel"][places], kind="stable")]
     heads = _heads(data)[places]
     sizes = heads["length"] - MESSAGE.size
@@ -381,7 +385,7 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
     starts = np.append(places, len(data))
     ends = np.append(0, places + RECORD.size + lengths)
     others: list[McapRecord] = []
-    found: list[int] = []
+    further: list[int] = []
     for gap in np.flatnonzero(starts != ends):
         position = int(ends[gap])
         stop = int(starts[gap])
@@ -391,11 +395,11 @@ def _walk(data: bytes, places: NDArray[np.int64]) -> tuple[list[McapRecord], NDA
             if begin + length > stop:
                 raise McapError("a record longer than its container")
             if opcode == Opcode.MESSAGE and length >= MESSAGE.size:
-                found.append(position)
+                further.append(position)
             else:
                 others += _decode_inner(opcode, data[begin : begin + length])
             position = begin + length
-    return others, np.sort(np.append(places, found)) if found else places
+    return others, np.sort(np.append(places, further)) if further else places
 
 
 def _decode_inner(opcode: int, content: bytes) -> Iterator[McapRecord]:
@@ -403,6 +407,12 @@ def _decode_inner(opcode: int, content: bytes) -> Iterator[McapRecord]:
     if opcode == Opcode.CHUNK:
         raise McapError("a chunk inside a chunk")
     return decode(opcode, content)
+
+
+def decode_parts(parts: Iterable[Part]) -> Iterator[McapRecord]:
+    """The records of parts of a file, in order. Raises DECODE_ERRORS."""
+    for part in parts:
+        yield from decode(part.opcode, part.content)
 
 
 def decode(opcode: int, content: bytes) -> Iterator[McapRecord]:

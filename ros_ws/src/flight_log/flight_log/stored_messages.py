@@ -102,15 +102,16 @@ def parameter_event(stamp_ns: int, node: str, changes: Mapping[str, Any]) -> byt
     def parameter(name: str, value: Any) -> Any:
         array = isinstance(value, (list, tuple))
         kind = 0 if value is None else 1 + texts.index(type(value[0] if array else value)) + 5 * array
-        of_kind: dict[int, Any] = {1: False, 2: 0, 3: 0.0, 4: "", 5: empty.astype(np.uint8), 6: empty.astype(bool)}
-        of_kind |= {7: empty.astype(np.int64), 8: empty, 9: []}
+        by_kind: dict[int, Any] = {1: False, 2: 0, 3: 0.0, 4: "", 5: empty.astype(np.uint8), 6: empty.astype(bool)}
+        by_kind |= {7: empty.astype(np.int64), 8: empty, 9: []}
         if kind:
-            of_kind[kind] = np.array(value, dtype=of_kind[kind].dtype) if 6 <= kind < 9 else value
-        return types["Parameter"](name, types["ParameterValue"](kind, *of_kind.values()))
+            by_kind[kind] = np.array(value, dtype=by_kind[kind].dtype) if 6 <= kind < 9 else value
+        return types["Parameter"](name, types["ParameterValue"](kind, *by_kind.values()))
 
-    kept, deleted = ([parameter(*item) for item in changes.items() if (item[1] is None) == gone] for gone in (False, True))
+    changed = [parameter(name, value) for name, value in changes.items() if value is not None]
+    deleted = [parameter(name, None) for name, value in changes.items() if value is None]
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
-    event = types["ParameterEvent"](stamp, node, [], kept, deleted)
+    event = types["ParameterEvent"](stamp, node, [], changed, deleted)
     return bytes(store.serialize_cdr(event, PARAMETER_EVENT))
 
 

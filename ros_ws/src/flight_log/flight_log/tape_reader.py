@@ -94,8 +94,8 @@ class RecordedRun(NamedTuple):
         if missing or (not names and not {*AIRCRAFT_TOPICS} & {*self.tape.signals}):
             where = "the log" if self.path is None else str(self.path)
             has = listed(self.topics)
-            found = f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
-            raise ParameterError(f"{where}: found {found}, expected {A_FLIGHT}")
+            lack = f"no sample of {', '.join(missing) or 'a flight'}{f' among {has}' if has else ''}"
+            raise ParameterError(f"{where}: found {lack}, expected {A_FLIGHT}")
 
     def scenario_file(self) -> StoredFile:
         """The scenario in the log. Raises ParameterError for a log without one."""
@@ -111,8 +111,8 @@ class RecordedRun(NamedTuple):
 def listed(topics: Mapping[str, str]) -> str:
     """Topics with the types, for a sentence; empty without topics."""
     names = [f"{topic} ({type_name or 'no type'})" for topic, type_name in sorted(topics.items())]
-    rest = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {rest} more topics" if rest > 0 else "")
+    unnamed = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {unnamed} more topics" if unnamed > 0 else "")
 
 
 def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | None = None) -> RecordedRun:
@@ -124,7 +124,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     namespace each, of which `namespace` names none, and for a scenario file that cannot be read.
     """
     run = as_path(run, "run", A_RUN)
-    given = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
+    replacement = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
     log = _read(run)
     filled = {
         topic: signal
@@ -132,22 +132,22 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
         if (signal := samples.signal(topic.rpartition("/")[2])) is not None
     }
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
-    unset = {topic: of.unset for topic, samples in log.topics.items() if (of := samples.recording()).unset}
-    without = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
-    without += filter(None, (samples.note(topic) for topic, samples in log.topics.items()))
-    require(bool(filled), str(run), "; ".join([nothing, *without, *log.notes_at(None)]), A_FLIGHT)
+    unset = {topic: clock.unset for topic, samples in log.topics.items() if (clock := samples.recording()).unset}
+    lacks = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
+    lacks += filter(None, (samples.note(topic) for topic, samples in log.topics.items()))
+    require(bool(filled), str(run), "; ".join([nothing, *lacks, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
     signals = {printable(name): filled[topic] for topic, name in names.items()}
     start_ns = _start_ns(signals)
     stamped = names_within(aircraft, log.topics).items()
-    recording = {printable(name): of for topic, name in stamped if (of := log.topics[topic].recording()).found}
+    recording = {printable(name): clock for topic, name in stamped if (clock := log.topics[topic].recording()).found}
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    told = [log.topics[topic].note(name) for topic, name in stamped]
-    told += [recording_note(name, of, start_ns) for name, of in recording.items()]
-    told += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
-    notes = [*log.notes_at(end), *filter(None, told)]
+    sentences = [log.topics[topic].note(name) for topic, name in stamped]
+    sentences += [recording_note(name, clock, start_ns) for name, clock in recording.items()]
+    sentences += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
+    notes = [*log.notes_at(end), *filter(None, sentences)]
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
     spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
     processes = flight_processes(spans, ready_times(log.lines), aircraft)
@@ -157,7 +157,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    stored = given or log.scenario
+    stored = replacement or log.scenario
     ages = age_of_u(log.diagnostics, aircraft)
     return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
 
@@ -165,8 +165,8 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
 def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
     """The span of each publisher over its topics, which are names with spans; of other programs on those of aircraft alone."""
     spans: dict[str, Span] = {}
-    for name, of_topic in topics:
-        for sender, span in of_topic.items():
+    for name, senders in topics:
+        for sender, span in senders.items():
             if name in AIRCRAFT_TOPICS or INSTANCE.fullmatch(sender):
                 spans[sender] = span.joined(spans[sender]) if sender in spans else span
     return spans
@@ -230,9 +230,9 @@ class _TopicSamples:
         self._numbered = self._numbered or bool(sequence.any())
         self._number = int(sequence[-1])
         self._restarted = self._restarted or bool(np.any(steps < 0))  # another publisher, or a restarted one
-        alike = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
-        if self._batched >= BATCH or not alike:
-            self._decode_batch(more=alike)
+        fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
+        if self._batched >= BATCH or not fits:
+            self._decode_batch(more=fits)
         self._batch.append((table, log_ns))
         self._batched += len(table)
 

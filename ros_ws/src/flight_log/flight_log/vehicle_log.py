@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -83,7 +84,7 @@ class Format(NamedTuple):
 
 
 def _sources(**places: tuple[Source, ...] | Source) -> Sources:
-    return MappingProxyType({name: (at,) if isinstance(at, Source) else at for name, at in places.items()})
+    return MappingProxyType({name: (source,) if isinstance(source, Source) else source for name, source in places.items()})
 
 
 def _estimator(field: str, scale: float = 1.0) -> tuple[Source, ...]:
@@ -196,7 +197,7 @@ class VehicleLog(NamedTuple):
     def source(self, quantity: str) -> Source | None:
         """The place in this log that has a quantity of y or of the pose; None where it has none."""
         sources = ULOG_SOURCES if self.format is None else self.format.sources
-        return next((at for at in sources.get(quantity, ()) if self.has(at)), None)
+        return next((source for source in sources.get(quantity, ()) if self.has(source)), None)
 
     def start_ns(self, quantity: str) -> int:
         """The first stamp of a quantity that the log has."""
@@ -205,14 +206,16 @@ class VehicleLog(NamedTuple):
 
     def parameters_at(self, stamp_ns: int) -> dict[str, float]:
         """The values of the parameters at an instant, without parameters whose first record comes later."""
-        known = {
-            name: [record for record in records if record.stamp_ns <= stamp_ns] for name, records in self.parameters.items()
-        }
-        return {name: records[-1].value for name, records in known.items() if records}
+        values: dict[str, float] = {}
+        for name, records in self.parameters.items():
+            known = [record.value for record in records if record.stamp_ns <= stamp_ns]
+            if known:
+                values[name] = known[-1]
+        return values
 
-    def has(self, at: Source) -> bool:
+    def has(self, source: Source) -> bool:
         """Whether the log has samples of a field."""
-        return at.message in self.tables and at.field in self.tables[at.message].fields
+        return source.message in self.tables and source.field in self.tables[source.message].fields
 
     def at(self, source: Source, stamp_ns: NDArray[np.int64]) -> FloatArray:
         """The newest value of a place at each of some instants, shape (n,); NaN before the first."""
@@ -247,7 +250,7 @@ def _silent() -> Iterator[None]:
     """Discard what pymavlink and pyulog print of a damaged file, a line for each byte without a message, from C too."""
     with redirect_stdout(StringIO()) as text, redirect_stderr(text), Path(os.devnull).open("wb") as null:
         try:
-            kept = os.dup(2)
+            stderr = os.dup(2)
         except OSError:  # it is closed
             yield
             return
@@ -255,8 +258,8 @@ def _silent() -> Iterator[None]:
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr, 2)
+            os.close(stderr)
 
 
 def _read_dataflash(path: Path, kind: str) -> VehicleLog:
@@ -372,14 +375,15 @@ def _read_ulog(path: Path, kind: str) -> VehicleLog:
     return VehicleLog(kind, tables, _parameters(records), None)
 
 
-def _wanted(of: Format) -> dict[str, set[str]]:
+def _wanted(log_format: Format) -> dict[str, set[str]]:
     """The fields that are read, by message."""
-    places = [at for sources in (of.sources, of.torques) for ats in sources.values() for at in ats] + list(of.mode)
-    for at, count in ((of.sticks, STICKS), (of.servos, SERVOS)):
-        places += [Source(at.message, at.field.format(number)) for number in range(1, count + 1)]
+    sources = (*log_format.sources.values(), *log_format.torques.values(), log_format.mode)
+    places = [*chain.from_iterable(sources)]
+    for source, count in ((log_format.sticks, STICKS), (log_format.servos, SERVOS)):
+        places += [Source(source.message, source.field.format(number)) for number in range(1, count + 1)]
     wanted: dict[str, set[str]] = {}
-    for at in places:
-        wanted.setdefault(at.message, set()).add(at.field)
+    for source in places:
+        wanted.setdefault(source.message, set()).add(source.field)
     return wanted
 
 
@@ -441,10 +445,11 @@ def _columns(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> dict[
         stamps.setdefault(name, []).append(stamp_ns)
         for field, values in columns[name].items():
             values.append(float(getattr(message, field)))
-    return {
-        name: _table(np.array(stamps[name], dtype=np.int64), {field: np.array(values) for field, values in fields.items()})
-        for name, fields in columns.items()
-    }
+    tables = {}
+    for name, lists in columns.items():
+        fields = {field: np.array(values) for field, values in lists.items()}
+        tables[name] = _table(np.array(stamps[name], dtype=np.int64), fields)
+    return tables
 
 
 def _is_number(value: object) -> bool:

@@ -35,7 +35,7 @@ from flight_log.bag import CHANNEL_UNITS, LOST_MESSAGES, SCENARIO_MEDIA_TYPE
 from flight_log.disk import is_locked
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE
 from flight_log.follow import Follower, Messages
-from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, told
+from flight_log.learning_messages import DIAGNOSTIC_ARRAY, LEARNING, stamped_sentence
 from flight_log.named_vectors import JOINT_STATE, Decoder, Samples, decoder, flight_start_ns, tables, typestore
 from flight_log.stored_messages import PARAMETER_EVENT, PARAMETER_EVENTS, parameter_value
 from flight_log.tape_reader import StoredFile, listed, read_run
@@ -450,7 +450,7 @@ class Flight:
                 if text and self._shows(namespace):
                     self._add_event(PageEvent(sent_ns, "parameter", f"{node}: {text}"))
             elif messages.type_name == DIAGNOSTIC_ARRAY:
-                stamp_ns, sentence = told(message)
+                stamp_ns, sentence = stamped_sentence(message)
                 self._add_event(PageEvent(stamp_ns, LEARNING, sentence))
             elif messages.type_name == ROUTE_TYPE:
                 if message.header.frame_id not in ROUTE_FRAMES:
