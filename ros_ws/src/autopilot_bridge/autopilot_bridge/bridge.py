@@ -84,7 +84,8 @@ class Bridge:
         self._end_ns: int | None = None  # of the engagement by `max_engaged`
         self._watches_transmitter = any(row.transmitter for row in channel_map.conditions.values())
         rows = channel_map.inputs.values()
-        self._lower, self._upper = (np.array([getattr(row, key) for row in rows]) for key in ("lower", "upper"))
+        self._lower = np.array([row.lower for row in rows])
+        self._upper = np.array([row.upper for row in rows])
         self._max_age_ns = nanoseconds(channel_map.silence.max_age)
         self._max_y_age_ns = nanoseconds(max(row.max_age for row in channel_map.outputs.values()))
 
@@ -221,7 +222,8 @@ class Bridge:
         if self._watches_transmitter and not self._blind:
             return ""
         rows = self.channel_map.overrides.items()
-        dead, working = (", ".join(name for name, row in rows if row.transmitter is by) for by in (True, False))
+        dead = ", ".join(name for name, row in rows if row.transmitter)
+        working = ", ".join(name for name, row in rows if not row.transmitter)
         conditions = ", ".join(name for name, row in self.channel_map.conditions.items() if not row.transmitter)
         releases = (
             f"the override by {working}" if working else "",
@@ -230,8 +232,8 @@ class Bridge:
             f"max_engaged after {self.channel_map.max_engaged:g} s" if self._end_ns else "",
         )
         where = "is not watched (--blind)" if self._watches_transmitter else "cannot be seen over this link"
-        without = f", and the override by {dead} has no effect then" if dead else ""
-        return f"the loss of the transmitter {where}{without}; released by {', '.join(filter(None, releases))}"
+        blind_override = f", and the override by {dead} has no effect then" if dead else ""
+        return f"the loss of the transmitter {where}{blind_override}; released by {', '.join(filter(None, releases))}"
 
     def _lacks(self, now_ns: int) -> str:
         """What an engagement lacks, as a sentence."""
@@ -469,8 +471,8 @@ class Bridge:
             return phase is Phase.RELEASE and not self._unmet(now_ns, awaited=True)
         if when == "failsafe":
             return phase is Phase.RELEASE and not (self._keeps_mode or self._is_contradicted())
-        own = [row.release for row in self.channel_map.inputs.values() if row.message == name]
-        return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in own)
+        releases = [row.release for row in self.channel_map.inputs.values() if row.message == name]
+        return phase in {Phase.ENGAGED, Phase.NEUTRAL} or (phase is Phase.RELEASE and None not in releases)
 
     def _is_contradicted(self) -> bool:
         """Whether a condition does not hold by its last value: the pilot or the autopilot chose another mode, or has landed.

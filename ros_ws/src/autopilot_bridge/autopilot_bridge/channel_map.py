@@ -142,14 +142,14 @@ COMPONENTS: Mapping[str, str] = MappingProxyType(
 """The members that the field of a function has; none for a number."""
 
 
-def _turned(message: Any, path: str, by: str) -> float:
+def _turned(message: Any, path: str, attitude: str) -> float:
     """Component of R(q) v: the vector v of the path VECTOR.x, .y or .z, turned from the body to the world.
 
-    `by`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q = (w, r).
+    `attitude`: the path of the quaternion q. R(q) v = v + 2 (w r x v + r x (r x v)) / |q|^2 with q = (w, r).
     """
     vector, _, axis = path.rpartition(".")
     v = np.array([float(get_field(message, f"{vector}.{name}")) for name in "xyz"])
-    w, *r = _quaternion(get_field(message, by))
+    w, *r = _quaternion(get_field(message, attitude))
     across = np.cross(r, v)
     turned = v + 2.0 * (w * across + np.cross(r, across)) / (w * w + np.dot(r, r))
     return float(turned["xyz".index(axis)])

@@ -87,11 +87,14 @@ def installed_definitions(kinds: Iterable[str]) -> Types:
 
 def check_map(channel_map: ChannelMap, releases: Iterable[Types]) -> list[CheckedRow]:
     """Each field that a map uses, against the definitions of some releases. A definition without a version has version 0."""
-    types = list(releases)
+    releases = list(releases)
     rows = []
     for key, topic, kind, path, components in channel_map.used_fields():
-        faults = tuple(_fault(of, topic, kind, path, components) or _constant_fault(of, channel_map, key, kind) for of in types)
-        rows.append(CheckedRow(key, topic, path, faults))
+        faults = []
+        for types in releases:
+            fault = _fault(types, topic, kind, path, components)
+            faults.append(fault or _constant_fault(types, channel_map, key, kind))
+        rows.append(CheckedRow(key, topic, path, tuple(faults)))
     return rows
 
 
@@ -124,11 +127,11 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
     version = next((value for name, _, value in known[kind][0] if name == VERSION), 0)
     if (expected := versioned_topic(topic, version)) != topic:
         return f"{topic}: version {version}, whose topic is {expected}"
-    at = kind
+    member_kind = kind
     field = (Nodetype.NAME, kind)
     for step in path.split("."):
         match = STEP.fullmatch(step)
-        fields = dict(known[at][1]) if at in known else {}
+        fields = dict(known[member_kind][1]) if member_kind in known else {}
         if match is None or match[1] not in fields:
             return f"no {step}"
         node, content = fields[match[1]]
@@ -136,7 +139,7 @@ def _fault(types: Types, topic: str, kind: str, path: str, components: str | Non
             return f"{match[1]} of {content[1]}"
         element = _element((node, content))
         field = (node, content) if match[2] is None else element
-        at = element[1] if element[0] is Nodetype.NAME else ""
+        member_kind = element[1] if element[0] is Nodetype.NAME else ""
     return "" if components is None or _has(known, field, components) else f"{path}: no {', '.join(components) or 'number'}"
 
 

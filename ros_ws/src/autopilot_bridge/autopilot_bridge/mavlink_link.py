@@ -70,16 +70,16 @@ def message_type(name: str) -> Any:
     require_package("pymavlink")
     from pymavlink.dialects.v20 import ardupilotmega as dialect  # noqa: PLC0415 - an extra
 
-    of_message = dialect.mavlink_map.get(getattr(dialect, f"MAVLINK_MSG_ID_{name}", None))
-    if of_message is None:
+    definition = dialect.mavlink_map.get(getattr(dialect, f"MAVLINK_MSG_ID_{name}", None))
+    if definition is None:
         raise ParameterError(f"{MAVLINK}/msg/{name}: found no message {name}, expected one of the dialect {DIALECT}")
-    pairs = zip(of_message.fieldnames, of_message.fieldtypes, of_message.array_lengths, strict=True)
+    pairs = zip(definition.fieldnames, definition.fieldtypes, definition.array_lengths, strict=True)
     zeros = {field: _zero(kind) for field, kind, length in pairs if length == 0 and kind != "char"}
 
     def init(self: Any) -> None:
         vars(self).update(zeros)
 
-    return type(name, (), {"__init__": init, "fields": tuple(zeros), "packed": of_message})
+    return type(name, (), {"__init__": init, "fields": tuple(zeros), "packed": definition})
 
 
 def _text(address: Address) -> str:
@@ -186,8 +186,9 @@ class Link:
             silence = f"no message of system {self._config.system} over {self._config.url} for {SILENCE:g} s"
             return "; ".join(filter(None, (silence, self._refused, self.conflict)))
         names = [name] if name else list(self._config.rates)
-        slow = [sentence for at, sentence in self._rates.slow(now).items() if at in names]
-        denied = [sentence for at, sentence in self._denied.items() if at in names and not self._rates.comes(at, now)]
+        slow = [sentence for message, sentence in self._rates.slow(now).items() if message in names]
+        refusals = {message: sentence for message, sentence in self._denied.items() if message in names}
+        denied = [sentence for message, sentence in refusals.items() if not self._rates.comes(message, now)]
         return "; ".join(filter(None, [self.conflict, *slow, *denied, *([TAKEN] if slow else [])]))
 
     def refusal(self) -> str:

@@ -350,12 +350,11 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if self._first_y or limit == 0.0 or now_ns - self._start_ns < nanoseconds(limit):
             return
         stale = self._bridge.stale(now_ns)
-        found = dict.fromkeys(
-            f"{subscription.name}: {self._cause(subscription)}"
-            for subscription, rows in self._readers
-            if any(name in stale for name, _ in rows)
-        )
-        raise FlightEnded(f"no y after {limit:g} s: {'; '.join(found)}")
+        causes: dict[str, None] = {}
+        for subscription, rows in self._readers:
+            if any(name in stale for name, _ in rows):
+                causes[f"{subscription.name}: {self._cause(subscription)}"] = None
+        raise FlightEnded(f"no y after {limit:g} s: {'; '.join(causes)}")
 
     def _cause(self, subscription: PolledSubscription | MavlinkReader) -> str:
         """Why no sample of a topic was accepted, as a sentence."""
@@ -391,15 +390,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
         Checked are the topics that the bridge reads, and the topics of setpoints. Several transmitters may override, and any
         node may request a mode.
         """
-        read = {
-            subscription.name
-            for subscription, rows in self._readers
-            if isinstance(subscription, PolledSubscription) and not all(isinstance(row, OverrideRow) for _, row in rows)
-        }
+        read = set()
+        for subscription, rows in self._readers:
+            overrides_alone = all(isinstance(row, OverrideRow) for _, row in rows)
+            if isinstance(subscription, PolledSubscription) and not overrides_alone:
+                read.add(subscription.name)
         publishers = [self._outgoing[row.message].publisher for row in self._map.inputs.values()]
         setpoints = {publisher.topic_name for publisher in publishers if isinstance(publisher, Publisher)}
-        own = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())  # two messages may share a topic
-        counts = {topic: self.count_publishers(topic) - own[topic] for topic in sorted(read | setpoints)}
+        # two messages may share a topic
+        sent = Counter(outgoing.publisher.topic_name for outgoing in self._outgoing.values())
+        counts = {topic: self.count_publishers(topic) - sent[topic] for topic in sorted(read | setpoints)}
         conflicts = [
             f"{topic} has {count} publishers{' beside this bridge' if topic in setpoints else ''}, expected "
             f"{'none' if topic in setpoints else 'the autopilot alone'}"

@@ -5,7 +5,7 @@
 import re
 from collections.abc import Mapping
 from importlib.resources import files
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, get_args
@@ -323,8 +323,8 @@ class ChannelMap(Config):
         outputs = ", ".join(self.outputs)
         messages = ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
-        own = self.outputs[self.instant]
-        require(not own.held, f"outputs.{self.instant}.held", "true", "false: its stamp is that of y")
+        instant_row = self.outputs[self.instant]
+        require(not instant_row.held, f"outputs.{self.instant}.held", "true", "false: its stamp is that of y")
         self._check_fields()
         self._check_topics()
         owners: dict[tuple[str, str], str] = {}
@@ -334,8 +334,8 @@ class ChannelMap(Config):
             when = self.messages[row.message].when
             moving = "one sent when engaged: it moves the aircraft"
             require(when == "engaged", f"{key}.message", f"one sent when {when}", moving)
-            other = owners.setdefault((row.message, row.field), name)
-            require(other == name, f"{key}.field", f"{row.field}, that of {other}", "a field of its own")
+            owner = owners.setdefault((row.message, row.field), name)
+            require(owner == name, f"{key}.field", f"{row.field}, that of {owner}", "a field of its own")
             low, high = row.range
             require(low < high, f"{key}.range", list(row.range), "the lower end before the upper one")
             for limit, u in (("trim", 0.0), ("lower", row.lower), ("upper", row.upper)):
@@ -368,14 +368,14 @@ class ChannelMap(Config):
                 )
                 require(lower < upper, f"{section}.{name}", [lower, upper], "the lower end before the upper one")
         for name, condition in self.conditions.items():
-            found = "both" if condition.one_of else "neither"
+            ways = "both" if condition.one_of else "neither"
             require(
-                bool(condition.one_of) is (condition.within is None), f"conditions.{name}", found, "one of one_of and within"
+                bool(condition.one_of) is (condition.within is None), f"conditions.{name}", ways, "one of one_of and within"
             )
         for name, override in self.overrides.items():
             thresholds = [key for key in ("above", "below", "moved") if getattr(override, key) is not None]
-            found = " and ".join(thresholds) or "no threshold"
-            require(len(thresholds) == 1, f"overrides.{name}", found, "one of above, below and moved")
+            threshold_text = " and ".join(thresholds) or "no threshold"
+            require(len(thresholds) == 1, f"overrides.{name}", threshold_text, "one of above, below and moved")
 
         for parameter, required in self.parameters.items():
             is_name = PARAMETER.fullmatch(parameter) is not None
@@ -386,8 +386,11 @@ class ChannelMap(Config):
 
     def _check_fields(self) -> None:
         rows = self._readers() | {"inputs": self.inputs}
-        paths = {f"{kind}.{name}.field": row.field for kind, named in rows.items() for name, row in named.items()}
-        paths |= {f"messages.{name}.values.{path}": path for name, row in self.messages.items() for path in row.values}
+        paths: dict[str, str] = {}
+        for kind, named in rows.items():
+            paths |= {f"{kind}.{name}.field": row.field for name, row in named.items()}
+        for name, message in self.messages.items():
+            paths |= {f"messages.{name}.values.{path}": path for path in message.values}
         for key, path in paths.items():
             is_path = PATH.fullmatch(path) is not None
             require(is_path, key, f"{path!r}", "the path of a field, such as twist.angular.y or axes[1]")
@@ -399,8 +402,8 @@ class ChannelMap(Config):
                 self._check_mavlink(key, topic, kind)
             elif "/msg/" in kind:
                 require(topic in self.topics, f"{key}.topic", topic, "one with a quality of service in `topics`")
-            other = types.setdefault(topic, kind)
-            require(other == kind, f"{key}.type", kind, f"{other}, as elsewhere in this map for {topic}")
+            first_type = types.setdefault(topic, kind)
+            require(first_type == kind, f"{key}.type", kind, f"{first_type}, as elsewhere in this map for {topic}")
         for topic in self.topics:
             require(topic in types, f"topics.{topic}", "a topic", "one that a row uses")
 
@@ -416,9 +419,8 @@ class ChannelMap(Config):
     @property
     def recorded_topics(self) -> list[str]:
         """The topics that the log has: those with a quality of service, and what comes over MAVLink."""
-        read = [
-            row.topic for named in self._readers().values() for row in named.values() if row.topic.startswith(f"{MAVLINK}/")
-        ]
+        rows = chain.from_iterable(named.values() for named in self._readers().values())
+        read = [row.topic for row in rows if row.topic.startswith(f"{MAVLINK}/")]
         return [*self.topics, *dict.fromkeys(read)]
 
     def _readers(self) -> dict[str, Mapping[str, Any]]:
@@ -429,7 +431,10 @@ class ChannelMap(Config):
     def used_topics(self) -> list[tuple[str, str, str]]:
         """(key of the row, topic, type) of each row that names a topic."""
         rows = self._readers() | {"messages": self.messages}
-        return [(f"{kind}.{name}", row.topic, row.type) for kind, named in rows.items() for name, row in named.items()]
+        topics: list[tuple[str, str, str]] = []
+        for kind, named in rows.items():
+            topics += [(f"{kind}.{name}", row.topic, row.type) for name, row in named.items()]
+        return topics
 
     def used_fields(self) -> list[tuple[str, str, str, str, str | None]]:
         """(key of the row, topic, type, path of the field, its components) of each field that is read or set.
