@@ -7,6 +7,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import psutil
@@ -35,11 +36,11 @@ def write_profile(peers: str, file: Path) -> tuple[str, tuple[str, ...], Mapping
     Returns the address of this host, those of all hosts, and the environment that selects the profile.
     """
     hosts = addresses(peers)
-    local = {entry.address for entries in psutil.net_if_addrs().values() for entry in entries}
-    own = own_address(hosts, {address for address in local if address.count(".") == 3 and address != "127.0.0.1"})
+    local = {entry.address for entry in chain.from_iterable(psutil.net_if_addrs().values())}
+    own_host = own_address(hosts, {address for address in local if address.count(".") == 3 and address != "127.0.0.1"})
     with writing("--write", file, "the path of a file"):
-        write_file(file, network_profile(own, hosts))
-    return own, hosts, {PROFILE_VARIABLE: str(file.absolute()), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
+        write_file(file, network_profile(own_host, hosts))
+    return own_host, hosts, {PROFILE_VARIABLE: str(file.absolute()), DISCOVERY_VARIABLE: "SYSTEM_DEFAULT"}
 
 
 class FlightGearClient(Client):
@@ -85,10 +86,10 @@ def domain_ports() -> tuple[int, int]:
 class NetworkClient(Client):
     """Exchanges clocks with the same command on the other hosts."""
 
-    def __init__(self, own: str, peers: Sequence[str]) -> None:
+    def __init__(self, own_host: str, peers: Sequence[str]) -> None:
         super().__init__("network", rosout=False)
-        self._instances = {_instance(address): address for address in peers if address != own}
-        self._clocks = PeerClocks(self._node, _instance(own))
+        self._instances = {_instance(address): address for address in peers if address != own_host}
+        self._clocks = PeerClocks(self._node, _instance(own_host))
 
     def exchange(self, timeout: float) -> tuple[set[str], dict[str, ClockOfPeer]]:
         """Exchange until every host is received and receives, at most `timeout` s.

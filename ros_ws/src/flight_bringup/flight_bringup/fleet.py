@@ -92,8 +92,8 @@ def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
     require(isinstance(content, Mapping), str(path), "no mapping", A_FLEET)
     config = FleetConfig.validate_mapping(content, path.stem)
     members = []
-    for name, given in config.aircraft.items():
-        aircraft = given or AircraftOfFleet()
+    for name, section in config.aircraft.items():
+        aircraft = section or AircraftOfFleet()
         try:
             namespace = absolute_namespace(name)
             require(namespace.count("/") == 1, "name", repr(name), "one word")
@@ -106,8 +106,8 @@ def read_fleet(file: FilePath, duration: float | None = None) -> Fleet:
         )
     fleet = Fleet(path.stem, tuple(members), config.lockstep, config.composed)
     cheaper = "" if config.composed else "; composed: true takes one an aircraft"
-    found = f"{fleet.participants()} participants of the middleware"
-    require(fleet.participants() <= MAX_PARTICIPANTS, path.stem, found, f"at most {MAX_PARTICIPANTS}{cheaper}")
+    participants = f"{fleet.participants()} participants of the middleware"
+    require(fleet.participants() <= MAX_PARTICIPANTS, path.stem, participants, f"at most {MAX_PARTICIPANTS}{cheaper}")
     return fleet
 
 
@@ -137,10 +137,11 @@ def _nested(scenario: Scenario, changes: Mapping[str, Mapping[str, Any]]) -> dic
         values = {key: getattr(old, key) for key in old.model_fields}
         return values | {key: merged(values.get(key), value) for key, value in new.items()}
 
-    return {
-        name: {key: merged(getattr(getattr(scenario, name, None), key, None), value) for key, value in section.items()}
-        for name, section in changes.items()
-    }
+    nested = {}
+    for name, section in changes.items():
+        config = getattr(scenario, name, None)
+        nested[name] = {key: merged(getattr(config, key, None), value) for key, value in section.items()}
+    return nested
 
 
 @dataclass

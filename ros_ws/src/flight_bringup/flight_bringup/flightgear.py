@@ -32,15 +32,15 @@ WHEELS = 3
 def packet(pose: Mapping[str, float], origin: Origin, ground: float, seconds: int) -> bytes:
     """The packet of a pose, `channels.POSE` as far as known. `ground`: altitude of the origin, m; `seconds`: system time."""
 
-    def of(name: str) -> float:
+    def value(name: str) -> float:
         return pose.get(name, 0.0)
 
-    latitude, longitude = map(math.radians, geographic(of("north"), of("east"), origin))
-    speed = math.hypot(of("v_north"), of("v_east"), of("climb"))
+    latitude, longitude = map(math.radians, geographic(value("north"), value("east"), origin))
+    speed = math.hypot(value("v_north"), value("v_east"), value("climb"))
     return PACKET.pack(
-        *(VERSION, 0, longitude, latitude, ground + of("altitude")),
-        *(of("altitude"), of("phi"), of("theta"), of("psi"), 0.0, of("beta"), 0.0, 0.0, 0.0),
-        *(speed / KNOT, of("climb") / FOOT, of("v_north") / FOOT, of("v_east") / FOOT, -of("climb") / FOOT),
+        *(VERSION, 0, longitude, latitude, ground + value("altitude")),
+        *(value("altitude"), value("phi"), value("theta"), value("psi"), 0.0, value("beta"), 0.0, 0.0, 0.0),
+        *(speed / KNOT, value("climb") / FOOT, value("v_north") / FOOT, value("v_east") / FOOT, -value("climb") / FOOT),
         *(speed / FOOT, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
         *(ENGINES, RUNNING, 0, 0, 0, *[0.0] * 36),
         *(0, *[0.0] * 4, WHEELS, 0, 0, 0, *[0.0] * 9),

@@ -94,8 +94,8 @@ class FlightMonitor(Client):
     def learned(self) -> list[tuple[float, str]]:
         """What became of proposals of a learner since the last call: instants by the clock of the stamps, s, and sentences."""
         received = () if self._learning is None else self._learning.take()
-        told = [reports.decode(message.message) for message in received]
-        return [(seconds(report.stamp_ns), bounded(report.sentence)) for report in told]
+        decoded = [reports.decode(message.message) for message in received]
+        return [(seconds(report.stamp_ns), bounded(report.sentence)) for report in decoded]
 
     def recorded(self) -> float | None:
         """The flight time up to which the log of a lockstep flight is complete, s; None without a change."""

@@ -229,14 +229,17 @@ class FlightProcesses:
 
     def _nodes(self) -> list[tuple[str, int]]:
         """Names and process ids of the nodes."""
-        return [(name, process.popen.pid) for process in self.processes for name in self._names(process)]
+        nodes: list[tuple[str, int]] = []
+        for process in self.processes:
+            nodes += [(name, process.popen.pid) for name in self._names(process)]
+        return nodes
 
     def _unmatched(self) -> list[str]:
         """What the flight waits for before t = 0, by node."""
         names = self._nodes()
         ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
-        without = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
-        return [f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}" for name in without]
+        unmatched = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
+        return [f"{name} {'has an input unmatched a publisher' if ready[name] else 'not ready'}" for name in unmatched]
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -292,7 +295,10 @@ class FlightProcesses:
 
     def last_words(self, node: NodeSpec) -> str:
         """The last line of a node on a topic that it waits for, or on a refused sample; empty without one."""
-        lines = [line for process in self.processes if node.executable in self._names(process) for line in process.lines]
+        lines: list[str] = []
+        for process in self.processes:
+            if node.executable in self._names(process):
+                lines += process.lines
         line = next((line for line in reversed(lines) if "waiting for" in line or "refused" in line), "")
         return re.sub(r"^(\[[^]]*\] ?)*(: )?", "", line)
 
@@ -307,8 +313,8 @@ class FlightProcesses:
             searches = self._lockstep and self.outcome == COMPLETED and self._scenario.learns()
             last = {RECORDER: CLOSE_TIMEOUT, ONE_PROCESS: SEARCH_TIMEOUT if searches else CLOSE_TIMEOUT}
             first = {LEARNER: SEARCH_TIMEOUT} if searches else {}
-            rest = {process.node: STOP_TIMEOUT for process in self.processes if process.node not in last | first}
-            for timeouts in (first, rest, last):
+            middle = {process.node: STOP_TIMEOUT for process in self.processes if process.node not in last | first}
+            for timeouts in (first, middle, last):
                 deadline = time.monotonic() + max(timeouts.values(), default=0.0)
                 group = [process for process in self.processes if process.node in timeouts]
                 for process in group:
