@@ -267,14 +267,11 @@ class Control:
         return self._flight.scenario.controller
 
     def _gains(self, scenario: Scenario) -> list[dict[str, Any]]:
-        return [
-            {
-                "name": name,
-                "values": list(_as_list(self._values.get(name, base))),
-                "ranges": [_range(value) for value in _as_list(base)],
-            }
-            for name, base in gains_of(scenario.controller).items()
-        ]
+        gains = []
+        for name, base in gains_of(scenario.controller).items():
+            values = list(_as_list(self._values.get(name, base)))
+            gains.append({"name": name, "values": values, "ranges": [*map(_range, _as_list(base))]})
+        return gains
 
     def _refresh(self, request: Mapping[str, Any]) -> str:
         """Read the faults; at first, and where the digest in the log differs, also the controller's parameters."""
@@ -404,7 +401,8 @@ class Control:
             raise RefusedError(HTTPStatus.BAD_REQUEST, f"points: expected 2 to {MAX_WAYPOINTS} of north, east, altitude")
         if any(not isinstance(point, list) or len(point) != len(("north", "east", "altitude")) for point in points):
             raise RefusedError(HTTPStatus.BAD_REQUEST, "points: expected north, east and altitude of each")
-        return self._link.send_route([[_number("points", coordinate) for coordinate in point] for point in points])
+        coordinate = partial(_number, "points")
+        return self._link.send_route([[*map(coordinate, point)] for point in points])
 
     def _engage(self, request: Mapping[str, Any]) -> str:
         if request.get("map") != (name := self._map()):
@@ -417,9 +415,13 @@ class Control:
 def gains_of(controller: ControllerConfig) -> dict[str, Any]:
     """The numeric parameters of a law tunable in flight, by name: a number, or a number per channel."""
     fields = type(controller).model_fields
-    own = [name for name in fields if name not in ControllerConfig.model_fields and name in controller.tunable()]
-    values = {name: getattr(controller, name) for name in own}
-    return {name: value for name, value in values.items() if all(isinstance(number, float) for number in _as_list(value))}
+    tunable = [name for name in fields if name not in ControllerConfig.model_fields and name in controller.tunable()]
+    values = {name: getattr(controller, name) for name in tunable}
+    return {name: value for name, value in values.items() if _is_numeric(value)}
+
+
+def _is_numeric(value: object) -> bool:
+    return all(isinstance(number, float) for number in _as_list(value))
 
 
 def _faults_of(scenario: Scenario) -> list[str]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from enum import IntEnum
 from pathlib import Path
 from threading import Thread
 from typing import Any, NamedTuple
@@ -142,7 +143,7 @@ class Flight:
         # What a page shows beside the samples, ready for JSON: the names of modes; `_described` once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,
-            "modes": {channel: {str(int(mode)): mode.name for mode in kind} for channel, kind in modes.items()},
+            "modes": {channel: _mode_names(kind) for channel, kind in modes.items()},
             "background": background,
         }
         self.notes: list[str] = []
@@ -276,8 +277,8 @@ class Flight:
             recorded = read_run(self.run, self._namespace)
             if self._given is not None:
                 recorded = recorded._replace(scenario=self._given)
-            of = log_account(recorded)
-            lacks = () if of is None else of.notes()
+            account = log_account(recorded)
+            lacks = () if account is None else account.notes()
             self._lacks = [_text(sentence) for sentence in (*recorded.tape.notes, *lacks)]
 
     def _rate_of(self, topic: str, type_name: str) -> float:
@@ -361,8 +362,8 @@ class Flight:
         if names != topic.names and sorted(names) == sorted(topic.names):  # of a second publisher: values are matched by name
             names, values = topic.names, values[:, [names.index(name) for name in topic.names]]
         if topic.columns is None:
-            kept = GROUPS.get(topic.name)
-            chosen = [i for i, name in enumerate(names) if kept is None or name in kept or name.partition(".")[0] in kept]
+            shown = GROUPS.get(topic.name)
+            chosen = [i for i, name in enumerate(names) if shown is None or name in shown or name.partition(".")[0] in shown]
             if len(chosen) > MAX_CHANNELS:
                 self._note(f"{topic.name}: {len(chosen) - MAX_CHANNELS} of its channels are not shown")
             topic.names = names
@@ -393,8 +394,8 @@ class Flight:
             self._take_errors(stamp_ns, names, values)
         samples.append(stamp_ns, values[:, topic.columns])
         if topic.name == LEARNED:
-            found = known_entries(Signal(samples.stamp_ns, samples.names, samples.values.astype(float)))
-            self.description |= {"learned": found}
+            entries = known_entries(Signal(samples.stamp_ns, samples.names, samples.values.astype(float)))
+            self.description |= {"learned": entries}
             self.described += 1
 
     def _take_errors(self, stamp_ns: NDArray[np.int64], names: Sequence[str], values: FloatArray) -> None:
@@ -506,6 +507,15 @@ def _text(text: str) -> str:
     return printable(text)[:MAX_TEXT]
 
 
+def _mode_names(modes: type[IntEnum]) -> dict[str, str]:
+    """The names of modes by number, as text."""
+    return {str(int(mode)): mode.name for mode in modes}
+
+
+def _finite_or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
 def _described(scenario: Scenario) -> dict[str, Any]:
     """Units, what a positive input does, limits, gusts, commands and route of a scenario.
 
@@ -521,7 +531,7 @@ def _described(scenario: Scenario) -> dict[str, Any]:
         "duration": scenario.flight.duration,
         "units": {name: unit._asdict() for name, unit in display_units(scenario).items()},
         "positive": scenario.aircraft.channels().positive,
-        "limits": {name: [bound if math.isfinite(bound) else None for bound in pair] for name, *pair in bounds},
+        "limits": {name: [*map(_finite_or_none, pair)] for name, *pair in bounds},
         "gusts": [[name, *window] for name, window in scenario.gust_windows().items()],
         "commands": [[edge.name, edge.start, edge.stop] for edge in pulse_edges(scenario)],
         "speed": scenario.aircraft.channels().speed,

@@ -43,10 +43,10 @@ class Series:
         """Append rows. A row up to DISORDER_NS older than an earlier row takes the newer stamp; an older row is refused."""
         earliest = self._stamp_ns[self.count - 1] if self.count else np.iinfo(np.int64).min + DISORDER_NS
         ordered = np.maximum.accumulate(np.concatenate([[earliest], stamp_ns]))[1:]
-        kept = stamp_ns >= ordered - DISORDER_NS
-        self.refused += int(np.count_nonzero(~kept))
-        ordered = ordered[kept]
-        values = values[kept]
+        in_order = stamp_ns >= ordered - DISORDER_NS
+        self.refused += int(np.count_nonzero(~in_order))
+        ordered = ordered[in_order]
+        values = values[in_order]
         for start in range(0, len(ordered), self._max_rows // 2):
             part = slice(start, start + self._max_rows // 2)
             self._append_part(ordered[part], values[part])
@@ -66,13 +66,13 @@ class Series:
 
     def _thin(self) -> None:
         """Replace groups of four rows by two, the minima and the maxima per channel: a plot keeps the peaks."""
-        whole = self.count - self.count % 4
+        grouped = self.count - self.count % 4
         k = len(self.names)
-        for start in range(0, whole, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
-            groups = self._values[start : min(start + BLOCK, whole)].reshape(-1, 4, k)
+        for start in range(0, grouped, BLOCK):  # in place: temporary arrays of all rows would stay in the heap of the process
+            groups = self._values[start : min(start + BLOCK, grouped)].reshape(-1, 4, k)
             thin = np.stack([np.fmin.reduce(groups, axis=1), np.fmax.reduce(groups, axis=1)], axis=1).reshape(-1, k)
             self._values[start // 2 : start // 2 + len(thin)] = thin
-        half = whole // 2
-        self._stamp_ns[:half] = self._stamp_ns[:whole:2].copy()
+        half = grouped // 2
+        self._stamp_ns[:half] = self._stamp_ns[:grouped:2].copy()
         self.count = half
         self.thinned = self.thinned + 1

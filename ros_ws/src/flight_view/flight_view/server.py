@@ -130,23 +130,23 @@ class Server:
         looked = -math.inf
         while True:
             changed = [flight.update(BUDGET) for flight in self.followed]
-            rest = POLL_PERIOD
+            pause = POLL_PERIOD
             if any(changed):
                 self._news.set()
                 self._news.clear()
-                rest = 0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
+                pause = 0.0 if any(flight.state() == "reading" for flight in self.followed) else REST
             if any(changed) or time.monotonic() > looked + STATE_PERIOD:
                 looked = time.monotonic()
                 for stream in [*self.streams]:
                     stream.look()
-            await asyncio.sleep(rest)
+            await asyncio.sleep(pause)
 
     async def news(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
         """The answer to a browser with the `known` numbers of rows by topic; waits up to MAX_WAIT s for news."""
         deadline = time.monotonic() + MAX_WAIT
-        while not has_news(flight, known) and (rest := deadline - time.monotonic()) > 0.0:
+        while not has_news(flight, known) and (remaining := deadline - time.monotonic()) > 0.0:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._news.wait(), min(rest, STATE_PERIOD))
+                await asyncio.wait_for(self._news.wait(), min(remaining, STATE_PERIOD))
         return self.answer(flight, known)
 
     def answer(self, flight: Flight | Fleet, known: Mapping[str, str]) -> bytes:
@@ -292,15 +292,15 @@ class _Handler(RequestHandler):
     def finish(self, chunk: str | bytes | dict[str, Any] | None = None) -> "Future[None]":
         """Send the answer, and close the connection as the class says."""
         stream = self.stream
-        kept = self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
-        if not kept:
+        stays_open = self._kept or self.get_status() == HTTPStatus.SWITCHING_PROTOCOLS
+        if not stays_open:
             self.set_header("Connection", "close")
         sent = super().finish(chunk)
         timeout = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT, stream.close)
 
         def end(_: "Future[None]") -> None:
             timeout.cancel()
-            if not kept:
+            if not stays_open:
                 stream.close()
 
         sent.add_done_callback(end)

@@ -28,14 +28,14 @@ DEFAULT_PORT = 8077
 def runs_in_recording(runs: Path, namespace: str | None = None) -> list[Path]:
     """The runs in recording, the newest first; with a namespace those that hold a topic of it."""
     folders = sorted((folder for folder in runs.iterdir() if is_folder(folder)), reverse=True) if is_folder(runs) else []
-    found = []
+    recording = []
     prefix = f"/{(namespace or '').strip('/')}/".replace("//", "/")
     for folder in folders:
         with suppress(ParameterError, OSError):
             held = any(is_locked(file) for file in bag_files(folder))
             if held and (not namespace or any(topic.startswith(prefix) for topic in log_topics(folder))):
-                found.append(folder)
-    return found
+                recording.append(folder)
+    return recording
 
 
 def newest_run(runs: Path, namespace: str | None = None) -> Path:
