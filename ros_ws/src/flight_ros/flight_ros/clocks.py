@@ -46,8 +46,8 @@ class ClockOfPeer(NamedTuple):
 class Peers:
     """The differences of clocks that a node has seen, and those that the other nodes report of it. Times in s and ns."""
 
-    def __init__(self, own: str) -> None:
-        self._own = own
+    def __init__(self, own_name: str) -> None:
+        self._own = own_name
         self._seen: dict[str, deque[float]] = {}
         self._reported: dict[str, float] = {}
         self._heard_ns: dict[str, int] = {}

@@ -54,10 +54,10 @@ class EndpointMonitor:
         """Log an error for each subscriber of a topic that does not match a publisher of the node."""
         topic = publisher.topic_name
         # The graph reports the QoS of both sides in the same terms. A new publisher is not in it yet.
-        for own in self._node.get_publishers_info_by_topic(topic):
-            if own.node_name == self._node.get_name():
+        for endpoint in self._node.get_publishers_info_by_topic(topic):
+            if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)
-                self._log_mismatches(topic, peers, own.topic_type, own.qos_profile)
+                self._log_mismatches(topic, peers, endpoint.topic_type, endpoint.qos_profile)
                 return
 
     def _log_mismatches(

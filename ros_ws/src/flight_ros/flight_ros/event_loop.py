@@ -8,6 +8,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import chain
 from types import FrameType
 from typing import Any
 
@@ -76,8 +77,8 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         if early_participant is not None:
             destroy_participant(early_participant)
     except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
-        own = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
-        print(f"error: {error if own else ' '.join(str(error).split())}", file=sys.stderr)
+        is_stack_error = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
+        print(f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr)
         rclpy.try_shutdown()
         sys.exit(ENDED_EARLY if isinstance(error, FlightEnded) else BAD_PARAMETERS)
     node = nodes[0]
@@ -131,7 +132,8 @@ def _start(nodes: Sequence[FlightNode[Any]]) -> SingleThreadedExecutor:
 
 def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
     executor = _start(nodes)
-    wait_set = WaitSet([subscription.entity for node in nodes for subscription in node.polled_subscriptions], nodes[0].context)
+    subscriptions = chain.from_iterable(node.polled_subscriptions for node in nodes)
+    wait_set = WaitSet([subscription.entity for subscription in subscriptions], nodes[0].context)
     now_ns = advance_ns = serve_ns = report_ns = time.monotonic_ns()
     began = False
     while not stop.requested:
@@ -216,10 +218,10 @@ class RealTime:
 def _start_instants(nodes: Sequence[FlightNode[Any]], executor: SingleThreadedExecutor, stop: _Stop) -> list[int]:
     """The start of each node, ns of the system clock, once all are known; none after a signal."""
     known: dict[FlightNode[Any], int] = {}
-    given = [node for node in nodes if node.waits_for_start()]
+    awaiting = [node for node in nodes if node.waits_for_start()]
     while not stop.requested:
-        known |= {node: start_ns for node in given if node not in known and (start_ns := node.start_ns()) is not None}
-        if len(known) == len(given):
+        known |= {node: start_ns for node in awaiting if node not in known and (start_ns := node.start_ns()) is not None}
+        if len(known) == len(awaiting):
             return [known[node] if node in known else node.start_ns() or 0 for node in nodes]
         for node in nodes:
             node.match()
@@ -244,8 +246,8 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
         now_ns = time.monotonic_ns()
         if now_ns >= serve_ns:
             # Requests may take half of the time to the next tick.
-            left = min(each.ticker.remaining() for each in running)
-            _serve(executor, nodes[0], now_ns + nanoseconds(max(left, 0.0) / 2.0))
+            remaining = min(each.ticker.remaining() for each in running)
+            _serve(executor, nodes[0], now_ns + nanoseconds(max(remaining, 0.0) / 2.0))
             for node in nodes:
                 node.require_peers()
                 node.match()

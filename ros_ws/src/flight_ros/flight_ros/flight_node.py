@@ -82,8 +82,8 @@ class FlightNode(Node, Generic[P]):
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
         self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
         self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, STATE)
-        given = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
-        self._start_subscription = PolledSubscription(self, START, STATE, raw=True) if given else None
+        is_start_awaited = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
+        self._start_subscription = PolledSubscription(self, START, STATE, raw=True) if is_start_awaited else None
         self._matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()
@@ -207,10 +207,10 @@ class FlightNode(Node, Generic[P]):
         """The end of a sentence on the stamp of a node whose clock differs; else empty."""
         return "" if self.clocks is None else self.clocks.told_of(sender)
 
-    def warn_no_publisher(self, subscription: PolledSubscription, without: str = "no publisher") -> None:
+    def warn_no_publisher(self, subscription: PolledSubscription, lack: str = "no publisher") -> None:
         """Called at each tick without a sample of a topic: logs a warning after 3 s, then every 2 s.
 
-        `without` is the cause where the topic has no publisher.
+        `lack` is the cause where the topic has no publisher.
         """
         now_ns = time.monotonic_ns()
         last_ns, log_ns = self._waiting.get(subscription.name, (0, 0))
@@ -219,7 +219,7 @@ class FlightNode(Node, Generic[P]):
         self._waiting[subscription.name] = now_ns, log_ns if now_ns < log_ns else now_ns + WAITING_PERIOD_NS
         if now_ns < log_ns:
             return
-        cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else without
+        cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else lack
         if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
             cause = refused
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")

@@ -19,41 +19,43 @@ PORTS_A_DOMAIN = 250  # section 9.6.1.1
 
 def addresses(text: str) -> tuple[str, ...]:
     """The addresses of the hosts, from "10.0.0.1,10.0.0.2". Raises ParameterError."""
-    found = tuple(part.strip() for part in text.split(","))
-    for address in found:
+    hosts = tuple(part.strip() for part in text.split(","))
+    for address in hosts:
         try:
-            own = ipaddress.IPv4Address(address)
+            host = ipaddress.IPv4Address(address)
         except ValueError:
             raise ParameterError(f"--peers: found {address!r}, expected IPv4 addresses, as in 10.0.0.1,10.0.0.2") from None
-        usable = not (own.is_unspecified or own.is_multicast or own.is_loopback)
+        usable = not (host.is_unspecified or host.is_multicast or host.is_loopback)
         require(usable, "--peers", repr(address), "the address of a host on the network")
     require(
-        len(set(found)) == len(found) >= 2, "--peers", repr(text), "two or more addresses, each once, this host's among them"
+        len(set(hosts)) == len(hosts) >= 2, "--peers", repr(text), "two or more addresses, each once, this host's among them"
     )
-    return found
+    return hosts
 
 
 def own_address(peers: Sequence[str], local: Collection[str]) -> str:
     """The address of this host among the peers, by the addresses of its interfaces. Raises ParameterError."""
-    own = [address for address in peers if address in local]
+    matches = [address for address in peers if address in local]
     named = ", ".join(sorted(local)) or "none"
     require(
-        len(own) == 1, "--peers", f"{len(own)} addresses of this host ({named})", "one of them, and those of the other hosts"
+        len(matches) == 1,
+        "--peers",
+        f"{len(matches)} addresses of this host ({named})",
+        "one of them, and those of the other hosts",
     )
-    return own[0]
+    return matches[0]
 
 
-def network_profile(own: str, peers: Sequence[str]) -> str:
+def network_profile(own_host: str, peers: Sequence[str]) -> str:
     """The loopback profile with the address of this host in place of 127.0.0.1, and the hosts as initial peers."""
     text = LOOPBACK_PROFILE.read_text(encoding="utf-8")
     locators = "".join(f"<locator><udpv4><address>{address}</address></udpv4></locator>" for address in peers)
-    about = (
-        f"<!-- Fast DDS over UDP, unicast alone, bound to {own}, for hosts {', '.join(peers)}; written by rise-di network. -->"
-    )
+    hosts = ", ".join(peers)
+    about = f"<!-- Fast DDS over UDP, unicast alone, bound to {own_host}, for hosts {hosts}; written by rise-di network. -->"
     for pattern, value in (
         (r"<!--.*?-->", about),
         (r"(?s)(?<=<initialPeersList>).*?(?=</initialPeersList>)", locators),
-        (r"(?s)(?<=<interfaceWhiteList>).*?(?=</interfaceWhiteList>)", f"<address>{own}</address>"),
+        (r"(?s)(?<=<interfaceWhiteList>).*?(?=</interfaceWhiteList>)", f"<address>{own_host}</address>"),
         (r"(?<=<maxInitialPeersRange>)\d+", str(PEER_RANGE)),
         (r"(?s)(?<=<leaseAnnouncement>)(\s*<sec>0</sec>\s*<nanosec>)\d+", rf"\g<1>{ANNOUNCEMENT_NS}"),
         ("udp_loopback", "udp_network"),

@@ -25,11 +25,11 @@ def read_parameters(node: Node, schema: type[P]) -> P:
     Then every parameter of the set is declared with its description, read-only unless it is tunable.
     """
     _require_no_octal(sys.argv)
-    given = nest(_overrides(node))
+    overrides = nest(_overrides(node))
     try:
-        parameters = schema.validate_mapping(given, node.get_name())
+        parameters = schema.validate_mapping(overrides, node.get_name())
     except ParameterError as error:
-        if given:
+        if overrides:
             raise
         expected = f"a section for {node.get_fully_qualified_name()} in a file of --params-file"
         raise ParameterError(f"{node.get_name()}: found no parameters, expected {expected}: {error}") from None

@@ -39,13 +39,13 @@ def take_messages(subscription: Subscription, limit: int) -> list[tuple[Any, Any
     handle = subscription.handle
     kind = subscription.msg_type
     raw = subscription.raw
-    taken = []
+    messages = []
     with handle:
         for _ in range(limit):
             if (message := handle.take_message(kind, raw)) is None:
                 break
-            taken.append(message)
-    return taken
+            messages.append(message)
+    return messages
 
 
 class WaitSet:
