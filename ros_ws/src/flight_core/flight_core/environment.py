@@ -12,6 +12,7 @@ import socket
 import sys
 import time
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import NoReturn
 
@@ -58,7 +59,9 @@ def _require_middleware() -> None:
     wanted = os.environ.get("RMW_IMPLEMENTATION", "")
     prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
     indexes = [Path(prefix) / "share/ament_index/resource_index/rmw_typesupport" for prefix in prefixes]
-    known = sorted({path.name for index in indexes if index.is_dir() for path in index.iterdir()} - {"rmw_implementation"})
+    folders = filter(Path.is_dir, indexes)
+    names = {path.name for path in chain.from_iterable(map(Path.iterdir, folders))}
+    known = sorted(names - {"rmw_implementation"})
     if wanted and known and wanted not in known:
         _refuse(f"RMW_IMPLEMENTATION: found {wanted!r}, expected one of {', '.join(known)}")
 

@@ -107,8 +107,8 @@ def _number(kind: type[float], *, allow_inf_nan: bool = False, **limits: float) 
 
 
 def _string(*, min_length: int = 0, pattern: str = "") -> Kind:
-    def content(given: str | os.PathLike[str], key: str, problems: Problems) -> Any:
-        value = os.fspath(given)
+    def content(text: str | os.PathLike[str], key: str, problems: Problems) -> Any:
+        value = os.fspath(text)
         if not value.isprintable():
             return problems.refuse(key, value, "printable characters")
         if len(value) < min_length:
@@ -156,9 +156,9 @@ def _table(parts: Sequence[Any], *, min_length: float = 0, max_length: float = m
     def content(value: Mapping[Any, Any], key: str, problems: Problems) -> dict[Any, Any]:
         _check_count(len(value), key, problems, min_length, max_length)
         table = {}
-        for given, item in value.items():
-            is_number = parts[0] is int and isinstance(given, str) and re.fullmatch(r"-?\d{1,18}", given)  # a key of JSON
-            name = int(given) if is_number else given
+        for entered, item in value.items():
+            is_number = parts[0] is int and isinstance(entered, str) and re.fullmatch(r"-?\d{1,18}", entered)  # a key of JSON
+            name = int(entered) if is_number else entered
             if keys.takes(name):
                 table[keys.content(name, key, problems)] = values.read(item, f"{key}.{name}", problems)
             else:
@@ -221,7 +221,10 @@ def kind_of(annotation: Any, rules: Mapping[str, Any] = MappingProxyType({})) ->
     origin = get_origin(annotation)
     parts = get_args(annotation)
     if origin is Annotated:
-        return kind_of(parts[0], {rule: limit for field in parts[1:] for rule, limit in field.rules.items()} | dict(rules))
+        own_rules: dict[str, Any] = {}
+        for field in parts[1:]:
+            own_rules |= field.rules
+        return kind_of(parts[0], own_rules | dict(rules))
     if origin in (Union, UnionType):
         return _union([kind_of(part, {} if part is NoneType else rules) for part in parts])
     if origin in GENERIC:

@@ -81,10 +81,10 @@ def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
 
 
 for _class in (_Loader, _Dumper):
-    _class.yaml_implicit_resolvers = {
-        first: [resolver for resolver in resolvers if _class is _Dumper or resolver[0] not in {INT_TAG, FLOAT_TAG}]
-        for first, resolvers in _class.yaml_implicit_resolvers.items()
-    }
+    _class.yaml_implicit_resolvers = {first: [*rows] for first, rows in _class.yaml_implicit_resolvers.items()}
+    if _class is _Loader:
+        for _rows in _class.yaml_implicit_resolvers.values():
+            _rows[:] = [row for row in _rows if row[0] not in {INT_TAG, FLOAT_TAG}]
     for _tag, _pattern in ((INT_TAG, INTEGER), (FLOAT_TAG, FLOAT)):
         _class.add_implicit_resolver(_tag, re.compile(rf"(?:{_pattern.pattern})\Z"), list("-+.0123456789"))
 _Loader.add_constructor(INT_TAG, _integer)
@@ -206,8 +206,8 @@ def require_no_octal(content: bytes | str, key: str) -> None:
         scalars = (token for token in yaml.scan(content, yaml.CSafeLoader) if isinstance(token, yaml.ScalarToken))
         numbers = [scalar for scalar in scalars if scalar.plain and LEADING_ZERO.fullmatch(scalar.value)]
     if numbers:
-        found = f"{numbers[0].value!r} in line {numbers[0].start_mark.line + 1}"
-        raise ParameterError(f"{key}: found {found}, expected a number without a 0 before it")
+        octal = f"{numbers[0].value!r} in line {numbers[0].start_mark.line + 1}"
+        raise ParameterError(f"{key}: found {octal}, expected a number without a 0 before it")
 
 
 @contextmanager

@@ -46,12 +46,12 @@ def require_package(package: str, remark: str = "") -> None:
 def missing(package: str) -> str:
     """A sentence on a package that is not installed: "found no Python package jax, expected it: make setup-all"."""
     in_checkout = (CHECKOUT / "Makefile").is_file() and (CHECKOUT / "ros_ws").is_dir()
-    of_messages = package.endswith(MESSAGE_SUFFIXES)
-    extra = "ros" if of_messages and find_spec("rclpy") is None else EXTRAS.get(package)
+    has_messages = package.endswith(MESSAGE_SUFFIXES)
+    extra = "ros" if has_messages and find_spec("rclpy") is None else EXTRAS.get(package)
     ways = ""
     if extra is not None:
         ways = f": {TARGETS[extra] if in_checkout else _pip_command(extra)}"
-    elif of_messages:
+    elif has_messages:
         build = f"make messages PACKAGE={package} SOURCE=FOLDER builds it from its sources; " if in_checkout else ""
         ways = f": {build}on a full ROS 2 install ros-jazzy-{package.replace('_', '-')}, or source a workspace with it"
     return f"found no Python package {package}, expected it{ways}"

@@ -92,9 +92,9 @@ class _Reader(pickle.Unpickler):
             return super().find_class(module, name)
         if (module, name) == ("builtins", "dict"):
             return dict
-        found = getattr(import_module(self._module), name, None) if module == self._module else None
-        if isinstance(found, type) and issubclass(found, tuple):
-            return found
+        member = getattr(import_module(self._module), name, None) if module == self._module else None
+        if isinstance(member, type) and issubclass(member, tuple):
+            return member
         raise IsolatedCallError(f"returned {module}.{name}, which is no plain value")
 
 
@@ -113,7 +113,7 @@ def main() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
     limit_memory(memory)
     for limit, most in ((resource.RLIMIT_FSIZE, FILE_LIMIT), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(limit, (min(most, own) if (own := resource.getrlimit(limit)[1]) >= 0 else most, own))
+        resource.setrlimit(limit, (min(most, current) if (current := resource.getrlimit(limit)[1]) >= 0 else most, current))
     open_ways = confinement.confine(Path.cwd())
     try:
         result = ("value", getattr(import_module(module), name)(*arguments), open_ways)

@@ -34,17 +34,19 @@ class Config:
     """The fields by name, fields of bases first."""
 
     def __init_subclass__(cls) -> None:
-        own = {}
+        new_fields = {}
         for name, annotation in inspect.get_annotations(cls).items():
             origin: Any = get_origin(annotation)
             if origin is not ClassVar:
-                given = vars(cls).get(name, REQUIRED)
-                own[name] = field = given if isinstance(given, FieldInfo) else Field(given)
+                default = vars(cls).get(name, REQUIRED)
+                new_fields[name] = field = default if isinstance(default, FieldInfo) else Field(default)
                 field.annotation = annotation
-                if given is not REQUIRED:
+                if default is not REQUIRED:
                     delattr(cls, name)
         bases = (base.model_fields for base in reversed(cls.__mro__[1:]) if issubclass(base, Config))
-        cls.model_fields = {name: field for fields in (*bases, own) for name, field in fields.items()}
+        cls.model_fields = {}
+        for fields in (*bases, new_fields):
+            cls.model_fields |= fields
 
     def __init__(self, **values: Any) -> None:
         vars(self).update(vars(type(self).validate_mapping(values, type(self).__name__)))
@@ -143,8 +145,8 @@ class Config:
         dumped = {}
         for name, field in self.model_fields.items():
             value = getattr(self, name)
-            without = (exclude_none and value is None) or (exclude_defaults and value == field.default)
-            if not (name in exclude or without or (exclude_unset and name not in vars(self)["_given"])):
+            is_left_out = (exclude_none and value is None) or (exclude_defaults and value == field.default)
+            if not (name in exclude or is_left_out or (exclude_unset and name not in vars(self)["_given"])):
                 dumped[name] = plain(value)
         return dumped
 
@@ -192,10 +194,10 @@ Names = Annotated[tuple[Name, ...], Field(min_length=1)]
 Signs = Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)]
 
 
-def require(condition: bool, key: str, found: object, expected: str) -> None:
+def require(condition: bool, key: str, actual: object, expected: str) -> None:
     """Raise ParameterError naming `key`, what was found and what is expected, unless the condition holds."""
     if not condition:
-        raise ParameterError(f"{key}: found {found}, expected {expected}")
+        raise ParameterError(f"{key}: found {actual}, expected {expected}")
 
 
 def one_of(known: Sequence[str], name: str) -> str:

@@ -102,7 +102,7 @@ def in_si(value: str | float, key: str, like: str) -> float:
     parsed = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?:\s*)(\D.*)?", str(value).strip())
     if parsed is None:
         raise ParameterError(f"{key}: found {value!r}, expected a number in {like}, or with a unit")
-    given = quantity(parsed[2] or like, key)
-    if given.dimension != quantity(like).dimension:
+    entered = quantity(parsed[2] or like, key)
+    if entered.dimension != quantity(like).dimension:
         raise ParameterError(f"{key}: found {value!r}, expected a unit like {like}")
-    return float(parsed[1]) * given.si
+    return float(parsed[1]) * entered.si
