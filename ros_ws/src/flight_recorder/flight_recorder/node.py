@@ -100,10 +100,11 @@ class RecorderNode(FlightNode[RecorderConfig]):
         super().__init__("recorder", RecorderConfig)
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
-        own, foreign = ([topic for topic in FLIGHT if topic.foreign is kind] for kind in (False, True))
+        stack_topics = [topic for topic in FLIGHT if not topic.foreign]
+        foreign_topics = [topic for topic in FLIGHT if topic.foreign]
         self._topics = [
-            *(self._record(self.subscribe(topic, RECORD), [PUBLISH]) for topic in own),
-            *(self._record(self._poll(topic, RECORD_FOREIGN), [PUBLISH]) for topic in foreign),
+            *(self._record(self.subscribe(topic, RECORD), [PUBLISH]) for topic in stack_topics),
+            *(self._record(self._poll(topic, RECORD_FOREIGN), [PUBLISH]) for topic in foreign_topics),
             self._record(self._poll(ROSOUT, RECORD), [RECORD]),
             self._record(self._poll(PARAMETER_EVENTS, RECORD_FOREIGN), [RECORD_FOREIGN]),
         ]
