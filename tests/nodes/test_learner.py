@@ -64,11 +64,14 @@ def proposer(tmp_path: Path) -> Iterator[Proposer]:
 def test_controller_refuses_a_lie_and_a_hasty_proposal_and_flies_a_certified_model(proposer: Proposer) -> None:
     flight = proposer.flight
     flipped = [-value for value in proposer.change["observer.F"]]
-    assert "spectral radius" in proposer.answer(lambda: proposer.propose(change={"observer.F": flipped})).sentence
+    lie = proposer.answer(lambda: proposer.propose(change={"observer.F": flipped}))
+    assert "spectral radius" in lie.sentence
+    assert lie.values == {"event": "refused"}
     assert "after that of the last proposal" in proposer.answer(proposer.propose).sentence
     flight.run(2.5)  # half of the least spacing
     flies = proposer.answer(proposer.propose)
     assert flies.sentence == "flies model"
+    assert flies.values == {"event": "flies"}
     flight.run(0.1)
     assert flight.values("observer.part") == [0.6]  # its bound
     flown = dict(zip(flight.at().tolist(), flight.column("parameters").tolist(), strict=True))

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The attachments, metadata and provenance of a log: they suffice to repeat the flight from the file alone."""
 
+import math
 import os
 import shlex
 import shutil
@@ -13,16 +14,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.conftest import REPOSITORY
+from tests.joint_states import vector
 
 from aircraft_sim.airframe import load_airframe
 from flight_analysis.closed_loop.scenario import SCHEMAS, ParameterOverrides, Scenario, load_scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario, scenarios
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.run_folder import attachments_for
+from flight_analysis.report.summary import summarise
 from flight_bringup.graph import ONE_PROCESS, RECORDER, parameter_overrides
 from flight_core.parameters import ParameterError
 from flight_log import columns
-from flight_log.bag import LogAttachments
+from flight_log.bag import BagWriter, LogAttachments
+from flight_log.named_vectors import JOINT_STATE
 from flight_log.provenance import STACK, revision
 from flight_log.tape_reader import RecordedRun, read_run
 from flight_log.tape_writer import write_run
@@ -128,6 +132,32 @@ def test_revision_is_commit_and_marks_local_changes(tmp_path: Path) -> None:
 def test_folder_that_cannot_be_written_is_one_sentence(osprey_gust: Scenario, tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"nowhere/parameters.yaml cannot be written \(No such file or directory\)"):
         attachments_for(osprey_gust, tmp_path / "nowhere")
+
+
+def test_pose_whose_first_samples_lack_channel_read_with_it(tmp_path: Path) -> None:
+    # The topics of an autopilot begin at different times: its first poses may be without climb.
+    with BagWriter(tmp_path / "run") as bag:
+        topic = bag.add_topic("/pose", JOINT_STATE, "")
+        for k in range(1, 7):
+            message = vector(k, ["phi"], [0.1]) if k < 3 else vector(k, ["phi", "climb"], [0.1, float(k)])
+            bag.write(topic, k, k, k, message)
+        for k in range(7, 17):  # of another publisher
+            bag.write(topic, k, k, k, vector(k, ["z"], [0.1]))
+    tape = read_run(tmp_path / "run").tape
+    assert tape["pose"]["climb"].tolist() == [3.0, 4.0, 5.0, 6.0]
+    assert "pose: 12 samples refused: damaged, not finite, or of other channels" in tape.notes
+    assert tape.refused == {"pose": 12}
+
+
+def test_summary_of_log_whose_y_was_refused_names_the_refusal(tmp_path: Path, osprey_gust: Scenario) -> None:
+    with BagWriter(tmp_path / "run") as bag:
+        for name, value in (("y", math.nan), ("y_m", 0.0)):
+            topic = bag.add_topic(f"/{name}", JOINT_STATE, "")
+            for k in range(1, 4):
+                bag.write(topic, k, k, k, vector(k, ["q"], [value]))
+    refused = r"no sample of y \(y: 3 samples refused: damaged, not finite, or of other channels\), expected"
+    with pytest.raises(ParameterError, match=refused):
+        summarise(read_run(tmp_path / "run").tape, osprey_gust)
 
 
 @pytest.mark.parametrize("indexed", [True, False])

@@ -21,6 +21,7 @@ from rise_di_controller.controller import Controller
 from rise_di_controller.proposals import (
     DESIGNED,
     Event,
+    EventKind,
     Learning,
     Proposal,
     Updates,
@@ -161,12 +162,14 @@ def test_lie_is_refused_with_a_sentence(change: dict[str, Any], sentence: str) -
     (event,) = flight.events
     assert not event.change
     assert re.search(sentence, event.sentence), event.sentence
+    assert event.kind is EventKind.REFUSED
 
 
 def test_model_that_is_not_proposed_is_said() -> None:
     flight = Flight()
     flight.receive({}, sentence="innovations of q: not white")
     assert flight.sentences == ["no model: innovations of q: not white"]
+    assert flight.events[-1].kind is EventKind.NO_MODEL
 
 
 def test_proposal_for_other_parameters_or_beside_changed_ones_is_refused() -> None:
@@ -295,6 +298,7 @@ def test_deactivated_law_goes_back_to_start_and_takes_models_of_its_next_engagem
     u = flight.controller.state.u
     assert flight.step(1) == 1
     assert flight.sentences[-1] == "goes back to the law of the start: it was deactivated"
+    assert flight.events[-1].kind is EventKind.RESTART
     assert flight.controller.digest == START.digest()
     assert flight.controller.state.u.tobytes() == u.tobytes()
     assert flight.step(3) == 3  # said once
@@ -402,6 +406,7 @@ def test_parameters_that_diverged_are_not_taken_again_in_the_engagement(monkeypa
         "falls back to the law of the start: q diverges",
         "refused: found parameters that diverged in this engagement, expected others",
     ]
+    assert [event.kind for event in flight.events] == [EventKind.FLIES, EventKind.FALLBACK, EventKind.REFUSED]
     assert flight.controller.digest == START.digest()
     flight.controller.tick(flight.now_ns, active=False)
     flight.step(1)

@@ -104,7 +104,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     for run in runs[1:]:
         result = replay(run)
         assert result.equal()
-        assert result.compared.sum() == len(result.whole) > 200
+        assert result.compared.sum() == len(result.compared) > 200
         assert not result.notes
 
 
@@ -144,7 +144,7 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
         result = replay(log)
         assert result.equal()
         # the last complete chunk can end between the internals of a tick and its y
-        assert result.compared.sum() >= len(result.whole) - 1 > 100
+        assert result.compared.sum() >= len(result.compared) - 1 > 100
 
 
 def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:

@@ -294,7 +294,7 @@ def fly_in_process(
     def learned(event: Event) -> None:
         line = f"t = {event.stamp_ns / NANOSECONDS:.2f} s: {event.sentence}"
         with interrupt.deferred():
-            writer.write_learning(event.stamp_ns, event.sentence, warns=not event.change)
+            writer.write_learning(event.stamp_ns, event.kind, event.sentence, warns=not event.change)
             if event.change:
                 writer.write_changes(event.stamp_ns, f"/{CONTROLLER.executable}", event.change)
             (run / "log").mkdir(exist_ok=True)

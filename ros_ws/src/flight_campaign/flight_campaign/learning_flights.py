@@ -16,7 +16,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import require
 from flight_core.rates import period_ns
 from flight_core.tape import Tape
-from rise_di_controller.proposals import FLIES, REFUSED, Event
+from rise_di_controller.proposals import Event, EventKind
 
 MakeLearner = Callable[[Scenario], Learn | None]
 """Makes the learner of a scenario, as `flight_design.learning.scenario_learner.learner`. Raises ParameterError."""
@@ -33,12 +33,12 @@ class LearningOutcome(NamedTuple):
 
 def learned(tape: Tape, events: Sequence[Event]) -> LearningOutcome:
     """Outcomes of the identifications of a flight, from its tape and its events."""
-    flown = [event.stamp_ns for event in events if event.sentence.startswith(FLIES)]
-    changes = sum(bool(event.change) for event in events)
-    refused = sum(event.sentence.startswith(REFUSED) for event in events)
+    flown = [event.stamp_ns for event in events if event.kind is EventKind.FLIES]
+    fallbacks = sum(event.kind in {EventKind.FALLBACK, EventKind.RESTART} for event in events)
+    refused = sum(event.kind is EventKind.REFUSED for event in events)
     if "learned" in tape:
         refused += int(np.sum(tape["learned"]["proposed"] == 0.0))
-    return LearningOutcome(flown[0] / 1e9 if flown else math.nan, len(flown), refused, changes - len(flown))
+    return LearningOutcome(flown[0] / 1e9 if flown else math.nan, len(flown), refused, fallbacks)
 
 
 class Flight(NamedTuple):

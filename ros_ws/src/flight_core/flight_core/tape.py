@@ -94,7 +94,7 @@ class Tape:
 
     `start_ns` is the stamp of flight time t = 0, `outcome` from flight_core.outcome. Of a flight of `simulate`: `scenario`, and
     `changes` of the controller's parameters in flight. Of a log: `recording` by topic, `duration`, s, of a whole flight where
-    the log has it, and `processes` by name.
+    the log has it, `processes` by name, and how many samples of a topic were `refused`.
     """
 
     signals: Mapping[str, Signal]
@@ -106,6 +106,7 @@ class Tape:
     duration: float | None = None
     changes: tuple[Mapping[str, Any], ...] = ()
     processes: Mapping[str, Process] = field(default_factory=dict)
+    refused: Mapping[str, int] = field(default_factory=dict)
 
     def __getitem__(self, topic: str) -> Signal:
         """The signal of a topic. Raises ParameterError with the list of topics."""
@@ -119,6 +120,11 @@ class Tape:
     def time(self, topic: str) -> FloatArray:
         """Flight times of the samples of a topic in s, shape (N,): t = (stamp - start) / 1e9."""
         return (self[topic].stamp_ns - self.start_ns) / NANOSECONDS
+
+
+def refusal_note(topic: str, count: int) -> str:
+    """The note on refused samples of a topic."""
+    return f"{topic}: {count} samples refused: damaged, not finite, or of other channels"
 
 
 def as_tape(value: object) -> Tape:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What became of the proposals of a learner: messages of the topic `learning`, written and read without ROS."""
 
+import json
 from typing import Any
 
 from flight_core.rates import NANOSECONDS
@@ -14,13 +15,14 @@ OK = 0
 WARN = 1
 
 
-def learning_message(stamp_ns: int, sentence: str, *, warns: bool) -> bytes:
-    """A message of LEARNING, as the controller itself publishes it."""
+def learning_message(stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> bytes:
+    """A message of LEARNING, as the controller itself publishes it; `kind` is that of the event."""
     store = typestore()
-    types = {name: store.types[f"diagnostic_msgs/msg/{name}"] for name in ("DiagnosticArray", "DiagnosticStatus")}
+    types = {name: store.types[f"diagnostic_msgs/msg/{name}"] for name in ("DiagnosticArray", "DiagnosticStatus", "KeyValue")}
     stamp = store.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, NANOSECONDS))
     header = store.types["std_msgs/msg/Header"](stamp, "in_process")
-    status = types["DiagnosticStatus"](WARN if warns else OK, LEARNING, sentence, "", [])
+    event = types["KeyValue"]("event", json.dumps(kind))
+    status = types["DiagnosticStatus"](WARN if warns else OK, LEARNING, sentence, "", [event])
     return bytes(store.serialize_cdr(types["DiagnosticArray"](header, [status]), DIAGNOSTIC_ARRAY))
 
 

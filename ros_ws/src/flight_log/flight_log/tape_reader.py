@@ -21,7 +21,7 @@ from flight_core.outcome import UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, seconds
 from flight_core.scenario_file import A_SCENARIO
-from flight_core.tape import Recording, Signal, Tape
+from flight_core.tape import Recording, Signal, Tape, refusal_note
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
 from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
@@ -134,7 +134,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     nothing = f"no sample of a flight among {has}" if (has := listed(log.kinds)) else "no sample on any topic"
     unset = {topic: clock.unset for topic, samples in log.topics.items() if (clock := samples.recording()).unset}
     lacks = [f"{topic}: {count} samples without a usable stamp" for topic, count in unset.items()]
-    lacks += filter(None, (samples.note(topic) for topic, samples in log.topics.items()))
+    lacks += [refusal_note(topic, count) for topic, samples in log.topics.items() if (count := samples.refused())]
     require(bool(filled), str(run), "; ".join([nothing, *lacks, *log.notes_at(None)]), A_FLIGHT)
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
@@ -144,7 +144,8 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     stamped = names_within(aircraft, log.topics).items()
     recording = {printable(name): clock for topic, name in stamped if (clock := log.topics[topic].recording()).found}
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
-    sentences = [log.topics[topic].note(name) for topic, name in stamped]
+    refused = {printable(name): count for topic, name in stamped if (count := log.topics[topic].refused())}
+    sentences = [refusal_note(name, count) for name, count in refused.items()]
     sentences += [recording_note(name, clock, start_ns) for name, clock in recording.items()]
     sentences += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
     notes = [*log.notes_at(end), *filter(None, sentences)]
@@ -154,6 +155,7 @@ def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | N
     tape = Tape(
         signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments),
         processes={printable(name): process for name, process in processes.items()},
+        refused=refused,
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
@@ -322,10 +324,9 @@ class _TopicSamples:
         """The stamps in the order of the recording; after `signal`."""
         return self._clock.recording(self._unset)._replace(lost=self._lost if self._numbered and not self._restarted else None)
 
-    def note(self, name: str) -> str:
-        """The note on refused samples; empty without any."""
-        refused = self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
-        return f"{name}: {refused} samples refused: damaged, not finite, or of other channels" if refused else ""
+    def refused(self) -> int:
+        """How many samples were refused: damaged, not finite, or of other channels."""
+        return self._refused + sum(map(self._count, self._samples)) - (self._count(self._names()) if self._samples else 0)
 
 
 class _Log:

@@ -71,9 +71,10 @@ class TapeWriter:
         """Write a change of parameters of a node in flight, as the node itself publishes it."""
         self._write_message(PARAMETER_EVENTS, PARAMETER_EVENT, stamp_ns, parameter_event(stamp_ns, node, changes))
 
-    def write_learning(self, stamp_ns: int, sentence: str, *, warns: bool) -> None:
+    def write_learning(self, stamp_ns: int, kind: str, sentence: str, *, warns: bool) -> None:
         """Write what became of a proposal of a learner, as the controller itself publishes it."""
-        self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, learning_message(stamp_ns, sentence, warns=warns))
+        message = learning_message(stamp_ns, kind, sentence, warns=warns)
+        self._write_message(f"/{LEARNING}", DIAGNOSTIC_ARRAY, stamp_ns, message)
 
     def _write_message(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
         if topic not in self._channels:

@@ -27,7 +27,7 @@ from flight_ros.topics import AUTHORITY, INTERNALS, LEARNING, LOCKSTEP, PROPOSAL
 from rise_di_controller.controller import Controller
 from rise_di_controller.laws import AnyLaw
 from rise_di_controller.params import ControllerConfig
-from rise_di_controller.proposals import AUTHORITY_TICKS, REFUSED, Event, Learning, Proposal, authority_names
+from rise_di_controller.proposals import AUTHORITY_TICKS, Event, EventKind, Learning, Proposal, authority_names
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 BEHIND_NS = 1_000_000
@@ -270,11 +270,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def _say(self, event: Event) -> None:
         """Log and publish what became of a proposal."""
         sentence = bounded(event.sentence)
-        if event.change or not sentence.startswith(REFUSED):
-            self.get_logger().info(sentence)
-        else:
+        if event.kind is EventKind.REFUSED:
             self.get_logger().warning(sentence)
-        report = Report(event.stamp_ns, self.instance, sentence, warns=not event.change)
+        else:
+            self.get_logger().info(sentence)
+        report = Report(event.stamp_ns, self.instance, sentence, {"event": event.kind}, warns=not event.change)
         self._publish_learning(reports.encode(report, "learning"))
 
     def _warn_stale_inputs(self, now_ns: int) -> None:

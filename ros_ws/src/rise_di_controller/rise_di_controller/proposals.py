@@ -7,6 +7,7 @@ Pure: for the node and for the loop in one process.
 
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,9 +31,14 @@ OPTIONAL = ("feedforward.inputs", "feedforward.gravity", "feedforward.deviation"
 """Parameters of a design that it may lack: a part that was not learned had no feedforward, and has one with its model."""
 
 
-FLIES = "flies"
-REFUSED = "refused"
-"""First words of the sentence of an event: a proposal is taken, a proposal fails a check."""
+class EventKind(StrEnum):
+    """What an event of the learning is, also in the messages of the topic `learning`."""
+
+    FLIES = "flies"  # the controller has taken a proposal
+    REFUSED = "refused"  # a proposal fails a check of the controller
+    NO_MODEL = "no model"  # the learner has refused what it identified
+    FALLBACK = "fallback"  # to the law of the start, in all parts or in some
+    RESTART = "restart"  # the law was deactivated, and begins again with the parameters of the start
 
 
 class Proposal(NamedTuple):
@@ -49,6 +55,7 @@ class Event(NamedTuple):
     """What became of a proposal, or a fallback: a change of the parameters by dotted name, or none, and why."""
 
     stamp_ns: int
+    kind: EventKind
     change: Mapping[str, Any]
     sentence: str
 
@@ -140,7 +147,7 @@ class Learning:
     def receive(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         """Take a proposal, or refuse it with an event."""
         if refusal := self._refusal(proposal, now_ns, controller):
-            self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
+            self._refuse(refusal, now_ns)
         elif self._simulated:
             self._received[proposal.stamp_ns] = proposal
         else:
@@ -179,7 +186,8 @@ class Learning:
         reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
         self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
         self._diverged.add(controller.digest)
-        self._take(controller, now_ns, prepared(fallen), f"falls back to the law of the start{lasting}: {reason}")
+        what = f"falls back to the law of the start{lasting}: {reason}"
+        self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
     def _end_oscillations(self, periods: Mapping[str, float], controller: Controller, now_ns: int) -> RiseDiConfig:
@@ -191,7 +199,7 @@ class Learning:
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
         outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
         what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
-        self._take(controller, now_ns, prepared(fallen), what)
+        self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
 
     def _begin_again(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
@@ -206,7 +214,8 @@ class Learning:
         self._diverged.clear()
         if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self._start):
             return None
-        self._take(controller, now_ns, prepared(self._start), "goes back to the law of the start: it was deactivated")
+        what = "goes back to the law of the start: it was deactivated"
+        self._take(controller, now_ns, prepared(self._start), EventKind.RESTART, what)
         return self._start
 
     def _acts_ns(self, end_ns: int) -> int:
@@ -236,7 +245,7 @@ class Learning:
         if proposal.change:
             self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
         elif proposal.sentence:
-            self._announce(Event(now_ns, {}, f"no model: {proposal.sentence}"))
+            self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 
     def _certify(self, controller: Controller, now_ns: int) -> ControllerConfig | None:
         """A part of the certificate, in simulated time all of it; the parameters taken at its end."""
@@ -254,8 +263,8 @@ class Learning:
                 refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
                 without = outputs_without(end.value.parameters)
-                what = f"{FLIES} {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
-                self._take(controller, now_ns, end.value, what)
+                what = f"flies {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
+                self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
             refusal = f"found numbers too large or too small ({error.args[-1]}), expected those of a flight"
@@ -264,7 +273,7 @@ class Learning:
         else:
             return None
         self._certificate = None
-        self._announce(Event(now_ns, {}, f"{REFUSED}: {refusal}"))
+        self._refuse(refusal, now_ns)
         return None
 
     def _unfit(self, proposal: Proposal, controller: Controller) -> str:
@@ -280,10 +289,13 @@ class Learning:
             return ""
         return f"found a proposal beside the parameters {proposal.flown}, expected {controller.digest}: they changed meanwhile"
 
-    def _take(self, controller: Controller, now_ns: int, new: Prepared, sentence: str) -> None:
+    def _take(self, controller: Controller, now_ns: int, new: Prepared, kind: EventKind, sentence: str) -> None:
         change = changes(controller.parameters, new.parameters)
         controller.retune(new)
-        self._announce(Event(now_ns, change, sentence))
+        self._announce(Event(now_ns, kind, change, sentence))
+
+    def _refuse(self, refusal: str, now_ns: int) -> None:
+        self._announce(Event(now_ns, EventKind.REFUSED, {}, f"refused: {refusal}"))
 
 
 def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: RiseDiConfig) -> Generator[None, None, Prepared]:

@@ -38,7 +38,7 @@ from flight_core.modes import Mode
 from flight_core.outcome import IMPORT
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import period_ns
-from flight_core.tape import Tape, as_tape
+from flight_core.tape import Tape, as_tape, refusal_note
 from flight_core.units import si_per_unit
 from flight_log.bag import COMPARED
 from flight_log.clock import SINCE_EPOCH_NS
@@ -147,7 +147,7 @@ def summarise(
     outcome = tape.outcome if outcome is None else outcome
     for topic in ("y", "y_m"):
         unset = " with a stamp" if topic in tape.recording and tape.recording[topic].unset else ""
-        refused = "".join(f" ({note})" for note in tape.notes if note.startswith(f"{topic}: ") and "refused" in note)
+        refused = f" ({refusal_note(topic, tape.refused[topic])})" if topic in tape.refused else ""
         require(topic in tape, "the log", f"no sample of {topic}{unset}{refused}", "a flight with y and y_m")
     flight_account = account(tape, scenario, outcome) if flight_account is None else flight_account
     events = transients(scenario, tape)
