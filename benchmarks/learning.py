@@ -154,10 +154,10 @@ class Timed:
         """Of the learner."""
         self._own.take(stamp_ns, y, u, flown)
 
-    def propose(self, flown: int) -> LearnerResult:
+    def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """Of the learner."""
         begin = time.process_time()
-        proposal = self._own.propose(flown)
+        proposal = self._own.propose(flown, given_up)
         self.steps.append(time.process_time() - begin)
         return proposal
 

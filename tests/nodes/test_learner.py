@@ -111,7 +111,8 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
     )
     controller = chosen.rise_di()
     names = ("mode", "age", "parameters", *(f"y.{name}" for name in controller.outputs))
-    encoder = Encoder((*names, *(f"u.{name}" for name in controller.inputs)), "/controller#1")
+    names += tuple(f"u.{name}" for name in controller.inputs)
+    encoder = Encoder((*names, *(f"given_up.{name}" for name in controller.outputs)), "/controller#1")
     with world_of("-p", f"scenario_file:={chosen.path}", "-p", "lockstep:=true") as world:
         learner = world.make(LearnerNode)
         publisher = world.publisher(JointState, "/internals")
@@ -123,7 +124,7 @@ def test_deactivated_law_ends_the_record(tmp_path: Path) -> None:
             (7, Mode.ENGAGED),
             (8, Mode.ENGAGED),
         ):
-            zeros = np.zeros(len(controller.outputs) + len(controller.inputs))
+            zeros = np.zeros(2 * len(controller.outputs) + len(controller.inputs))
             publisher.publish(encoder.encode(nanoseconds(t), np.array([float(mode), 0.0, float(controller.digest()), *zeros])))
             learner.advance()
         learner.close()  # completes the search

@@ -234,7 +234,7 @@ def test_aircraft_that_learn_fly_as_in_single_process_simulation(tmp_path: Path)
 
     def learner(flown: Scenario) -> Learn:
         proposed = model.model_copy(update={"observer": None}) if flown.aircraft.uncertainty.number else model
-        made = SimpleNamespace(take=lambda *_: None, propose=lambda _: LearnerResult(proposed, "given"))
+        made = SimpleNamespace(take=lambda *_: None, propose=lambda *_: LearnerResult(proposed, "given"))
         return lambda _: made
 
     (folder := tmp_path / "learn").mkdir()

@@ -297,7 +297,7 @@ def test_internals_hold_integrals_and_what_limited_each_input() -> None:
     state = guard.initial_state(4)._replace(
         law=law_state, u_free=np.array([0.5, 5.0, -5.0, 0.9]), u=np.array([0.5, 1.0, -1.0, 0.7]), u_trim=np.full(4, 0.1)
     )
-    values = logged(state, guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8)
+    values = logged(state, guard.TickInputs(0, np.ones(4), np.zeros(4), 0.0, 0.01), limits, 0.0, 0.0, 7, 8, np.zeros(0))
     assert (values["e.q"], values["e_0.q"], values["integral_e.q"], values["Pi.q"]) == (1.0, 0.0, 2.0, 3.0)
     assert (values["u_free.aileron"], values["u.aileron"], values["u_trim.aileron"]) == (5.0, 1.0, 0.1)
     limited = [values[f"limited.{name}"] for name in PARAMS.inputs]

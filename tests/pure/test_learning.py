@@ -3,6 +3,7 @@
 """Learning in the air: a flight that learns beside the law alone, its replay, proposals that are wrong, and the fallback."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,7 +35,7 @@ from flight_design.learning.scenario_learner import learn_again, learner
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import read_run
 from rise_di_controller.linear_loop import LinearPlant, Loop, is_stable, linear_law
-from rise_di_controller.proposals import acting_inputs, authority, authority_names, given_up
+from rise_di_controller.proposals import acting_inputs, authority, authority_names, without_models
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
@@ -108,7 +109,7 @@ class Fixed:
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Nothing is learned."""
 
-    def propose(self, flown: int) -> LearnerResult:
+    def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """The next one."""
         return LearnerResult(self._proposals.pop(0), "given")
 
@@ -176,6 +177,15 @@ def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     assert [step.sentence for step in steps] == [f"record: found {length} s, expected 10 s" for length in (2.99, 3.01)]
     with pytest.raises(ParameterError, match=r"^the log: found at most 5\.02 s of ticks of an active controller"):
         learn_again(cut, scenario(learn={"updates": [6.0]}))
+
+
+def test_log_without_outputs_that_controller_gave_up_is_refused(flown: Flown) -> None:
+    tape = read_run(flown.run).tape
+    ticks = tape["internals"]
+    kept = [k for k, name in enumerate(ticks.names) if not name.startswith("given_up.")]
+    bare = Signal(ticks.stamp_ns, tuple(ticks.names[k] for k in kept), ticks.values[:, kept])
+    with pytest.raises(ParameterError, match=r"^the log: found no channels given_up\.\* of internals, expected a log that has"):
+        learn_again(replace(tape, signals={"internals": bare}), scenario())
 
 
 def test_effects_of_inputs_found_within_three_deviations(flown: Flown) -> None:
@@ -247,18 +257,27 @@ def test_part_that_the_controller_took_back_is_not_proposed_again(flown: Flown, 
     (change,) = parameter_changes(flown.run, "/controller", RiseDiConfig.model_fields)
     model = vary(start, change)
     assert isinstance(model, RiseDiConfig)
-    fallen = given_up(start, model, ["q", "V"])
+    fallen = without_models(start, model, ["q", "V"])
     learned = copy.deepcopy(flown.learner)
     # all but this part is as proposed
-    assert learned.propose(fallen.digest()) == LearnerResult(
+    assert learned.propose(fallen.digest(), ["q", "V"]) == LearnerResult(
         None, "no identification is due, and no part is tested for a change"
     )
     learned = copy.deepcopy(flown.learner)
     learned.propose(model.digest())
     learned._proposed, learned._last = 0, start  # a later proposal, which lost the race with the fallback
-    again = learned.propose(fallen.digest()).controller
+    again = learned.propose(fallen.digest(), ["q", "V"]).controller
     assert again is not None
     assert acting_inputs(again) == ("aileron", "rudder")
+    restarted = made_learner(scenario())  # it has proposed nothing yet
+    restarted._record = learned._record
+    restarted._first_ns = learned._first_ns
+    fresh = restarted.propose(without_models(start, start, ["q", "V"]).digest(), ["q", "V"]).controller
+    assert fresh is not None
+    assert acting_inputs(fresh) == ("aileron", "rudder")
+    none_left = without_models(start, fresh, ["p", "r"]).digest()
+    sentences = [restarted.propose(none_left, NAMES).sentence for _ in range(2)]
+    assert sentences == ["each part flies the law of the start from now on: no part is left to learn", ""]
 
 
 @pytest.mark.parametrize(

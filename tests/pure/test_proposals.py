@@ -17,7 +17,7 @@ from flight_core.modes import Mode
 from flight_core.parameters import flatten
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.vectors import StampedVector
-from rise_di_controller.controller import Controller
+from rise_di_controller.controller import Controller, ControlOutput
 from rise_di_controller.proposals import (
     DESIGNED,
     Event,
@@ -32,9 +32,9 @@ from rise_di_controller.proposals import (
     coupled,
     designed,
     fallen_back,
-    given_up,
     outputs_without,
     with_channels_of,
+    without_models,
 )
 from rise_di_controller.rise_di_config import LearnConfig, RiseDiConfig
 
@@ -58,13 +58,15 @@ class Flight:
         self.now_ns = END_NS
         self.engage()
 
-    def engage(self) -> None:
+    def engage(self) -> ControlOutput:
         """A tick with y and y_m of now."""
         now = StampedVector(self.now_ns, np.zeros(len(START.outputs)))
         self.controller.take_y(now, self.now_ns)
         self.controller.take_y_m(now, self.now_ns)
-        self.controller.tick(self.now_ns)
+        output = self.controller.tick(self.now_ns)
         assert self.controller.mode is Mode.ENGAGED
+        assert output is not None
+        return output
 
     def receive(self, change: dict[str, Any] | None = None, **replaced: Any) -> None:
         """A proposal of now."""
@@ -335,9 +337,12 @@ def test_part_that_oscillates_flies_the_law_of_the_start_to_the_end_of_the_engag
     assert isinstance(whole, RiseDiConfig)
     assert isinstance(fallen, RiseDiConfig)
     longitudinal = [name in {"q", "V"} for name in START.outputs]
-    assert fallen == given_up(START, whole, ["q", "V"])
+    assert fallen == without_models(START, whole, ["q", "V"])
     assert outputs_without(fallen) == ("q", "V")
-    assert outputs_without(given_up(START, fallen, ["r", "p"])) == START.outputs
+    flight.now_ns += 10_000_000
+    logged = dict(zip(flight.controller.names, flight.engage().internals.tolist(), strict=True))
+    assert [logged[f"given_up.{name}"] for name in ("q", "V", "p", "r")] == [1.0, 1.0, 0.0, 0.0]
+    assert outputs_without(without_models(START, fallen, ["r", "p"])) == START.outputs
     assert changes(fallen, fallen_back(START, whole, longitudinal)) == {"learn.without": None}
     assert acting_inputs(fallen) == ("aileron", "rudder")
     flight.now_ns += 10 * NANOSECONDS
@@ -368,7 +373,7 @@ def test_law_of_the_start_flies_where_all_parts_oscillate() -> None:
     assert fallen_back(START, whole, [True] * 4) == START
     assert fallen_back(START, START, [True, False, False, False]) == START
     flight = Flight()
-    flight.controller.retune(given_up(START, whole, START.outputs))
+    flight.controller.retune(without_models(START, whole, START.outputs))
     flight.receive()
     flight.step()
     refused = "refused: proposal: found no model, expected one of other outputs than q, p, r, V, by learn.without"
@@ -424,7 +429,7 @@ def test_part_has_no_further_model_after_its_second_fallback(monkeypatch: pytest
         flight.receive(faded(time))
         flight.step()
         diverge(flight, monkeypatch, "q")
-    assert flight.controller.parameters == given_up(START, START, ["q", "V"])
+    assert flight.controller.parameters == without_models(START, START, ["q", "V"])
     for time in (0.7, 0.8):
         flight.receive(faded(time))
         flight.step()

@@ -73,6 +73,7 @@ class Controller:
         self.period_ns = self._guard.period_ns
         self._number = 0  # of the last `internals`
         self._first = self._parameters = parameters
+        self._given_up = parameters.given_up()
         self._first_law = True
         self._learned = _with_feedforward(parameters)
         zero = np.zeros(len(parameters.outputs))
@@ -141,6 +142,7 @@ class Controller:
         self._guard = new.guard
         self._digest = new.digest
         self._parameters = new.parameters
+        self._given_up = new.parameters.given_up()
         self._first_law = self._has_first_model(new.parameters)
         self._learned = _with_feedforward(new.parameters)
 
@@ -243,7 +245,8 @@ class Controller:
         age = seconds(now_ns - inputs.stamp_ns)
         limits = self._guard
         digest = self._digest
-        log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest)
+        given_up = self._given_up
+        log = partial(internals.values, self._state, inputs, limits, seconds(late_ns), age, self._number, digest, given_up)
         return ControlOutput(inputs.stamp_ns, self._state.command, inputs, log)
 
     def overrun(self, last_ns: int, now_ns: int) -> tuple[int, ...]:

@@ -19,7 +19,10 @@ EFFECTOR = "effector"  # group of an allocation
 # groups of the vanes of an observer
 VANE_STATE = ("vane_mean", "vane_square", "vane_measures")
 VANE_READING = ("vane", "vane_m")
-RESERVED = frozenset({*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, *VANE_STATE, *VANE_READING, EFFECTOR}) - {"e"}
+GIVEN_UP = "given_up"  # group of a controller that learns
+RESERVED = frozenset(
+    {*SCALARS, *OUTPUT_GROUPS, *INPUT_GROUPS, *OBSERVER_GROUPS, *VANE_STATE, *VANE_READING, EFFECTOR, GIVEN_UP}
+) - {"e"}
 """Names reserved by the log, not for the state of a law. e is y - y_m."""
 
 
@@ -70,10 +73,18 @@ def names(grouped: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 
 def values(
-    state: ControllerState, inputs: TickInputs, guard: GuardParams, late: float, age: float, number: int, parameters: int
+    state: ControllerState,
+    inputs: TickInputs,
+    guard: GuardParams,
+    late: float,
+    age: float,
+    number: int,
+    parameters: int,
+    given_up: FloatArray,
 ) -> FloatArray:
     """Values of `internals` in the order of `names`. Raises ValueError for a state never engaged.
 
+    `given_up` is 1 for an output without a model to the end of the engagement, (m,), and empty without a learner.
     With an allocation an input is limited by MAGNITUDE where it, or any effector, is at an end.
     """
     if state.law is None:
@@ -93,4 +104,4 @@ def values(
     by_output = (inputs.y, inputs.y_m, inputs.y - inputs.y_m, *state_values.values())
     by_input = (state.u_free, state.u, state.u_trim, limited, state.u_ff)
     effectors = () if state.effectors is None else (state.effectors,)
-    return np.concatenate([scalars, *by_output, *by_input, *observer_values, *readings, *effectors])
+    return np.concatenate([scalars, *by_output, *by_input, *observer_values, *readings, *effectors, given_up])

@@ -438,6 +438,10 @@ class ControllerConfig(NodeConfig):
         guard = self.guard()
         return guard.limits if guard.allocation is None else guard.allocation.limits
 
+    def given_up(self) -> FloatArray:
+        """1 for an output without a model to the end of the engagement, else 0, (m,); empty without a learner."""
+        return np.zeros(0)
+
     def history_ticks(self) -> int:
         """Ticks of the last y and u from which an observer that is replaced in flight starts."""
         return 0

@@ -181,7 +181,7 @@ class Learning:
         part = [name for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True) if diverges]
         self._fallbacks.update(part)
         ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
-        fallen = given_up(self._start, self._start, {*outputs_without(flown), *ended})
+        fallen = without_models(self._start, self._start, {*outputs_without(flown), *ended})
         lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
         reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
         self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
@@ -195,7 +195,9 @@ class Learning:
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
-        fallen = given_up(self._start, flown, [name for name, without in zip(flown.outputs, bare, strict=True) if without])
+        fallen = without_models(
+            self._start, flown, [name for name, without in zip(flown.outputs, bare, strict=True) if without]
+        )
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
         outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
         what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
@@ -468,7 +470,7 @@ def outputs_without(parameters: ControllerConfig) -> tuple[str, ...]:
     return () if learn is None else learn.without or ()
 
 
-def given_up(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]) -> RiseDiConfig:
+def without_models(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection[str]) -> RiseDiConfig:
     """What flies, with the law of the start in some outputs to the end of the engagement, added to `learn.without`."""
     fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns

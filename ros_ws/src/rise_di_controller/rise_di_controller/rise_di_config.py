@@ -12,6 +12,7 @@ import numpy as np
 from flight_core.fields import Field
 from flight_core.parameters import Config, Numbers, ParameterError, Positive, Positives, require, require_length
 from flight_core.vectors import FloatArray
+from rise_di_controller import internals
 from rise_di_controller.control_law import ControlLaw, TunedLaw
 from rise_di_controller.feedforward import Nominal
 from rise_di_controller.guard import GuardParams
@@ -256,6 +257,17 @@ class RiseDiConfig(ControllerConfig):
         speed = np.float64(self.schedule.speed)
         time = np.float64(self.schedule.time)
         return TunedLaw(with_schedule(law.control_law), ScheduleParams(law.params, speed, self._airspeed(), time, over))
+
+    def logged_groups(self, law: ControlLaw | None = None) -> dict[str, tuple[str, ...]]:
+        """Also the outputs that are given up, of a controller that learns."""
+        grouped = super().logged_groups(law)
+        return grouped if self.learn is None else grouped | {internals.GIVEN_UP: self.outputs}
+
+    def given_up(self) -> FloatArray:
+        """By `learn.without`."""
+        if self.learn is None:
+            return np.zeros(0)
+        return np.array([float(name in (self.learn.without or ())) for name in self.outputs])
 
     def history_ticks(self) -> int:
         """HISTORY where the models are learned."""

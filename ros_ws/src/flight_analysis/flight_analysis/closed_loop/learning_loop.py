@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A learner beside a controller in a loop of one process, and what a learner is."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from flight_core.modes import Mode
 from flight_core.vectors import FloatArray
 from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.proposals import Event, Learning, Proposal, designed
+from rise_di_controller.proposals import Event, Learning, Proposal, designed, outputs_without
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
@@ -27,8 +27,12 @@ class Learner(Protocol):
     def take(self, stamp_ns: int, y: FloatArray, u: FloatArray, flown: int) -> None:
         """Take y and u, after its limits, of a tick of the engaged law, (m,), and the digest of its parameters."""
 
-    def propose(self, flown: int) -> LearnerResult:
-        """Parameters from the record so far; `flown` is the digest of the parameters at its end."""
+    def propose(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
+        """Parameters from the record so far.
+
+        `flown` is the digest of the parameters at its end, `given_up` the outputs that have no model to the end of the
+        engagement.
+        """
 
 
 Learn = Callable[[RiseDiConfig], Learner]
@@ -125,6 +129,6 @@ class LearningLoop:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u, controller.digest)
         if not self._learning.ticked(controller, now_ns):
             return None
-        proposal = self._learner.propose(controller.digest)
+        proposal = self._learner.propose(controller.digest, outputs_without(controller.parameters))
         self._learning.receive(as_received(proposal, self._parameters, now_ns, controller.digest), controller, now_ns)
         return self._identifications.next(proposal)

@@ -7,9 +7,9 @@ refused with a sentence. The controller refuses parameters that fail its own che
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from itertools import chain, combinations, pairwise, product
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -39,7 +39,7 @@ from flight_design.identification.model_identification import (
 )
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from rise_di_controller import divergence
-from rise_di_controller.proposals import given_up, outputs_without, with_channels_of
+from rise_di_controller.proposals import outputs_without, with_channels_of, without_models
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 AT_BOUND = 1  # entries at their bound: the right model may have one that hardly shows, wrong ones have two to six
@@ -117,10 +117,10 @@ class Learner:
         self._dead: dict[tuple[str, ...], str] = {}
         self._start = controller  # with the `learn.without` of what flies
         self._has_ended = False
-        self._give_up(controller)
+        self._give_up(outputs_without(controller))
         self._changed: set[tuple[str, ...]] = set()  # parts whose model is that of before a change
-        self._flew = self._last = controller  # the last proposal that flew, and the last one
-        self._proposed = controller.digest()  # of the last one
+        self._last = controller  # the last proposal
+        self._proposed = controller.digest()  # of the last proposal
         self._proposals = set[int]()  # digests of all of them
         self.identification: Identification | None = None  # the last one
 
@@ -157,7 +157,7 @@ class Learner:
         )
         return Recording(self._period, t, y, u)
 
-    def propose(self, flown: int) -> LearnerResult:
+    def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
         """Parameters with the observer and the feedforward of what was identified, or the sentence of a refusal.
 
         The last RECORD seconds are tested for a loss of effect of inputs. After a loss the older record is left out, and the
@@ -166,21 +166,21 @@ class Learner:
         itself.
 
         Where the last proposal does not fly, by the digest `flown`, an identification is due: the proposal was refused, or the
-        controller fell back. Outputs that the controller took back, because they oscillated, are not proposed again. Where no
-        part is left, nothing is identified, and the sentence says so once.
+        controller fell back. Outputs that the controller gave up, `given_up`, are not proposed again. Where no part is left,
+        nothing is identified, and the sentence says so once.
         """
         try:
-            return self._proposal(flown)
+            return self._proposal(flown, given_up)
         except ParameterError as error:  # no steady airspeed, no motion, or no design
             return LearnerResult(None, str(error))
 
-    def _proposal(self, flown: int) -> LearnerResult:
+    def _proposal(self, flown: int, given_up: Sequence[str]) -> LearnerResult:
         """The proposal of `propose`. Raises ParameterError where there is none."""
         end_ns = self._record[-1].stamp_ns if self._record else 0
         length = seconds(end_ns - self._record[0].stamp_ns) + self._period if self._record else 0.0  # lost ticks included
         if length < SHORTEST - self._period:
             return LearnerResult(None, f"record: found {length:.3g} s, expected {SHORTEST:g} s")
-        self._note_fallback(flown)
+        self._note_given_up(flown, given_up)
         lost = flown != self._proposed
         if is_within(self._controller.outputs, chain.from_iterable(self._dead)) and not lost:
             ended, self._has_ended = self._has_ended, True
@@ -239,32 +239,23 @@ class Learner:
         self._proposals.add(self._proposed)
         return LearnerResult(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
 
-    def _note_fallback(self, flown: int) -> None:
-        """Give up the outputs that fly the law of the start to the end of the engagement, by the digest of what flies.
-
-        The rest of it is the last proposal, the one before, which flew, or the start.
-        """
-        if flown == self._proposed:
-            self._flew = self._last
-        if flown in {self._proposed, self._start.digest()}:
+    def _note_given_up(self, flown: int, outputs: Sequence[str]) -> None:
+        """Give up the outputs that the controller gave up. The rest of what flies is the last proposal, or it was refused."""
+        if set(outputs) <= set(outputs_without(self._start)):
             return
-        names = self._controller.outputs
-        subsets = [outputs for count in range(1, len(names) + 1) for outputs in combinations(names, count)]
-        for model, outputs in product((self._last, self._flew, self._start), subsets):
-            fallen = given_up(self._controller, model, outputs)
-            if fallen.digest() == flown:
-                self._give_up(fallen)
-                if model is self._last:  # else it does not fly: the controller refused it
-                    self._last = fallen
-                    self._proposed = flown
-                return
+        self._give_up(outputs)
+        rest = without_models(self._controller, self._last, outputs)
+        if rest.digest() == flown:
+            self._last = rest
+            self._proposed = flown
 
-    def _give_up(self, flown: RiseDiConfig) -> None:
-        """Leave the outputs of `learn.without` to the law of the start."""
-        self._start = given_up(self._controller, self._controller, outputs_without(flown))
-        if without := outputs_without(flown):
-            self._dead[without] = ""
-            self._known = {part: known for part, known in self._known.items() if not is_within(part, without)}
+    def _give_up(self, outputs: Sequence[str]) -> None:
+        """Leave outputs to the law of the start, by `learn.without`."""
+        self._start = without_models(self._controller, self._controller, outputs)
+        if outputs:
+            part = outputs_without(self._start)
+            self._dead[part] = ""
+            self._known = {names: known for names, known in self._known.items() if not is_within(names, part)}
 
     def _is_due(self, end_ns: int) -> bool:
         """Whether an identification is planned by now: at `learn.updates`, then once a window."""

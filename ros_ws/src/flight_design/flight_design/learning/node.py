@@ -29,6 +29,7 @@ from flight_ros.messages import Decoder
 from flight_ros.reports import Report
 from flight_ros.ticker import Tick
 from flight_ros.topics import INTERNALS, LEARNED, LOCKSTEP, PROPOSAL, RECORD_FOREIGN
+from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.proposals import Updates
 
 PERIOD_NS = NANOSECONDS // 10
@@ -55,6 +56,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._settings, self._new_learner = self._start.learn, partial(make, self._start)
         names = ("mode", "age", "parameters", *(f"y.{name}" for name in self._start.outputs))
         names += tuple(f"u.{name}" for name in self._start.inputs)
+        names += tuple(f"{GIVEN_UP}.{name}" for name in self._start.outputs)
         self._internals = self.receive(
             INTERNALS,
             Decoder(names).decode,
@@ -68,6 +70,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._proposal = LearnerResult(None, "")
         self._end_ns = 0
         self._flown = 0
+        self._given_up: tuple[str, ...] = ()
         self._begin()
 
     def _begin(self) -> None:
@@ -126,7 +129,7 @@ class LearnerNode(FlightNode[LearnerConfig]):
 
     def _take(self, sample: StampedVector, now_ns: int) -> None:
         mode, age, flown = sample.value[:3].tolist()
-        y, u = np.split(sample.value[3:], 2)
+        y, u, given_up = np.split(sample.value[3:], 3)
         if mode == Mode.INACTIVE:  # the next engagement begins with the law of the start
             if self._has_record:
                 self._begin()
@@ -136,13 +139,14 @@ class LearnerNode(FlightNode[LearnerConfig]):
         self._has_record = True
         self._end_ns = sample.stamp_ns + round(age * NANOSECONDS)
         self._flown = int(flown)
+        self._given_up = tuple(name for name, is_left in zip(self._start.outputs, given_up, strict=True) if is_left)
         self._is_due = self._updates.due(self._end_ns) or self._is_due
 
     def _propose(self) -> None:
         if not self.parameters.lockstep:
             os.nice(NICE)  # Linux: of this thread alone
         try:
-            self._proposal = self._learner.propose(self._flown)
+            self._proposal = self._learner.propose(self._flown, self._given_up)
         except Exception as error:  # the flight goes on, and in lockstep waits for a proposal
             self.get_logger().error(f"unexpected exception: {traceback.format_exc()}")
             self._proposal = LearnerResult(None, f"the identification failed: {' '.join(str(error).split())}")

@@ -20,6 +20,7 @@ from flight_design.gains.gain_design import observed
 from flight_design.identification.model_identification import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched
 from flight_design.learning.learner import Learner
+from rise_di_controller.internals import GIVEN_UP
 from rise_di_controller.proposals import Updates
 from rise_di_controller.rise_di_config import RiseDiConfig
 
@@ -116,6 +117,14 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
     flown = ticks["parameters"]
     start = controller.digest()
     is_of_log = bool(np.any(flown == start))
+    given_up = ticks.group(GIVEN_UP)
+    is_complete = not is_of_log or given_up.names == controller.outputs
+    require(
+        is_complete,
+        "the log",
+        f"no channels {GIVEN_UP}.* of internals",
+        "a log that has the outputs that the controller gave up",
+    )
     (learned, updates), proposed, begin_ns, longest_ns = begun(), start, instants_ns[0], 0
     for k, (stamp_ns, now_ns) in enumerate(zip(ticks.stamp_ns.tolist(), instants_ns.tolist(), strict=True)):
         if mode[k] == Mode.INACTIVE:
@@ -126,7 +135,8 @@ def learn_again(tape: Tape, scenario: Scenario) -> LearnResult:
         if mode[k] == Mode.ENGAGED:
             learned.take(stamp_ns, np.array(y[k]), np.array(u[k]), int(flown[k]) if is_of_log else proposed)
         if updates.due(now_ns):
-            proposal = learned.propose(int(flown[k]) if is_of_log else proposed)
+            left = tuple(name for name in given_up.names if is_of_log and given_up[name][k])
+            proposal = learned.propose(int(flown[k]) if is_of_log else proposed, left)
             proposed = proposed if proposal.controller is None else proposal.controller.digest()
             t = (now_ns - tape.start_ns) / NANOSECONDS
             if proposal.sentence:
