@@ -190,7 +190,8 @@ def test_private_names_of_rclpy_are_in_one_file() -> None:
 
 def has_private_names(path: Path) -> bool:
     """Whether a file imports rclpy.impl, or reads a `handle` beside an import of rclpy."""
-    nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+    text = path.read_text(encoding="utf-8")
+    nodes = list(ast.walk(ast.parse(text))) if "rclpy" in text else []
     modules = [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     reads_handle = any(isinstance(node, ast.Attribute) and node.attr == "handle" for node in nodes)
     return any(name.startswith("rclpy.impl") or (name.startswith("rclpy") and reads_handle) for name in modules)
