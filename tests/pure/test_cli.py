@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.cli import COMMANDS, application
 
 pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
@@ -77,6 +79,8 @@ def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
     [
         (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
         (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
+        (["fly", "--set", "wind.sigma=1"], "error: --set: found 'wind.sigma=1', expected a parameter of the scenario and"),
+        (["fly", "--set", "controller.k_g"], "error: --set: found 'controller.k_g', expected a parameter of the scenario and"),
         (["report", "nowhere"], "error: nowhere: found no such file or folder"),
     ],
 )
@@ -86,6 +90,17 @@ def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: 
     assert shown.stderr.startswith(sentence)
     assert len(shown.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
+    settings = ("--set", "controller.k_g=2.5", "--set", "controller.learn.window=40", "--set", "flight.duration=0.2")
+    shown = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    flown = recorded_scenario(tmp_path / "runs" / "latest")
+    expected = find_scenario("osprey_learn").rise_di().learn
+    assert expected is not None
+    assert (flown.flight.duration, flown.rise_di().k_g) == (0.2, 2.5)
+    assert flown.rise_di().learn == expected.model_copy(update={"window": 40.0})
 
 
 def test_help_names_every_option() -> None:

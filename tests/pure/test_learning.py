@@ -165,6 +165,14 @@ def test_log_teaches_what_flight_taught_and_model_starts_next_flight(flown: Flow
         learner(scenario(learn={"prior": "navion_lateral"}))
 
 
+def test_log_teaches_with_other_settings(flown: Flown) -> None:
+    """The flight has other parameters than what this learner proposes: it knows no refusal, and identifies once a window."""
+    result = CliRunner().invoke(application(["learn"]), ["learn", str(flown.run), "--set", "controller.learn.updates=[10]"])
+    first, second = (line for line in result.output.splitlines() if line.startswith("t ="))
+    assert first.startswith("t = 10.00 s: B["), result.output
+    assert second.startswith("t = 20.00 s: no model: the aircraft has not changed"), result.output
+
+
 def test_deactivated_law_ends_the_record_of_a_log(flown: Flown) -> None:
     tape = read_run(flown.run).tape
     ticks, t = tape["internals"], tape.time("internals")

@@ -22,6 +22,7 @@ from flight_cli.output import (
     show_flight,
 )
 from flight_cli.route_options import Altitude, Line, Simplify, parse_origin, read_waypoints
+from flight_cli.settings import Settings, with_settings
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -35,6 +36,7 @@ def fly(
     context: typer.Context,
     scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
     duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
+    settings: Settings = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Fly in one process without ROS, as fast as it goes.")
     ] = False,
@@ -77,7 +79,7 @@ def fly(
     Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a leg
     missed or not flown, 130 interrupted.
     """
-    chosen = find_scenario(scenario, duration, with_route=route is None)
+    chosen = with_settings(find_scenario(scenario, duration, with_route=route is None), settings)
     require(
         not (in_process and (lockstep or one_process or composed)),
         "--in-process",
@@ -104,7 +106,7 @@ def fly(
     learn = _learner(chosen)
     run = new_run(chosen, runs)
     context.call_on_close(partial(remove_empty, run))
-    if files is not None:
+    if files is not None or settings:
         chosen = written(chosen, run / f"{chosen.name}.yaml")
     if watch:
         from flight_cli.watch import watched  # noqa: PLC0415 - loads the server, which few flights need

@@ -3,7 +3,7 @@
 """`rise-di learn`: repeat the learner on the log of a flight, with other settings, and write the model."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
@@ -12,7 +12,8 @@ from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.metrics import errors_by_model
 from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
-from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, parse_numbers, print_json, write_text
+from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, print_json, write_text
+from flight_cli.settings import Settings, with_settings
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -24,15 +25,13 @@ NOTHING_LEARNED = 1
 
 def learn(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
-    window: Annotated[float | None, typer.Option(help="Length of the record of y and u, s.")] = None,
-    updates: Annotated[str | None, typer.Option(help="Times of the identifications, s, with commas.")] = None,
-    prior: Annotated[str | None, typer.Option(help="Airframe file of the rough model.")] = None,
+    settings: Settings = None,
     write: Annotated[Path | None, typer.Option(help="File for the learned model, an airframe file.")] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Repeat the learner on the log of a flight, with the settings of its scenario or others.
+    """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set controller.learn.*, others.
 
     y and u are those of the log: a flight without a learner can be learned from too, if its controller has an observer. With
     --write the model becomes an airframe file, from which `controller.learn.prior` starts the next flight. Exit status: 0 a
@@ -41,19 +40,14 @@ def learn(
     if write is not None:
         require(write.suffix == ".yaml", "--write", write, "a name that ends in .yaml, as airframe files do")
         require(write.parent.is_dir(), "--write", write, "a file in a folder that exists")
-    changed: dict[str, Any] = {"window": window, "prior": prior}
-    if updates is not None:
-        changed["updates"] = times = parse_numbers(updates)
-        require(bool(times), "--updates", repr(updates), "seconds with commas, as 10,15,30")
     recorded = read_run(run, namespace, scenario_file(scenario))
     recorded.require()
     warn_of_lacks(recorded)
     flown = recorded_scenario(recorded)
-    settings = flown.controller.model_dump().get("learn") or {}
-    settings |= {name: value for name, value in changed.items() if value is not None}
+    others = with_settings(flown, settings)
     console = Console(quiet=as_json)
     with console.status(f"learning from {printable(str(run))}"):
-        result = learn_again(recorded.tape, flown.vary(controller={"learn": settings}))
+        result = learn_again(recorded.tape, others)
     for step in result.steps:
         console.print(
             f"t = {step.t:.2f} s: {'' if step.proposed else 'no model: '}{step.sentence}",

@@ -22,7 +22,7 @@ from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, write_text
-from flight_core.files import parse_yaml
+from flight_cli.settings import Settings, parse_settings
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -33,10 +33,7 @@ DIFFERS = 1
 
 def replay(
     run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file.")] = LATEST,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="A parameter to change, as in controller.Lambda='[5, 5, 3, 1]'; may be repeated."),
-    ] = None,
+    settings: Settings = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")] = None,
@@ -48,8 +45,8 @@ def replay(
     Exit status: 0 every bit equal, 1 a tick differs or flew with other parameters, 2 bad input, 4 every bit equal, and less
     than 99 % of the ticks are in the log with y and u.
     """
-    changed = dict(map(_parse_setting, settings or []))
-    require(len(changed) == len(settings or []), "--set", "a parameter twice", "each once")
+    changes = parse_settings(settings, "controller")
+    changed = {name.removeprefix("controller."): value for name, value in changes.items()}
     scenario_source = scenario_file(scenario)
     with Console(stderr=True, quiet=as_json).status(f"computing {printable(str(run))} again"):
         recorded = read_run(run, namespace, scenario_source)
@@ -100,14 +97,6 @@ def _guidance_as_json(guided: GuidanceReplay) -> dict[str, Any]:
     first = guided.first
     shown = None if first is None else {**first._asdict(), "ulps": first.ulps}
     return {"steps": guided.steps, "checked": guided.checked, "differing": guided.differing, "first": shown}
-
-
-def _parse_setting(text: str) -> tuple[str, Any]:
-    name, equals, value = text.partition("=")
-    key = name.strip().removeprefix("controller.")
-    fits = bool(equals) and key != name.strip()
-    require(fits, "--set", repr(text), "a parameter of the controller and its value, as in controller.k_g=2.0")
-    return key, parse_yaml(value, f"--set {text!r}", "a value")
 
 
 def _parameter_notes(result: ReplayResult, *, open_loop: bool) -> list[str]:

@@ -110,6 +110,13 @@ class Config:
             return None
         return built
 
+    def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        """The values with changes by dotted name, not validated; None removes a parameter. Raises ParameterError."""
+        flat = dict(flatten(self.model_dump()))
+        for name in changes:
+            flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
+        return nest(flat | dict(changes))
+
     def _check(self) -> None:
         """Check relations between the values. Raises ParameterError."""
 

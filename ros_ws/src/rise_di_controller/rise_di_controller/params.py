@@ -6,7 +6,7 @@ The parameters of a law are a subclass; `AnyLaw.validate_mapping` finds it by th
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from hashlib import blake2b
 from itertools import combinations
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -27,7 +27,6 @@ from flight_core.parameters import (
     Positives,
     Signs,
     flatten,
-    nest,
     require,
     require_channels,
     require_length,
@@ -373,13 +372,6 @@ class ControllerConfig(NodeConfig):
         if self.observer is None or not self.vanes:
             return self
         return self.model_copy(update={"observer": self.observer.model_copy(update={"vanes": None})})
-
-    def changed(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """The values with changes by dotted name, not validated; None removes a parameter. Raises ParameterError."""
-        flat = dict(flatten(self.model_dump()))
-        for name in changes:
-            flat = {key: value for key, value in flat.items() if key != name and not key.startswith(name + ".")}
-        return nest(flat | dict(changes))
 
     def check_law(self) -> None:
         """Checks of the law's own parameters against each other and the channels. Raises ParameterError."""

@@ -1,0 +1,49 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The option --set: parameters of a scenario by their keys."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any
+
+import typer
+
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_core.files import parse_yaml
+from flight_core.parameters import Config, nest, require
+
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="A parameter to change, as in controller.k_g=2.0; may be repeated."),
+]
+
+
+def parse_settings(settings: Sequence[str] | None, owner: str = "scenario") -> dict[str, Any]:
+    """The values by key, as controller.k_g; `owner` is the only section, or the scenario. Raises ParameterError."""
+    changes: dict[str, Any] = {}
+    for text in settings or ():
+        name, equals, value = text.partition("=")
+        key = name.strip()
+        section = key.partition(".")[0]
+        fits = bool(equals) and section != key and section in (SCHEMAS if owner == "scenario" else {owner})
+        require(fits, "--set", repr(text), f"a parameter of the {owner} and its value, as in controller.k_g=2.0")
+        require(key not in changes, "--set", "a parameter twice", "each once")
+        changes[key] = parse_yaml(value, f"--set {text!r}", "a value")
+    return changes
+
+
+def with_settings(scenario: Scenario, settings: Sequence[str] | None) -> Scenario:
+    """The scenario with the parameters of --set. Raises ParameterError."""
+    sections: dict[str, dict[str, Any]] = defaultdict(dict)
+    for name, value in parse_settings(settings).items():
+        section, _, key = name.partition(".")
+        sections[section][key] = value
+    return scenario.vary(**{name: _changed(getattr(scenario, name, None), changes) for name, changes in sections.items()})
+
+
+def _changed(section: object, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The parameters of a section that change, with all keys of a group of which one changes."""
+    if not isinstance(section, Config):
+        return nest(changes)
+    values = section.changed(changes)
+    return {name: values[name] for name in {key.partition(".")[0] for key in changes}}
