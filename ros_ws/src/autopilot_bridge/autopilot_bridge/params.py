@@ -321,12 +321,20 @@ class ChannelMap(Config):
 
     def _check(self) -> None:
         outputs = ", ".join(self.outputs)
-        messages = ", ".join(self.messages)
         require(self.instant in self.outputs, "instant", f"{self.instant!r}", f"one of the outputs {outputs}")
         instant_row = self.outputs[self.instant]
         require(not instant_row.held, f"outputs.{self.instant}.held", "true", "false: its stamp is that of y")
         self._check_fields()
         self._check_topics()
+        self._check_inputs()
+        self._check_channels()
+        self._check_limits()
+        self._check_conditions()
+        self._check_parameters()
+
+    def _check_inputs(self) -> None:
+        """Check the fields of the inputs, and the values in trim and at the limits against the range of the field."""
+        messages = ", ".join(self.messages)
         owners: dict[tuple[str, str], str] = {}
         for name, row in self.inputs.items():
             key = f"inputs.{name}"
@@ -344,6 +352,9 @@ class ChannelMap(Config):
                 require(inside, f"{key}.{limit}", f"{row.field} = {raw:.6g}", f"one in the range [{low:g}, {high:g}]")
             neutral = low if row.neutral == "trim" else row.neutral
             require(low <= neutral <= high, f"{key}.neutral", row.neutral, f"one in the range [{low:g}, {high:g}]")
+
+    def _check_channels(self) -> None:
+        """Check the names of channels by section."""
         for name in self.trims:
             require(name in self.inputs, f"trims.{name}", "a channel", f"one of the inputs {', '.join(self.inputs)}")
         for name in self.pose:
@@ -357,6 +368,9 @@ class ChannelMap(Config):
                 "a channel of y or of the pose too",
                 "a name of its own",
             )
+
+    def _check_limits(self) -> None:
+        """Check the limits of watched channels."""
         watched = [*self.pose, *self.outputs, *self.sensors]
         for section, limits in (("envelope", self.envelope), ("engage_if", self.engage_if)):
             for name, (lower, upper) in limits.items():
@@ -367,6 +381,9 @@ class ChannelMap(Config):
                     f"one of the pose, of y or of the sensors: {', '.join(watched)}",
                 )
                 require(lower < upper, f"{section}.{name}", [lower, upper], "the lower end before the upper one")
+
+    def _check_conditions(self) -> None:
+        """Check the thresholds of conditions and overrides."""
         for name, condition in self.conditions.items():
             ways = "both" if condition.one_of else "neither"
             require(
@@ -377,6 +394,8 @@ class ChannelMap(Config):
             threshold_text = " and ".join(thresholds) or "no threshold"
             require(len(thresholds) == 1, f"overrides.{name}", threshold_text, "one of above, below and moved")
 
+    def _check_parameters(self) -> None:
+        """Check the names and the limits of parameters of the autopilot."""
         for parameter, required in self.parameters.items():
             is_name = PARAMETER.fullmatch(parameter) is not None
             require(is_name, f"parameters.{parameter}", "no name of a parameter", "one such as RC_OVERRIDE_TIME")
