@@ -478,12 +478,7 @@ def command(
     limits = params.limits
     flies = state.mode is Mode.ENGAGED
     if flies:
-        alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
-        turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
-        flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
-        rolling = abs(y["p"]) / params.attitude.roll_rate
-        slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
-        state = state._replace(alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt))
+        state = _with_estimates(state, pose, y, speed, dt, params)
 
     xp = array_namespace(speed)
     bank = protection.bank_limit(limits.bank, limits.stall_speed, speed)
@@ -530,6 +525,23 @@ def command(
         slew_limited=reduce(or_, (value != wanted[name] for name, value in zip(params.outputs, u_m, strict=True))),
     )
     return state._replace(climb_c=climb_c, V_c=V_c, u_m=u_m), commands
+
+
+def _with_estimates(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    y: Mapping[str, Scalar],
+    speed: Scalar,
+    dt: float,
+    params: GuidanceParams,
+) -> GuidanceState:
+    """The state with new estimates of the angle of attack, the slip and the wind."""
+    alpha = alpha_estimate(state.alpha, state.theta, pose["climb"], speed, dt, params.vertical)
+    turn = GRAVITY * array_namespace(speed).tan(tilt(state.phi))
+    flown = speed * heading_rate(state.phi, state.theta, y["q"], y["r"])
+    rolling = abs(y["p"]) / params.attitude.roll_rate
+    slip = slip_estimate(state.slip, turn, flown, rolling, dt, params.vertical.alpha_time)
+    return state._replace(alpha=alpha, slip=slip, wind=wind_estimate(state.wind, _measured_wind(pose, speed), dt))
 
 
 def _with_attitude(state: GuidanceState, inputs: Inputs, dt: float, params: GuidanceParams) -> GuidanceState:
