@@ -128,22 +128,27 @@ def fly(
             )
         if outcome == "completed":
             progress(chosen.flight.duration, outcome)
+    raise typer.Exit(_report(chosen, run, outcome, as_json=as_json))
+
+
+def _report(scenario: Scenario, run: Path, outcome: str, *, as_json: bool) -> int:
+    """Write and print the report of a flight. Returns the exit status."""
     status = exit_status(outcome)
     try:
         result = write_report(run, outcome)
     except ParameterError:
         if status == 0:
             raise
-        write_empty_summary(run, chosen, outcome)
+        write_empty_summary(run, scenario, outcome)
         print(f"error: {outcome}, before the first sample; see {display_path(run)}", file=sys.stderr)
-        raise typer.Exit(status) from None
+        return status
     outcome = result.flight.summary["outcome"]
     if as_json:
         print_json(result.flight.summary)
     else:
         show_flight(Console(), result.flight)
         print(f"outcome: {outcome}\nlog:     {display_path(result.mcap)}\nreport:  {display_path(result.report)}")
-    raise typer.Exit(exit_status(outcome))
+    return exit_status(outcome)
 
 
 def _with_files(

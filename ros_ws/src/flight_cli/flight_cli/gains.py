@@ -3,6 +3,7 @@
 """`rise-di gains`: select gains by Theorem 1 and by the engineering procedure, or check those of a scenario."""
 
 import math
+from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
@@ -113,10 +114,7 @@ def gains(
     answers: dict[str, Assessment]
     with console.status("selecting gains on uncertain airframes") as status, options(*loop, *PARTS):
         if check:
-            for option, requested in (("--write", write is not None), ("--feedforward", feedforward), ("--observer", observer)):
-                require(not requested, option, "it beside --check", "one of them: --check selects nothing to write")
-            own_loop = all(value is None for value in loop.values())
-            require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
+            _require_check_alone({"--write": write, "--feedforward": feedforward, "--observer": observer}, loop)
             answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
             answers = {"scenario": answer}
             origin = ""
@@ -165,6 +163,14 @@ def gains(
                 console.print(f"{key}: {display_path(path)}", highlight=False, soft_wrap=True)
     if check and failing(answers["scenario"].loop):
         raise typer.Exit(CONDITION_FAILS)
+
+
+def _require_check_alone(selections: Mapping[str, object], loop: Mapping[str, object]) -> None:
+    """Raise ParameterError for options beside --check that select gains or another loop."""
+    for option, value in selections.items():
+        require(value in (None, False), option, "it beside --check", "one of them: --check selects nothing to write")
+    own_loop = all(value is None for value in loop.values())
+    require(own_loop, "--check", "it beside another loop", "the scenario's own rate, lag, delay and inputs")
 
 
 def _write_page(path: Path, answer: Assessment) -> None:
