@@ -100,7 +100,7 @@ def saturate(u: Array, measured: Measurements, dt: Array, limits: Limits) -> tup
 def conditional_integration(before: Array, after: Array, effect: Array, excess: Array) -> Array:
     """Anti-windup by conditional integration: `before` where effect * excess > 0, else `after`.
 
-    Arguments: `effect`, change of u (or of the scaled input) by the increment; `excess`, that over the limit, in the
+    Arguments: `effect`, change of u (or of the scaled input) by the increment; `excess`, u over the limit, in the
     same units and channels. Source: K. J. Astrom, T. Hagglund, "Advanced PID Control", 3.5.
     """
     return array_namespace(before).where(effect * excess > 0.0, before, after)

@@ -56,7 +56,7 @@ def allocate(v: Array, u_before: Array, dt: Array, params: Allocation) -> tuple[
 
 
 def _where_not(final: Array, value: Array, otherwise: Callable[[], Array]) -> Array:
-    """The value of the aircraft where it is final; the others, if any, get `otherwise`."""
+    """The value of the aircraft with a final value; the others, if any, get `otherwise`."""
     return jax.lax.cond(jnp.all(final), lambda: value, lambda: jnp.where(final, value, otherwise()))
 
 

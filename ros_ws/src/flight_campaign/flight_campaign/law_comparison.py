@@ -117,7 +117,7 @@ def compare(
 
 
 def _nominal_once(matrices: Sequence[FloatArray]) -> FloatArray:
-    """The matrices of all levels after each other, with the nominal aircraft of the first level alone."""
+    """The matrices of all levels in order, with the nominal aircraft of the first level alone."""
     return np.concatenate([matrices[0], *(level[1:] for level in matrices[1:])])
 
 

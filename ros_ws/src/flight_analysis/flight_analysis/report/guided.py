@@ -241,7 +241,7 @@ def guidance_notices(tape: Tape, section: GuidanceConfig | None) -> list[str]:
 
 
 def _segment_figures(segment: Segment) -> dict[str, Any]:
-    """The figures of a segment with those of the quantities that guidance holds."""
+    """The figures of a segment and of the held quantities."""
     return segment._asdict() | {name: getattr(segment, name)._asdict() for name in ("lateral", "vertical", "V")}
 
 

@@ -138,8 +138,8 @@ def summarise(
 ) -> dict[str, Any]:
     """The metrics of a flight, SI, ready for JSON. docs/interfaces.md, section Figures, explains the keys.
 
-    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `flight_account` is
-    that of the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
+    Scenario and outcome come from the tape; the tape of a log has no scenario and needs the argument. `flight_account`:
+    the account of the whole flight where the tape is a part. Raises ParameterError for a tape without y and y_m.
     """
     flown = as_tape(tape).scenario if scenario is None else scenario
     require(flown is not None, "scenario", "none on the tape of a log", "summarise(run.tape, recorded_scenario(run))")
