@@ -239,7 +239,7 @@ class FlightProcesses:
         names = self._nodes()
         ready = {name: self._monitor.is_ready(name, pid) for name, pid in names}
         unmatched = [name for name, pid in names if not self._monitor.is_matched(name, pid)]
-        return [f"{name} {'has an input unmatched a publisher' if ready[name] else 'not ready'}" for name in unmatched]
+        return [f"{name} {'has an input without a publisher' if ready[name] else 'not ready'}" for name in unmatched]
 
     def __exit__(self, *_: object) -> None:
         self.stop()

@@ -131,7 +131,7 @@ def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] 
 
 
 def selection_matrix(wanted: Sequence[str], names: Sequence[str]) -> FloatArray:
-    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: its product with values selects."""
+    """1 where a row of `wanted` and a column of `names` are the same channel, else 0: the product with values selects."""
     matrix = np.zeros((len(wanted), len(names)))
     for row, channel in zip(matrix, wanted, strict=True):
         row[:] = [name == channel for name in names]
