@@ -61,8 +61,9 @@ def fly(scenario: Scenario, learner: MakeLearner) -> Flight:
     at_ticks = true.stamp_ns % period_ns(scenario.controller.rate, "controller.rate") == 0
     errors = {name: error_metrics(true[name][at_ticks]) for name in outputs}
     slew = {name: parts["whole"].rate for name, parts in inputs_by_part(tape, ()).items()}
-    of_rms, of_max = ({name: getattr(of, key) for name, of in errors.items()} for key in ("rms", "max"))
-    return Flight(tape.outcome != COMPLETED, of_rms, of_max, slew, learned(tape, events))
+    rms = {name: metrics.rms for name, metrics in errors.items()}
+    largest = {name: metrics.max for name, metrics in errors.items()}
+    return Flight(tape.outcome != COMPLETED, rms, largest, slew, learned(tape, events))
 
 
 def require_flyable(scenario: Scenario) -> None:

@@ -50,11 +50,11 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._active = False
         self._publishes = self.parameters.autostart  # a standby that was never activated publishes no u beside another's
         self._controller = Controller(self.parameters)
-        of_y = self.parameters.measured, self._taking(self._controller.take_y)
-        of_y_m = self.parameters.outputs, self._taking(self._controller.take_y_m)
+        y_input = self.parameters.measured, self._taking(self._controller.take_y)
+        y_m_input = self.parameters.outputs, self._taking(self._controller.take_y_m)
         self._y, self._y_m = (
             self.receive(topic, Decoder(names).decode, take, max_age_ns=self._max_age_ns, lock=self._new_lock())
-            for topic, (names, take) in ((Y, of_y), (Y_M, of_y_m))
+            for topic, (names, take) in ((Y, y_input), (Y_M, y_m_input))
         )
         self._publish_u, self._publish_internals = self.advertise(U), self.advertise(INTERNALS)
         self._u_encoder = self.encoder(self.parameters.effectors)
@@ -236,8 +236,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
             return
         self._decoded = False
         self._proposals.poll(now_ns)
-        if (taken := self._learning.step(self._controller, now_ns)) is not None:
-            self.adopt(taken)
+        if (parameters := self._learning.step(self._controller, now_ns)) is not None:
+            self.adopt(parameters)
 
     def _publish_authority(self, now_ns: int) -> None:
         """Tell guidance what the inputs can do, by the model that flies. Without a learner nothing is told."""

@@ -162,17 +162,17 @@ class Learning:
         """
         if controller.mode is Mode.INACTIVE:
             return self._begin_again(controller, now_ns)
-        taken = None
+        adopted = None
         while self._due and self._acts_ns(self._due[0]) <= now_ns and self._due[0] in self._received:
             self._begin(self._received.pop(self._due.popleft()), controller, now_ns)
-            taken = self._certify(controller, now_ns) or taken
+            adopted = self._certify(controller, now_ns) or adopted
         if not self._simulated:
-            taken = self._certify(controller, now_ns)
+            adopted = self._certify(controller, now_ns)
         if oscillations := controller.oscillations():
-            taken = self._end_oscillations(oscillations, controller, now_ns)
+            adopted = self._end_oscillations(oscillations, controller, now_ns)
         elif diverging := controller.diverging():
-            taken = self._end_divergence(diverging, controller, now_ns)
-        return taken
+            adopted = self._end_divergence(diverging, controller, now_ns)
+        return adopted
 
     def _end_divergence(self, diverging: Collection[str], controller: Controller, now_ns: int) -> RiseDiConfig:
         """Take the law of the start; a part that has now fallen back FALLBACKS times keeps it to the end of the engagement."""
@@ -196,10 +196,10 @@ class Learning:
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
         fallen = without_models(
-            self._start, flown, [name for name, without in zip(flown.outputs, bare, strict=True) if without]
+            self._start, flown, [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare]
         )
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
-        outputs = ", ".join(name for name, without in zip(flown.outputs, bare, strict=True) if without)
+        outputs = ", ".join(name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare)
         what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
         self._take(controller, now_ns, prepared(fallen), EventKind.FALLBACK, what)
         return fallen
@@ -264,8 +264,8 @@ class Learning:
             if end.value.digest in self._diverged:
                 refusal = "found parameters that diverged in this engagement, expected others"
             if not refusal:
-                without = outputs_without(end.value.parameters)
-                what = f"flies {proposal.sentence}{', without ' * bool(without)}{', '.join(without)}"
+                bare_outputs = outputs_without(end.value.parameters)
+                what = f"flies {proposal.sentence}{', without ' * bool(bare_outputs)}{', '.join(bare_outputs)}"
                 self._take(controller, now_ns, end.value, EventKind.FLIES, what)
                 return controller.parameters
         except ArithmeticError as error:
@@ -323,12 +323,12 @@ def _certificate(flown: ControllerConfig, change: Mapping[str, Any], start: Rise
         f"that of the start: {speeds or 'none'}",
     )
     least = start.observer.margin
-    found = proposed.observer.margin
-    require(found >= least, "controller.observer.margin", f"{found:g} s", f"at least {least:g} s, that of the start")
-    if without := outputs_without(flown):
-        others = f"one of other outputs than {', '.join(without)}, by learn.without"
+    margin = proposed.observer.margin
+    require(margin >= least, "controller.observer.margin", f"{margin:g} s", f"at least {least:g} s, that of the start")
+    if bare_outputs := outputs_without(flown):
+        others = f"one of other outputs than {', '.join(bare_outputs)}, by learn.without"
         require(proposed.feedforward is not None, "proposal", "no feedforward", others)
-        bare = coupled(proposed, without)
+        bare = coupled(proposed, bare_outputs)
         proposed = fallen_back(start, proposed, bare)
         require(not all(bare), "proposal", "no model", others)
         yield
@@ -366,20 +366,20 @@ def with_channels_of(start: RiseDiConfig, designed: RiseDiConfig, bare: Sequence
     input scale, so that the law holds it.
     """
     law = start.law_params()
-    own = designed.law_params()
-    last = own.K[-1]
+    design = designed.law_params()
+    last = design.K[-1]
     channels = np.array(bare)
-    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), own.K)
+    K = np.where(channels, np.maximum(law.K, last + MIN_GAIN), design.K)
     K[-1] = last
     share = np.where(channels, law.K / K, 1.0)
-    scale = np.where(channels, law.input_scale * share, own.input_scale)
-    of_start, of_designed = (
+    scale = np.where(channels, law.input_scale * share, design.input_scale)
+    start_values, design_values = (
         (np.array(part.beta), np.array(part.Lambda), np.array(part.omega), np.broadcast_to(part.softening, K.shape))
         for part in (start, designed)
     )
     beta, Lambda, omega, softening = (
-        np.where(channels, kept * factor, taken)
-        for kept, taken, factor in zip(of_start, of_designed, (1.0 / share, 1.0, share, 1.0), strict=True)
+        np.where(channels, old * factor, new)
+        for old, new, factor in zip(start_values, design_values, (1.0 / share, 1.0, share, 1.0), strict=True)
     )
     changed: dict[str, Any] = {
         "k_d": tuple((K[:-1] - last).tolist()),
@@ -436,29 +436,29 @@ def authority(flown: RiseDiConfig, start: RiseDiConfig) -> FloatArray:
     model = flown.feedforward
     acting = acting_inputs(flown)
     dead = np.array(flown.input_scale) <= SMALLEST
-    found = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
+    bounds = np.where(dead, 0.0, np.full((2, m), UNKNOWN))
     if model is None or flown.models() == start.models():
-        return found.ravel()
+        return bounds.ravel()
     rows = [model.states.index(name) for name in flown.outputs]
     both = (model.B, model.deviation or (0.0,) * len(model.B))
     B, deviation = (np.reshape(values, (-1, m))[rows].diagonal() for values in both)
     least = np.abs(B) * np.exp(-2.0 * deviation / np.abs(B))
-    for there in () if flown.schedule is None else flown.schedule.models:
-        least = least * np.minimum(np.abs(np.reshape(there.B, (-1, m))[rows].diagonal() / B), 1.0)
+    for scheduled in () if flown.schedule is None else flown.schedule.models:
+        least = least * np.minimum(np.abs(np.reshape(scheduled.B, (-1, m))[rows].diagonal() / B), 1.0)
     for k, limits in enumerate((flown.lower, flown.upper)):
         if limits is None:
             continue
         side = np.where(B > 0.0, k, 1 - k)
         known = ~dead & [name in acting for name in flown.inputs]
-        found[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
-    return found.ravel()
+        bounds[side[known], np.flatnonzero(known)] = (least * np.abs(limits))[known]
+    return bounds.ravel()
 
 
 def fallen_back(start: RiseDiConfig, flown: RiseDiConfig, bare: Sequence[bool]) -> RiseDiConfig:
     """What flies, with the law of the start in further channels; the start itself where no channel keeps a model."""
     acting = acting_inputs(flown)
     is_first = flown.models() == start.models()
-    if is_first or all(without or name not in acting for name, without in zip(flown.inputs, bare, strict=True)):
+    if is_first or all(is_bare or name not in acting for name, is_bare in zip(flown.inputs, bare, strict=True)):
         return start
     mixed = with_channels_of(start, flown, bare, [scale <= SMALLEST for scale in flown.input_scale])
     return RiseDiConfig.validate_mapping(mixed.model_dump(), "controller", check=False)
@@ -474,8 +474,8 @@ def without_models(start: RiseDiConfig, flown: RiseDiConfig, outputs: Collection
     """What flies, with the law of the start in some outputs to the end of the engagement, added to `learn.without`."""
     fallen = fallen_back(start, flown, [name in outputs for name in start.outputs])
     assert start.learn is not None  # noqa: S101 - a controller that learns
-    without = tuple(name for name in start.outputs if name in {*outputs_without(flown), *outputs})
-    return fallen.model_copy(update={"learn": start.learn.model_copy(update={"without": without or None})})
+    bare_outputs = tuple(name for name in start.outputs if name in {*outputs_without(flown), *outputs})
+    return fallen.model_copy(update={"learn": start.learn.model_copy(update={"without": bare_outputs or None})})
 
 
 def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
@@ -486,8 +486,8 @@ def coupled(parameters: RiseDiConfig, names: Collection[str]) -> list[bool]:
     A, gravity, B = (np.reshape(values, (n, -1)) != 0.0 for values in (model.A, model.gravity or np.zeros(n), model.B))
     links = A | gravity | (B @ B.T) | np.eye(n, dtype=bool)
     reached = np.linalg.matrix_power((links | links.T).astype(float), n) > 0.0
-    at = [model.states.index(name) for name in names]
-    return [bool(np.any(reached[model.states.index(output), at])) for output in parameters.outputs]
+    states = [model.states.index(name) for name in names]
+    return [bool(np.any(reached[model.states.index(output), states])) for output in parameters.outputs]
 
 
 def changes(old: ControllerConfig, new: ControllerConfig) -> dict[str, Any]:

@@ -72,9 +72,9 @@ class Learned(NamedTuple):
 
 def learned(entries: Iterable[Entry], outputs: tuple[str, ...], *, proposed: bool) -> Learned:
     """What an identification found, and whether it became a proposal."""
-    kept = [entry for entry in entries if entry.row in outputs]
-    channels = {f"value.{entry.name}": entry.value for entry in kept}
-    channels |= {f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in kept}
+    output_entries = [entry for entry in entries if entry.row in outputs]
+    channels = {f"value.{entry.name}": entry.value for entry in output_entries}
+    channels |= {f"deviation.{entry.name}": abs(entry.unit) * entry.deviation for entry in output_entries}
     return Learned(("proposed", *channels), np.array([float(proposed), *channels.values()]))
 
 
@@ -89,11 +89,11 @@ class Identifications:
 
     def next(self, proposal: LearnerResult) -> Learned | None:
         """That of a proposal; None where nothing was identified."""
-        found = getattr(self._learner, "identification", None)
-        if found is None or found is self._last:
+        identification = getattr(self._learner, "identification", None)
+        if identification is None or identification is self._last:
             return None
-        self._last = found
-        entries = {entry.name: entry for entry in found.entries if entry.nominal}
+        self._last = identification
+        entries = {entry.name: entry for entry in identification.entries if entry.nominal}
         self._names = self._names or tuple(entries)  # a topic keeps its channels: those of the rough airframe
         return learned((entries[name] for name in self._names), self._outputs, proposed=proposal.controller is not None)
 

@@ -156,15 +156,15 @@ def fly(  # noqa: PLR0912, PLR0915 - a part a node
                 if learning is not None:
                     learning.before_tick(controller, t_ns)
                     if t_ns % (AUTHORITY_TICKS * controller.period_ns) == 0:
-                        signals["authority"].add(t_ns, able := learning.authority(controller))
+                        signals["authority"].add(t_ns, bounds := learning.authority(controller))
                         if guidance is not None:  # acts from its next step on
-                            guidance.take_authority(dict(zip(signals["authority"].names, able.tolist(), strict=True)))
+                            guidance.take_authority(dict(zip(signals["authority"].names, bounds.tolist(), strict=True)))
                 if (output := controller.tick(t_ns)) is not None:
                     u = select(aircraft.inputs, inputs, output.u)
                     signals["u"].add(output.stamp_ns, output.u)
                     signals["internals"].add(output.stamp_ns, output.internals)
-                if learning is not None and (found := learning.after_tick(controller, output, t_ns)) is not None:
-                    signals.setdefault("learned", _SignalBuilder(found.names)).add(t_ns, found.values)
+                if learning is not None and (identified := learning.after_tick(controller, output, t_ns)) is not None:
+                    signals.setdefault("learned", _SignalBuilder(identified.names)).add(t_ns, identified.values)
             if t_ns % NANOSECONDS == 0:
                 record({topic: builder.take() for topic, builder in signals.items()})
                 if progress is not None:

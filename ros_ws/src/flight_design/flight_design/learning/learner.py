@@ -142,19 +142,15 @@ class Learner:
         record = [sample for sample in self._record if sample.stamp_ns > after_ns]
         stamp_ns = np.array([sample.stamp_ns for sample in record])
         place = np.round((stamp_ns - stamp_ns[0]) * 1e-9 / self._period).astype(int)
-        place, kept = np.unique(place, return_index=True)
-        y = np.array([sample.y for sample in record])[kept]
-        u = np.array([sample.u for sample in record])[kept]
+        place, first_places = np.unique(place, return_index=True)
+        y = np.array([sample.y for sample in record])[first_places]
+        u = np.array([sample.u for sample in record])[first_places]
         t = seconds(int(stamp_ns[0])) + self._period * np.arange(place[-1] + 1)
-        whole = np.full((len(t), y.shape[1]), np.nan)
-        whole[place] = y
+        padded_y = np.full((len(t), y.shape[1]), np.nan)
+        padded_y[place] = y
         held = u[np.searchsorted(place, np.arange(len(t)), side="right") - 1]
-        of_y = self._controller.outputs
-        of_u = self._controller.inputs
-        y, u = (
-            np.stack([values[:, own.index(name)] for name in names], axis=1)
-            for values, own, names in ((whole, of_y, self._rough.outputs), (held, of_u, tuple(self._rough.inputs)))
-        )
+        y = np.stack([padded_y[:, self._controller.outputs.index(name)] for name in self._rough.outputs], axis=1)
+        u = np.stack([held[:, self._controller.inputs.index(name)] for name in self._rough.inputs], axis=1)
         return Recording(self._period, t, y, u)
 
     def propose(self, flown: int, given_up: Sequence[str] = ()) -> LearnerResult:
@@ -189,33 +185,33 @@ class Learner:
             )
         changes = self._changes(end_ns)
         dead = {change.outputs: change.dead for change in changes if change.dead}
-        found = [change for change in changes if change.found]
+        damaged = [change for change in changes if change.found]
         due = self._is_due(end_ns) or lost
-        if not (due or found or self._changed):
+        if not (due or damaged or self._changed):
             return LearnerResult(None, unchanged(changes))
-        if found:
+        if damaged:
             self._record = deque(sample for sample in self._record if sample.stamp_ns > end_ns - nanoseconds(RECORD))
             self._prior = self._model
-            self._changed |= {change.outputs for change in found}
+            self._changed |= {change.outputs for change in damaged}
         identified = self.identification = self._identified()
         dead = {part: name for part, name in dead.items() if not self._acts(name, identified)}
-        gone = self._dead | dead
+        without_model = self._dead | dead
         sentences = [
             f"{name} has no effect: {' and '.join(part)} without it, by the law of the start"
-            for part, name in (gone if lost else dead).items()
+            for part, name in (without_model if lost else dead).items()
             if name
         ]
-        sentences += [changed(change) for change in found if change.outputs not in dead]
-        known, model = {part: value for part, value in self._known.items() if part not in gone}, self._model
+        sentences += [changed(change) for change in damaged if change.outputs not in dead]
+        known, model = {part: value for part, value in self._known.items() if part not in without_model}, self._model
         refusals = []
         for part in identified.parts:
-            if any(is_within(part.outputs, without) or is_within(without, part.outputs) for without in gone):
+            if any(is_within(part.outputs, outputs) or is_within(outputs, part.outputs) for outputs in without_model):
                 continue
             rough = part.outputs not in known and part.before.whiteness.max() <= MAX_WHITENESS and explains(part)
-            learned = {outputs for outputs, of_part in known.items() if not of_part.is_rough} - self._changed
+            learned = {outputs for outputs, estimate in known.items() if not estimate.is_rough} - self._changed
             before = model if part.outputs in learned and not lost else None
-            of_flight = "" if rough else part.refusal or not_white(part) or weaker(part, before)
-            if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or of_flight:
+            reason = "" if rough else part.refusal or not_white(part) or weaker(part, before)
+            if refusal := uncoupled(part, known) or too_late(part, self._actuation.delay) or reason:
                 refusals.append(refusal)
                 continue
             entries = [entry._replace(error=0.0) for entry in part.entries] if rough else part.entries
@@ -231,10 +227,10 @@ class Learner:
             self._prior = self._model if self._prior is self._rough else self._rough
         if not sentences:
             return LearnerResult(None, "; ".join(refusals) or "each part flies the law of the start from before on")
-        proposed = self._designed(model, known, gone)
-        new = [*gone, *(part for part, value in known.items() if value.end_ns == end_ns)]
+        proposed = self._designed(model, known, without_model)
+        new = [*without_model, *(part for part, value in known.items() if value.end_ns == end_ns)]
         self._changed = {part for part in self._changed if not any(is_within(part, outputs) for outputs in new)}
-        self._known, self._model, self._dead = known, model, gone
+        self._known, self._model, self._dead = known, model, without_model
         self._last, self._proposed = proposed, proposed.digest()
         self._proposals.add(self._proposed)
         return LearnerResult(proposed, "; ".join(sentences + [f"refused: {refusal}" for refusal in refusals]))
@@ -244,9 +240,9 @@ class Learner:
         if set(outputs) <= set(outputs_without(self._start)):
             return
         self._give_up(outputs)
-        rest = without_models(self._controller, self._last, outputs)
-        if rest.digest() == flown:
-            self._last = rest
+        flying = without_models(self._controller, self._last, outputs)
+        if flying.digest() == flown:
+            self._last = flying
             self._proposed = flown
 
     def _give_up(self, outputs: Sequence[str]) -> None:
@@ -274,11 +270,11 @@ class Learner:
         The test of a loss takes A as known: with a wrong A an input that acts may look dead. With A free it does not. Better
         is a gain of log-likelihood above the limit of the test: beside a dead rudder, with wider bounds, it was 1.1.
         """
-        gain = identified.after.log_likelihood - self._identified(without=name).after.log_likelihood  # of a sample
+        gain = identified.after.log_likelihood - self._identified(dead_input=name).after.log_likelihood  # of a sample
         return gain * len(self.recording().t) / HELD_OUT > MAX_GAIN
 
-    def _identified(self, without: str = "") -> Identification:
-        """A and B from the record, about the prior, `without` the effect of an input; also from the model that flies on.
+    def _identified(self, dead_input: str = "") -> Identification:
+        """A and B from the record, about the prior, without the effect of `dead_input`; also from the model that flies on.
 
         Beside models at several speeds the record is of a steady speed, and so is the prior. The entries are reduced to the
         trim speed. Raises ParameterError where the speed is not steady over SHORTEST.
@@ -288,26 +284,26 @@ class Learner:
         identified = partial(identify, actuation=self._actuation, channels=channels, at_bound=AT_BOUND, unknown=unknown)
         prior = self._prior
         model = self.model
-        if without:
-            prior = without_effect(prior, without)
-            model = model and without_effect(model, without)
+        if dead_input:
+            prior = without_effect(prior, dead_input)
+            model = model and without_effect(model, dead_input)
         if not self._has_speeds:
             return identified(self.recording(), prior, flown=model)
-        found, ratio = self._steady(self.recording())
-        length = self._period * len(found.t)
+        steady, ratio = self._steady(self.recording())
+        length = self._period * len(steady.t)
         expected = f"{SHORTEST:g} s or more with an rms of at most {100 * SPREAD:g} % about its mean"
         require(length > SHORTEST - self._period, "airspeed", f"it steady over the last {length:.3g} s", expected)
         flown = None if model is None else self._at_speed(model, ratio)
-        there = identified(found, self._at_speed(prior, ratio), flown=flown)
-        parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in there.parts)
-        return there._replace(parts=tuple(parts))
+        reduced = identified(steady, self._at_speed(prior, ratio), flown=flown)
+        parts = (part._replace(entries=self._at_trim(part.entries, ratio)) for part in reduced.parts)
+        return reduced._replace(parts=tuple(parts))
 
     def _steady(self, recorded: Recording) -> tuple[Recording, float]:
         """Beside models at several speeds: the steady end of a record, about the trim there, and the speed over V0."""
         if not self._has_speeds:
             return recorded, 1.0
-        found, ratio = steady_end(recorded, self._rough)
-        return about(found, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
+        steady, ratio = steady_end(recorded, self._rough)
+        return about(steady, self._rough, *level_flight(self._model, ratio, self._thrust)), ratio
 
     def _at_speed(self, model: Airframe, ratio: float) -> Airframe:
         """A model at a speed of `_steady`."""
@@ -318,11 +314,14 @@ class Learner:
         powers = exponents(self._rough, self._thrust)
         states = list(self._rough.states)
         columns = {"A": states, "B": list(self._rough.inputs)}
-        of = {"A": powers.A, "B": powers.B}
-        each = [ratio ** of[e.matrix][states.index(e.row), columns[e.matrix].index(e.column)].item() for e in entries]
+        exponent = {"A": powers.A, "B": powers.B}
+        factors = [
+            ratio ** exponent[entry.matrix][states.index(entry.row), columns[entry.matrix].index(entry.column)].item()
+            for entry in entries
+        ]
         return tuple(
             entry._replace(nominal=entry.nominal / factor, unit=entry.unit / factor)
-            for entry, factor in zip(entries, each, strict=True)
+            for entry, factor in zip(entries, factors, strict=True)
         )
 
     def _changes(self, end_ns: int) -> list[Change]:
@@ -404,8 +403,8 @@ def margin_behind(delay: float, start: RiseDiConfig) -> float:
 
     Beyond the delay at least DELAY_LEFT is left, or what the start leaves beyond its own delay.
     """
-    left = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
-    return max(margin_of(start), round(delay + left, 4))  # 0.1 ms, as few digits as the file of a scenario
+    reserve = min(max(margin_of(start) - start.delay, 0.0), DELAY_LEFT)
+    return max(margin_of(start), round(delay + reserve, 4))  # 0.1 ms, as few digits as the file of a scenario
 
 
 def unchanged(changes: Iterable[Change]) -> str:
@@ -432,57 +431,57 @@ def without_effect(model: Airframe, name: str) -> Airframe:
     return with_entries(model, [Entry("B", row, name, value, FAINT - 1.0, 0.0, value) for row, value in effects if value])
 
 
-def is_within(part: Iterable[str], whole: Iterable[str]) -> bool:
+def is_within(part: Iterable[str], outputs: Iterable[str]) -> bool:
     """Whether the outputs of a part are among those of another."""
-    return set(part) <= set(whole)
+    return set(part) <= set(outputs)
 
 
-def changed(found: Change) -> str:
+def changed(change: Change) -> str:
     """The part that has changed, and its weakest input."""
-    name, left = min(found.left.items(), key=lambda effect: effect[1])
-    weakest = f"{name} has {100 * left:.0f} % of its effect"
-    return f"{' and '.join(found.outputs)} changed, log-likelihood {found.gain:.3g}: {weakest}"
+    name, effectiveness = min(change.left.items(), key=lambda effect: effect[1])
+    weakest = f"{name} has {100 * effectiveness:.0f} % of its effect"
+    return f"{' and '.join(change.outputs)} changed, log-likelihood {change.gain:.3g}: {weakest}"
 
 
-def explains(found: Part) -> bool:
+def explains(part: Part) -> bool:
     """Whether the nominal airframe predicts the held-out samples as well as the identified model."""
-    return bool(found.after.log_likelihood <= found.before.log_likelihood)
+    return bool(part.after.log_likelihood <= part.before.log_likelihood)
 
 
-def not_white(found: Part) -> str:
+def not_white(part: Part) -> str:
     """The output with the least white innovations, if above MAX_WHITENESS."""
-    worst = int(np.argmax(found.after.whiteness))
-    white = float(found.after.whiteness[worst])
+    worst = int(np.argmax(part.after.whiteness))
+    white = float(part.after.whiteness[worst])
     if white <= MAX_WHITENESS:
         return ""
-    name = found.outputs[worst]
+    name = part.outputs[worst]
     return f"innovations of {name}: found a whiteness of {white:.3g}, expected at most {MAX_WHITENESS:g}, 1 being white"
 
 
-def too_late(found: Part, delay: float) -> str:
+def too_late(part: Part, delay: float) -> str:
     """The refusal of a part whose inputs are as late as the search goes beyond the known `delay` of the loop, s."""
     bound = delay + MAX_DELAY_ERROR * DELAY_DEVIATION
-    if found.delay < bound - 1e-6:  # s, of rounding
+    if part.delay < bound - 1e-6:  # s, of rounding
         return ""
-    names = " and ".join(found.inputs)
-    return f"{names}: found u {1e3 * found.delay:.0f} ms late or later, expected less than {1e3 * bound:.0f} ms"
+    names = " and ".join(part.inputs)
+    return f"{names}: found u {1e3 * part.delay:.0f} ms late or later, expected less than {1e3 * bound:.0f} ms"
 
 
-def uncoupled(found: Part, known: Iterable[tuple[str, ...]]) -> str:
+def uncoupled(part: Part, known: Iterable[tuple[str, ...]]) -> str:
     """The refusal of a part alone where the flown model couples the part with another; empty where it does not."""
-    if not any(is_within(found.outputs, whole) for whole in known if whole != found.outputs):
+    if not any(is_within(part.outputs, outputs) for outputs in known if outputs != part.outputs):
         return ""
-    return f"{' and '.join(found.outputs)}: found no model with coupling, expected one, as that which flies"
+    return f"{' and '.join(part.outputs)}: found no model with coupling, expected one, as that which flies"
 
 
-def weaker(found: Part, flown: Airframe | None) -> str:
+def weaker(part: Part, flown: Airframe | None) -> str:
     """The effect that a record of gusts has weaker than the model that flies, if by more than MAX_DEVIATION.
 
     Gusts hide what the inputs do: the effects come out too weak, a design with them too strong.
     """
-    if flown is None or not found.gusts:
+    if flown is None or not part.gusts:
         return ""
-    for entry in best_known(found.entries, found.outputs):
+    for entry in best_known(part.entries, part.outputs):
         share = entry.value / flown.matrix_b()[flown.index(entry.row), list(flown.inputs).index(entry.column)]
         if share < 1.0 - MAX_DEVIATION:
             expected = f"expected {100 * (1.0 - MAX_DEVIATION):g} % or more beside gusts, which hide effects"
@@ -490,12 +489,12 @@ def weaker(found: Part, flown: Airframe | None) -> str:
     return ""
 
 
-def sentence(found: Part) -> str:
+def sentence(part: Part) -> str:
     """The effects of inputs on outputs that the flight shows, relative to the rough airframe, with deviations."""
-    effects = (entry for entry in found.entries if entry.matrix == "B" and entry.row in found.outputs)
+    effects = (entry for entry in part.entries if entry.matrix == "B" and entry.row in part.outputs)
     known = (entry for entry in effects if entry.nominal and entry.deviation < PRIOR / 2.0)
     text = ", ".join(f"{entry.name} {100 * entry.error:+.0f} +- {100 * entry.deviation:.0f} %" for entry in known)
-    return text if all(entry.nominal for entry in found.entries) else f"{text}, with coupling"
+    return text if all(entry.nominal for entry in part.entries) else f"{text}, with coupling"
 
 
 def steady_end(recorded: Recording, airframe: Airframe) -> tuple[Recording, float]:
