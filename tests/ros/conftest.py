@@ -5,6 +5,7 @@
 import fcntl
 import itertools
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -145,7 +146,8 @@ INCONCLUSIVE = "inconclusive"  # key of the property of a report
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
     """Run a test again where it failed beside a delay of the host beyond what it bears; a failure without one is a failure.
 
-    Where the host delayed each of three attempts, the test is skipped as inconclusive. The summary names the test either way.
+    Where the host delayed each of three attempts, the test is skipped as inconclusive, but not where all failed alike: then
+    the host is not the cause. The summary names the test either way.
     """
     if not item.path.is_relative_to(IN_REAL_TIME):
         return None
@@ -154,6 +156,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     mark = item.get_closest_marker("longest_pause")
     bears = float(mark.args[0]) if mark else LONGEST_PAUSE
     item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    failures = set[str]()
     for attempt in range(1, ATTEMPTS + 1):
         begin = time.time()
         reports = runtestprotocol(item, log=False, nextitem=nextitem)
@@ -162,15 +165,22 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
             break
         sentence = f"the host paused for {pause:.2f} s, the test bears {bears:g} s, in attempt {attempt} of {ATTEMPTS}"
         item.user_properties.append((INCONCLUSIVE, sentence))
+        failures.update(failure(report) for report in reports if report.failed)
     else:
         for report in reports:
-            if report.failed:
+            if report.failed and len(failures) > 1:
                 report.outcome, report.longrepr = "skipped", (str(item.path), 0, f"inconclusive: {sentence}")
     for report in reports:
         report.user_properties = list(item.user_properties)
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
+
+
+def failure(report: pytest.TestReport) -> str:
+    """The first line of a failure without its numbers, which differ from attempt to attempt."""
+    crash = getattr(report.longrepr, "reprcrash", None)
+    return "" if crash is None else re.sub(r"[\d.]+", "#", str(crash.message).partition("\n")[0])
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -24,6 +24,7 @@ SPEED = 25.0  # m/s, trim
 PER_US = math.radians(30.0) / 500.0  # rad of a surface
 STICKS = (1500, 1500, 1500, 1500)  # of the transmitter: roll, pitch, throttle, yaw
 LEAVE = 65535
+OVERRIDE_TIME = (b"RC_OVERRIDE_TIME", 0.5)  # s, the only parameter
 
 
 def fly(scenario: Path, port: int) -> None:
@@ -40,6 +41,8 @@ def fly(scenario: Path, port: int) -> None:
         while (message := connection.recv_msg()) is not None:
             if message.get_type() == "COMMAND_LONG":
                 send.command_ack_send(message.command, 0)
+            elif message.get_type() == "PARAM_REQUEST_READ":
+                send.param_value_send(OVERRIDE_TIME[0], OVERRIDE_TIME[1], mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
             elif message.get_type() == "RC_CHANNELS_OVERRIDE" and message.get_srcSystem() == 255:
                 pulses = [getattr(message, f"chan{k}_raw") for k in range(1, 5)]
                 before = channels
