@@ -276,7 +276,7 @@ def recorder(start_node: Start) -> Recorder:
 @pytest.fixture
 def publisher(domain: int) -> Iterator[subprocess.Popen[str]]:
     """Six topics at 1 kHz, as wide as those of a flight, until the test ends."""
-    command = [sys.executable, "-m", "benchmarks.recorder", "--publish", "--duration=120"]
+    command = [sys.executable, "-m", "benchmarks.recorder", "1000", "120"]  # Hz, s
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=REPOSITORY)
     yield process
     process.terminate()
