@@ -378,3 +378,8 @@ def test_a_missing_map_is_one_sentence() -> None:
         BridgeConfig.validate_mapping({"map": "nowhere"}, "bridge")
     with pytest.raises(ParameterError, match="lockstep"):
         BridgeConfig.validate_mapping({"map": "px4", "lockstep": True}, "bridge")
+
+
+def test_message_that_the_installed_package_lacks_is_refused() -> None:
+    with pytest.raises(ParameterError, match="found no Airspeed in the installed px4_msgs"):
+        message_type("px4_msgs/msg/Airspeed", lambda name: Message(Airspeed=0))
