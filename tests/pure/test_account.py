@@ -219,6 +219,18 @@ def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: 
     assert (clock.recording().unset, clock.recording().step_ns) == (len(damaged), 0)
 
 
+def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays() -> None:
+    """Stored 0.6 s after its stamp; the next one comes 1.2 s later and is stored at once."""
+    (log_ns,) = stamps(range(1000, 1200))
+    stamp_ns = log_ns.copy()
+    stamp_ns[0] = log_ns[1] - 12 * NANOSECONDS // 10
+    log_ns[0] = stamp_ns[0] + 6 * NANOSECONDS // 10
+    clock = StampClock()
+    keep, _ = clock.usable(stamp_ns, log_ns, more=False, end=True)
+    assert keep.all()
+    assert clock.recording().unset == 0
+
+
 def test_clock_step_is_found_across_batches() -> None:
     stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
     log_ns = np.concatenate([*stamps(range(1000, 1200))])
