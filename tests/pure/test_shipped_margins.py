@@ -22,8 +22,8 @@ CONTROLLER = "/**/controller"
 EXAMPLES = [path for path in sorted(REPOSITORY.glob("examples/*/*.yaml")) if CONTROLLER in path.read_text(encoding="utf-8")]
 FILES = [*sorted(LIBRARY.glob("*.yaml")), *EXAMPLES]
 STATED = ("An ideal loop", "Margins below the requirement")  # how a first line names a loop without the margins
-NOMINAL, OBSERVED, WORST, SENSITIVITY = 40.0, 35.0, 30.0, 2.0  # deg, deg with an observer, deg of the worst aircraft, 1
-AIRCRAFT, UNCERTAINTY = 40, 0.3  # benchmarks/margins.py has 200
+NOMINAL, OBSERVED, WORST, SENSITIVITY = 40.0, 35.0, 30.0, 2.0  # deg, deg with an observer, deg of the worst of 200, 1
+AIRCRAFT, UNCERTAINTY = 200, 0.3
 
 
 @pytest.fixture(scope="module", autouse=True)
