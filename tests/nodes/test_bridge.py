@@ -223,7 +223,7 @@ def test_silent_autopilot_releases_and_bridge_does_not_engage_again_by_itself(se
     setup.engaged()
     silent, setup.autopilot_runs = setup.t, False
     setup.until_logged("RELEASE -> DISENGAGED: ", " s old (/ap/")
-    setup.until_logged("waiting for /ap/twist/filtered: its publisher sends no samples")
+    setup.until_logged("waiting for /ap/twist/filtered: no sample of its publisher arrives")
     setup.autopilot_runs = True
     setup.run(1.0)
     finite, released = setup.sent_since(silent)

@@ -14,7 +14,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import GetParameters, SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, stamp_ns, world_of
 
 from flight_analysis.closed_loop.scenario import Scenario
@@ -411,7 +411,8 @@ def test_clock_of_ticks_outlives_step_of_system_clock_and_step_is_told(flight: F
     ("begin", "cause"),
     [
         (None, "no publisher"),
-        (lambda flight: flight.world.publisher(JointState, "/y"), "its publisher sends no samples"),
+        (lambda flight: flight.world.publisher(JointState, "/y"), "no sample of its publisher arrives"),
+        (lambda flight: flight.world.publisher(String, "/y"), "/peer publishes std_msgs/msg/String, expected sensor_msgs"),
         (lambda flight: flight.world.send("/y", {"q": 0.0}), "samples refused, the last"),
     ],
 )

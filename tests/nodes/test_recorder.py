@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import State
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from sensor_msgs.msg import FluidPressure, JointState, Temperature
 from std_msgs.msg import String
 from tests.nodes.world import OUTPUTS, World, diagnostics, parameters, world_of
@@ -122,7 +122,7 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recording) -> None:
     recorder.run(0.3)
     weak = recorder.world.publisher(JointState, "/u_m", BEST_EFFORT)
     recorder.run(0.3)
-    assert recorder.logged("/u_m: now recorded with best_effort, as not all of its publishers offer more")
+    assert recorder.logged("/u_m: now recorded as best_effort and volatile: its publishers offer no more")
     (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == "/u_m")
     assert subscription.endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     weak.publish(Encoder(OUTPUTS, "/weak#2").encode(2, np.zeros(4)))
@@ -130,6 +130,34 @@ def test_later_publisher_with_weaker_qos_recorded(recorder: Recording) -> None:
     recorder.end()
     texts = [data for topic, _, data in messages(recorder.folder) if topic == "/u_m"]
     assert [b"strong" in text for text in texts] == [True, False]
+
+
+@pytest.mark.parametrize("qos", [QoSProfile(depth=10), BEST_EFFORT], ids=["reliable", "best_effort"])
+@pytest.mark.parametrize("topic", ["y", "y_m", "u", "truth", "internals", "pose"])
+def test_topic_of_any_publisher_is_recorded_with_the_quality_that_it_offers(
+    topic: str, qos: QoSProfile, recorder: Recording
+) -> None:
+    """A subscription that asks for more than a publisher offers receives nothing from it."""
+    plain = recorder.world.publisher(JointState, f"/{topic}", qos)
+    recorder.run(1.5)
+    (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == f"/{topic}")
+    requested = subscription.endpoint.qos_profile
+    assert qos_check_compatible(qos, requested)[0] != QoSCompatibility.ERROR
+    assert requested.reliability == qos.reliability
+    plain.publish(Encoder(OUTPUTS, "/mine").encode(1, np.zeros(4)))
+    recorder.run(0.2)
+    assert not recorder.logged("[ERROR]")
+    recorder.end()
+    assert count_messages(recorder.folder)[f"/{topic}"] == 1
+
+
+def test_weaker_publisher_beside_that_of_stack_is_named_and_costs_the_log_nothing(recorder: Recording) -> None:
+    recorder.run(0.5, *LOOP)
+    recorder.world.publisher(JointState, "/y", BEST_EFFORT, "/second")
+    recorder.run(1.5, *LOOP)
+    (subscription,) = (each for each in recorder.world.subscriptions if each.topic_name == "/y")
+    assert subscription.endpoint.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    assert recorder.logged("[ERROR] /y: /second publishes with incompatible quality of service")
 
 
 def test_flight_of_which_part_is_recorded_is_no_silent_failure(recorder: Recording) -> None:

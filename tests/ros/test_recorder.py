@@ -60,7 +60,7 @@ def test_topics_of_ros_and_further_ones_recorded_with_any_offered_qos(
     peer_node.until(lambda: recorded(peer_node, "/mixed") == 1, "the strong message")
     weaker = node.create_publisher(String, "/mixed", BEST_EFFORT)
     node.declare_parameter("gain", 3.0)
-    process.wait_for("/mixed: now recorded with best_effort")
+    process.wait_for("/mixed: now recorded as best_effort")
 
     def publish() -> None:
         weak.publish(FluidPressure())

@@ -43,7 +43,6 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError
-from flight_ros.endpoints import mismatch, type_name
 from flight_ros.flight_node import FlightNode
 from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
@@ -367,10 +366,9 @@ class BridgeNode(FlightNode[BridgeConfig]):
         if not publishers:
             profile = os.environ.get(PROFILE_VARIABLE, "")
             return f"no publisher. The autopilot's agent needs the same DDS profile, {PROFILE_VARIABLE}={profile}"
-        kind = type_name(subscription.topic.type)
-        faults = (mismatch(subscription.name, publisher, kind, subscription.qos) for publisher in publishers)
+        faults = self.endpoints.mismatches(subscription)
         refused = (what for what in self.refusals.counts if what.startswith(f"{subscription.topic.name}: "))
-        return next(filter(None, (*faults, *refused)), "its publisher sends no samples")
+        return next(iter((*faults, *refused)), "no sample of its publisher arrives")
 
     def graph_checks(self) -> list[Callable[[], None]]:
         """Also report a topic to which the autopilot subscribes with another type or an incompatible quality of service.

@@ -100,11 +100,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         super().__init__("recorder", RecorderConfig)
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
-        stack_topics = [topic for topic in FLIGHT if not topic.foreign]
-        foreign_topics = [topic for topic in FLIGHT if topic.foreign]
         self._topics = [
-            *(self._record(self.subscribe(topic, RECORD), [PUBLISH]) for topic in stack_topics),
-            *(self._record(self._poll(topic, RECORD_FOREIGN), [PUBLISH]) for topic in foreign_topics),
+            *(self._record(self._poll(topic, RECORD_FOREIGN if topic.foreign else RECORD), [PUBLISH]) for topic in FLIGHT),
             self._record(self._poll(ROSOUT, RECORD), [RECORD]),
             self._record(self._poll(PARAMETER_EVENTS, RECORD_FOREIGN), [RECORD_FOREIGN]),
         ]
@@ -307,11 +304,11 @@ class RecorderNode(FlightNode[RecorderConfig]):
             return ""
         return bounded(outcome.strip())
 
-    # Foreign topics may appear late, and with any QoS
+    # A topic may appear late, and with any QoS
 
     def _check_publisher_counts(self) -> None:
         for topic in self._topics:
-            if topic.foreign and (count := self.count_publishers(topic.name)) != topic.publishers:
+            if (count := self.count_publishers(topic.name)) != topic.publishers:
                 topic.publishers = count
                 self._weaken_qos(topic)
 
@@ -378,18 +375,24 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._topics.append(self._record(topic, offered))
 
     def graph_checks(self) -> list[Callable[[], None]]:
-        foreign = (topic for topic in self._topics if topic.foreign)
-        checks = (partial(self.endpoints.check_publishers, topic.name, topic.channel.type.name) for topic in foreign)
-        return [*super().graph_checks(), *checks]
+        return [*super().graph_checks(), *(partial(self._check_publishers, topic) for topic in self._topics)]
+
+    def _check_publishers(self, topic: _RecordedTopic) -> None:
+        self._weaken_qos(topic)
+        self.endpoints.check_publishers(topic.subscription)
 
     def _offered(self, name: str, message_type: str) -> list[QoSProfile]:
         return [peer.qos_profile for peer in self.get_publishers_info_by_topic(name) if peer.topic_type == message_type]
 
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
-        """Subscribe again with a weaker QoS when a new publisher offers less than is requested."""
+        """Subscribe again with a weaker QoS where the publishers of a topic offer less than is requested.
+
+        A weaker publisher beside one of the stack does not lower the QoS of a topic of the stack: EndpointMonitor names it.
+        """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)
-        if all(qos_check_compatible(profile, subscription.qos)[0] != QoSCompatibility.ERROR for profile in offered):
+        lacking = [qos_check_compatible(profile, subscription.qos)[0] == QoSCompatibility.ERROR for profile in offered]
+        if not any(lacking) or not (topic.foreign or all(lacking)):
             return
         # Volatile, because the transient-local samples have been recorded already.
         weaker = QoSProfile(depth=subscription.qos.depth, reliability=strongest_compatible(offered).reliability)
@@ -397,7 +400,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self.destroy_subscription(subscription.entity)
         topic.subscription = self._poll(subscription.topic, weaker)
         self.get_logger().info(
-            f"{topic.name}: now recorded with {weaker.reliability.short_key}, as not all of its publishers offer more"
+            f"{topic.name}: now recorded as {weaker.reliability.short_key} and volatile: its publishers offer no more"
         )
 
     def status(self) -> tuple[bytes, str, dict[str, object]]:

@@ -11,6 +11,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo, TopicEndpointTypeEnum
 
 from flight_core.rates import NANOSECONDS
 from flight_core.text import bounded
+from flight_ros.subscriptions import PolledSubscription
 from flight_ros.throttle import Throttle
 
 LOG_PERIOD_NS = 5 * NANOSECONDS  # between two lines on one mismatch
@@ -21,22 +22,17 @@ def type_name(message: type) -> str:
     return f"{message.__module__.split('.')[0]}/msg/{message.__name__}"
 
 
-def mismatch(topic: str, peer: TopicEndpointInfo, message_type: str, qos: QoSProfile | None) -> str:
-    """Why a peer exchanges no messages with a local endpoint of this message type and QoS; empty if both match.
-
-    Without a QoS only the message type is compared.
-    """
+def mismatch(peer: TopicEndpointInfo, message_type: str, qos: QoSProfile) -> str:
+    """Why a peer exchanges no messages with a local endpoint of this message type and QoS; empty if both match."""
     node = f"{peer.node_namespace.rstrip('/')}/{peer.node_name}"
     publishes = peer.endpoint_type == TopicEndpointTypeEnum.PUBLISHER
     verb = "publishes" if publishes else "subscribes"
     if peer.topic_type != message_type:
-        return f"{topic}: {node} {verb}{'' if publishes else ' to'} {peer.topic_type}, expected {message_type}"
-    if qos is not None:
-        offered, requested = (peer.qos_profile, qos) if publishes else (qos, peer.qos_profile)
-        compatibility, reason = qos_check_compatible(offered, requested)
-        if compatibility == QoSCompatibility.ERROR:
-            return f"{topic}: {node} {verb} with incompatible quality of service: {reason}"
-    return ""
+        return f"{node} {verb}{'' if publishes else ' to'} {peer.topic_type}, expected {message_type}"
+    offered, requested = (peer.qos_profile, qos) if publishes else (qos, peer.qos_profile)
+    compatibility, reason = qos_check_compatible(offered, requested)
+    is_refused = compatibility == QoSCompatibility.ERROR
+    return f"{node} {verb} with incompatible quality of service: {reason}" if is_refused else ""
 
 
 class EndpointMonitor:
@@ -46,9 +42,15 @@ class EndpointMonitor:
         self._node = node
         self._throttle = Throttle(LOG_PERIOD_NS)
 
-    def check_publishers(self, topic: str, message_type: str, qos: QoSProfile | None = None) -> None:
-        """Log an error for each publisher of a topic that does not match a subscription of this type and QoS."""
-        self._log_mismatches(topic, self._node.get_publishers_info_by_topic(topic), message_type, qos)
+    def mismatches(self, subscription: PolledSubscription) -> list[str]:
+        """A sentence for each publisher that does not match a subscription of the node."""
+        kind = type_name(subscription.topic.type)
+        peers = self._node.get_publishers_info_by_topic(subscription.name)
+        return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]
+
+    def check_publishers(self, subscription: PolledSubscription) -> None:
+        """Log an error for each publisher that does not match a subscription of the node."""
+        self._log(subscription.name, self.mismatches(subscription))
 
     def check_subscribers(self, publisher: Publisher) -> None:
         """Log an error for each subscriber of a topic that does not match a publisher of the node."""
@@ -57,13 +59,10 @@ class EndpointMonitor:
         for endpoint in self._node.get_publishers_info_by_topic(topic):
             if endpoint.node_name == self._node.get_name():
                 peers = self._node.get_subscriptions_info_by_topic(topic)
-                self._log_mismatches(topic, peers, endpoint.topic_type, endpoint.qos_profile)
+                self._log(topic, [mismatch(peer, endpoint.topic_type, endpoint.qos_profile) for peer in peers])
                 return
 
-    def _log_mismatches(
-        self, topic: str, peers: Sequence[TopicEndpointInfo], message_type: str, qos: QoSProfile | None
-    ) -> None:
-        for peer in peers:
-            sentence = mismatch(topic, peer, message_type, qos)
-            if sentence and self._throttle.due(sentence):
-                self._node.get_logger().error(bounded(sentence))
+    def _log(self, topic: str, sentences: Sequence[str]) -> None:
+        for sentence in sentences:
+            if sentence and self._throttle.due(f"{topic}: {sentence}"):
+                self._node.get_logger().error(bounded(f"{topic}: {sentence}"))

@@ -22,7 +22,7 @@ from flight_core.publisher_lock import PublisherLock
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.text import bounded
 from flight_ros.clocks import PeerClocks
-from flight_ros.endpoints import EndpointMonitor, type_name
+from flight_ros.endpoints import EndpointMonitor
 from flight_ros.liveliness import LivelinessMonitor
 from flight_ros.messages import Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
@@ -219,7 +219,9 @@ class FlightNode(Node, Generic[P]):
         self._waiting[subscription.name] = now_ns, log_ns if now_ns < log_ns else now_ns + WAITING_PERIOD_NS
         if now_ns < log_ns:
             return
-        cause = "its publisher sends no samples" if self.count_publishers(subscription.name) else lack
+        cause = lack
+        if self.count_publishers(subscription.name):
+            cause = "; ".join(self.endpoints.mismatches(subscription)) or "no sample of its publisher arrives"
         if refused := self.refusals.since(subscription, now_ns - NO_PUBLISHER_WARNING_NS):
             cause = refused
         self.get_logger().warning(f"waiting for {subscription.name}: {cause}")
@@ -289,10 +291,9 @@ class FlightNode(Node, Generic[P]):
 
         They log an error for each peer with another message type or incompatible QoS: its topic would stay silent.
         """
-        subscribed = ((receiver.name, type_name(receiver.topic.type), receiver.qos) for receiver in self.polled_subscriptions)
         return [
             *(partial(self.endpoints.check_subscribers, publisher) for publisher in self._flight_publishers),
-            *(partial(self.endpoints.check_publishers, *topic) for topic in subscribed),
+            *(partial(self.endpoints.check_publishers, subscription) for subscription in self.polled_subscriptions),
         ]
 
     def runs_in_lockstep(self) -> bool:
