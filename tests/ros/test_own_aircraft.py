@@ -1,34 +1,96 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The aircraft of docs/ros.md, a node of rclpy alone, flies as it stands under the reference model and the controller."""
+"""The shells of docs/ros.md that start single nodes run as they stand, each in a shell of its own, to their last command."""
 
 import re
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from sensor_msgs.msg import JointState
 from tests.conftest import REPOSITORY
-from tests.ros.conftest import Start
-from tests.ros.peer import Peer
+from tests.ros.waiting import until
 
-pytestmark = pytest.mark.package("flight_bringup")
+from flight_bringup.processes import end_with_parent
+from flight_log.tape_reader import read_run
 
-PEER_TOPICS = ("y", "y_m")
+pytestmark = [pytest.mark.package("flight_bringup"), pytest.mark.timeout(240)]
 
-
-def pitch_rate(message: JointState | None) -> float:
-    """Q of a named vector, rad/s; 0 before the first."""
-    return 0.0 if message is None else float(message.position[message.name.index("q")])
+PAGE = (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8")
+FLOWN = 4.0  # s: from any begin it contains a command of the scenario
 
 
-def test_aircraft_of_page_tracks_reference_model(start: Start, start_node: Start, peer_node: Peer, tmp_path: Path) -> None:
-    (program,) = re.findall(
-        r"^```python\n(.*?)^```$", (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
+def shells(section: str) -> tuple[list[str], list[str]]:
+    """The lines of a section that each shell begins with, and the commands, each of a shell of its own."""
+    text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    text = re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = re.findall(r"^    (\S.*)$", text, re.MULTILINE)
+    common = [line for line in lines if re.match(r"export |\w+=", line)]
+    return common, [line for line in lines if line not in common]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with what the commands of a page need of a checkout, and the programs of the page."""
+    for name in (".venv", "ros_ws"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    (program,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     (tmp_path / "my_aircraft.py").write_text(program, encoding="utf-8")
-    start("my_aircraft")
-    start_node("rise_di_controller").wait_for("ready")
-    start_node("reference_model")
-    # Half of the first command of the scenario, then most of that by the aircraft: without control its q would stay 0.
-    peer_node.until(lambda: pitch_rate(peer_node.last("y_m")) > 0.05, "a command")
-    peer_node.until(lambda: pitch_rate(peer_node.last("y")) > 0.04, "the aircraft follows it")
+    return tmp_path
+
+
+@pytest.fixture
+def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """The processes of a page; those that still run at the end of the test are killed."""
+    processes: list[subprocess.Popen[bytes]] = []
+    yield processes
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("section", ["Nodes one by one", "Your own aircraft"])
+def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, shell: list[subprocess.Popen[bytes]]) -> None:
+    common, commands = shells(section)
+    nodes = [command for command in commands if "rise-di " not in command]
+    after = [command for command in commands if command not in nodes]
+    assert "recorder" in nodes[-1]
+    assert after
+    for number, command in enumerate(nodes):
+        with (checkout / f"{number}.txt").open("wb") as output:
+            script = "\n".join([*common, f"exec {command}"])
+            shell.append(
+                subprocess.Popen(
+                    [*end_with_parent(), "bash", "-c", script], cwd=checkout, stdout=output, stderr=subprocess.STDOUT
+                )
+            )
+    recorder = shell[-1]
+
+    def texts() -> str:
+        return "\n".join(path.read_text(encoding="utf-8") for path in sorted(checkout.glob("*.txt")))
+
+    def flies() -> bool:
+        assert [process.poll() for process in shell] == [None] * len(shell), texts()
+        return "WAITING -> ENGAGED" in texts() and "[recorder]: ready" in texts()
+
+    until(flies, "a controller that tracks, and a log")
+    time.sleep(FLOWN)
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(timeout=60) == 0
+    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")  # of the recorder
+    for command in after:
+        done = subprocess.run(
+            ["/bin/bash", "-c", "\n".join([*common, command])],
+            cwd=checkout,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode in {0, 4}, done.stdout + done.stderr  # 4: the recorder began after the controller
+    tape = read_run(checkout / "runs" / "latest").tape
+    q, reference = (abs(tape[topic]["q"]) for topic in ("y", "y_m"))
+    assert len(q) > 50.0 * FLOWN  # of at least 100 a second
+    assert max(q) > 0.7 * max(reference) > 0.0  # without control q of the page's aircraft would stay 0

@@ -87,6 +87,39 @@ def test_topics_of_ros_and_further_ones_recorded_with_any_offered_qos(
     assert [parameter.name for event in events for parameter in event.new_parameters] == ["gain"]
 
 
+PLAIN = {
+    "y": (1000.0, QoSProfile(depth=10)),
+    "y_m": (500.0, BEST_EFFORT),
+    "u": (100.0, QoSProfile(depth=10)),
+    "truth": (20.0, BEST_EFFORT),
+}
+"""Rates of publishers, Hz, and qualities as rclpy and rclcpp have them by default, or of a sensor."""
+
+
+def test_plain_publishers_of_any_rate_are_recorded(recorder: Recorder, peer_node: Peer, tmp_path: Path) -> None:
+    process = recorder("run").wait_for("ready")
+    publishers = {topic: peer_node.node.create_publisher(JointState, topic, qos) for topic, (_, qos) in PLAIN.items()}
+    peer_node.until(
+        lambda: all(publisher.get_subscription_count() for publisher in publishers.values()),
+        "the subscriptions of the recorder",
+    )
+    sent = dict.fromkeys(PLAIN, 0)
+    begin = time.monotonic()
+    while (elapsed := time.monotonic() - begin) < 2.0:
+        for topic, (rate, _) in PLAIN.items():
+            if sent[topic] <= elapsed * rate:
+                sent[topic] += 1
+                publishers[topic].publish(to_message(time.time_ns(), OUTPUTS, np.zeros(4), ""))
+        time.sleep(0.0002)
+    process.interrupt().succeed()
+    run = read_run(tmp_path / "run")
+    stored = {topic: len(run.tape[topic].stamp_ns) for topic in PLAIN}
+    lost = {topic: int(run.metadata.get("rise_di_lost", {}).get(f"/{topic}", 0)) for topic in PLAIN}
+    assert all(stored[topic] + lost[topic] >= sent[topic] - 1 for topic in PLAIN), (sent, stored, lost)
+    assert all(stored[topic] > 0.9 * sent[topic] for topic in PLAIN), (sent, stored, lost)
+    assert [line for line in process.lines if "[ERROR]" in line or "waiting for" in line] == []
+
+
 def forge_gap(domain: int, writer: bytes) -> None:
     """Send a GAP of a writer to all participants of this host: its readers take 100,000 samples as irrelevant.
 

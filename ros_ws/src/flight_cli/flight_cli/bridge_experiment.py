@@ -15,12 +15,12 @@ from autopilot_bridge.params import ChannelMap, load_map
 from control_laws.excitation import ExcitationConfig
 from flight_analysis.closed_loop.replay import recorded_parameters
 from flight_analysis.closed_loop.scenario import load_scenario
-from flight_analysis.report.run_folder import link_latest, new_run
+from flight_analysis.report.run_folder import new_run
 from flight_bringup.fly import fly_over_topics
 from flight_bringup.graph import find_autopilot
 from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import flight_progress, new_table, print_json
-from flight_core.files import display_path, write_file, writing
+from flight_core.files import display_path, link_latest, write_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape

@@ -251,3 +251,16 @@ def write_file(path: Path, content: str | bytes) -> None:
     """Write a file atomically, text as UTF-8, as `replacing` does. Raises OSError."""
     with replacing(path) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
+
+
+def link_latest(run: Path) -> None:
+    """Point runs/latest at a run, atomically. Raises ParameterError where no link can be made."""
+    latest = run.parent / "latest"
+    temporary = run.parent / f".latest-{os.getpid()}"
+    with writing("", latest, "a link to the last run"):
+        temporary.symlink_to(run.name)
+        try:
+            temporary.replace(latest)
+        except OSError:
+            temporary.unlink()
+            raise

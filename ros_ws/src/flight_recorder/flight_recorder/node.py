@@ -18,7 +18,7 @@ from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
 
-from flight_core.files import dump_yaml, is_file, read_file, writing
+from flight_core.files import dump_yaml, is_file, link_latest, read_file, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
@@ -141,6 +141,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
             bag = BagWriter(directory)
             bag.add_attachments(attachments, time.time_ns())
             bag.flush()
+            if not parameters.directory:
+                link_latest(directory)
         return bag
 
     def _space_shortage(self, directory: Path) -> str:
@@ -387,7 +389,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
         """Subscribe again with a weaker QoS where the publishers of a topic offer less than is requested.
 
-        A weaker publisher beside one of the stack does not lower the QoS of a topic of the stack: EndpointMonitor names it.
+        A weaker publisher beside one of the stack does not lower the QoS of a topic of the stack: EndpointMonitor logs the mismatch.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)

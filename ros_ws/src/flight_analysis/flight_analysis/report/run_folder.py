@@ -3,7 +3,6 @@
 """The folder of a run: created before a flight, with the attachments of the log; read back and reported on afterwards."""
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -17,7 +16,7 @@ from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, p
 from flight_analysis.report.account import Account, account, flown, outcome_of_log
 from flight_analysis.report.summary import RecordedFlight, empty_summary, engagement_notes, summarise, summarise_imported
 from flight_core.arguments import FilePath
-from flight_core.files import dump_yaml, read_file, write_file, writing
+from flight_core.files import dump_yaml, link_latest, read_file, write_file, writing
 from flight_core.outcome import COMPLETED, NEVER_FLEW, UNKNOWN
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS
@@ -248,16 +247,3 @@ def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, si
             if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):
                 return bounded(outcome.strip())
     return outcome_of_log(tape, scenario, simulated=simulated) or f"{UNKNOWN}: neither the run nor the log has one"
-
-
-def link_latest(run: Path) -> None:
-    """Point runs/latest at a run, atomically. Raises ParameterError where no link can be made."""
-    latest = run.parent / "latest"
-    temporary = run.parent / f".latest-{os.getpid()}"
-    with writing("", latest, "a link to the last run"):
-        temporary.symlink_to(run.name)
-        try:
-            temporary.replace(latest)
-        except OSError:
-            temporary.unlink()
-            raise
