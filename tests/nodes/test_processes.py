@@ -13,7 +13,7 @@ from tests.ros.waiting import HANG, until
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_bringup import processes
 from flight_bringup.graph import NodeSpec
-from flight_bringup.processes import FlightProcesses
+from flight_bringup.processes import FlightProcesses, NotReadyError
 from flight_core.parameters import ParameterError
 
 pytestmark = pytest.mark.package("flight_bringup")
@@ -54,6 +54,30 @@ def test_process_ending_while_others_wait_named_at_once(
     with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
         start_stage(osprey_gust, tmp_path / "run")
     assert time.monotonic() - begin < HANG / 2
+
+
+@pytest.mark.parametrize(
+    ("end", "flew_never", "cause"),
+    [
+        ("import os\nos.kill(os.getpid(), 9)\n", True, "controller was killed by SIGKILL"),
+        ("", True, "controller was shut down"),
+        ("import sys\nsys.exit(1)\n", True, "controller ended with status 1: no output"),
+        (
+            "import sys\nprint('error: no such airframe')\nsys.exit(2)\n",
+            False,
+            "controller ended with status 2: no such airframe",
+        ),
+    ],
+    ids=["killed", "shut down", "exception", "bad input"],
+)
+def test_end_before_ready_is_bad_input_only_by_its_status(
+    end: str, flew_never: bool, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """`rise-di fly` ends with status 3 for NotReadyError, and else with 2."""
+    only_stage.write_text(end, encoding="utf-8")
+    with pytest.raises(ParameterError, match=f"^{cause}$") as caught:
+        start_stage(osprey_gust, tmp_path / "run")
+    assert isinstance(caught.value, NotReadyError) is flew_never
 
 
 def test_process_that_ends_named_with_fatal_line_not_last_one(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:

@@ -221,6 +221,21 @@ def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> N
             assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
 
 
+def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_path: Path) -> None:
+    actions, context, first, _ = case
+    timer = every(TimerAction, actions)[-1]
+    assert timer.period == 20.0
+    (require_ready,) = every(OpaqueFunction, timer.actions)
+    for executable in first[:-1]:
+        publish(actions, context, f"/{executable}#{PID}")
+    with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
+        require_ready.function(context)
+    left = [file.read_text(encoding="utf-8") for file in tmp_path.glob("runs/*/outcome")]
+    assert left == ([f"never flew: {first[-1]} not ready after 20 s"] if "recorder" in first else [])
+    publish(actions, context, f"/{first[-1]}#{PID}")
+    assert require_ready.function(context) is None
+
+
 def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
     """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
     sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)

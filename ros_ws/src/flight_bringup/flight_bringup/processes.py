@@ -35,7 +35,7 @@ from flight_bringup.graph import (
     start_lead,
 )
 from flight_core.files import dump_yaml, write_file
-from flight_core.outcome import COMPLETED, INTERRUPTED, LOST_CONTACT, NEVER_FLEW
+from flight_core.outcome import COMPLETED, INTERRUPTED, LOST_CONTACT, NEVER_FLEW, STATUS_BAD_INPUT
 from flight_core.parameters import ParameterError, nest
 from flight_core.scheduling import leave_real_time_priority
 from flight_core.signals import handle_shutdown
@@ -85,7 +85,7 @@ def leave_outcome(run: Path, outcome: str) -> None:
 
 
 class NotReadyError(ParameterError):
-    """A node is not ready in time."""
+    """A node is not ready in time, or has ended before, and not by bad input."""
 
 
 class NodeProcess:
@@ -258,7 +258,8 @@ class FlightProcesses:
     def _wait_until_ready(self, deadline: float) -> None:
         while waiting := self.waiting():
             if (reason := self.ended_early()) is not None:
-                raise ParameterError(reason)
+                statuses = {process.popen.poll() for process in self.processes}
+                raise (ParameterError if STATUS_BAD_INPUT in statuses else NotReadyError)(reason)
             if time.monotonic() > deadline:
                 late = f"timed out waiting for {', '.join(waiting)}: not ready after {READY_TIMEOUT:g} s"
                 raise NotReadyError(f"{late}; see the logs in {self._run / 'log'}")

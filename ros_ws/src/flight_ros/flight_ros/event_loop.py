@@ -16,7 +16,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
-from flight_core.outcome import FlightEnded
+from flight_core.outcome import STATUS_BAD_INPUT, STATUS_ENDED_EARLY, FlightEnded
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
 from flight_core.scheduling import disable_timer_slack, request_short_slices
@@ -27,10 +27,6 @@ from flight_ros.flight_node import MAX_START_AGE_NS, FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
-
-# exit statuses
-BAD_PARAMETERS = 2
-ENDED_EARLY = 3
 
 PEER_TIMEOUT_NS = 30 * NANOSECONDS  # of a lockstep flight that never begins, or that waits after a refused sample
 
@@ -80,7 +76,7 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
         is_stack_error = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
         print(f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr)
         rclpy.try_shutdown()
-        sys.exit(ENDED_EARLY if isinstance(error, FlightEnded) else BAD_PARAMETERS)
+        sys.exit(STATUS_ENDED_EARLY if isinstance(error, FlightEnded) else STATUS_BAD_INPUT)
     node = nodes[0]
     try:
         if sockets := transport.open_to_network():
@@ -91,10 +87,10 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
             _run_real_time(nodes, stop)
     except ParameterError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(BAD_PARAMETERS)
+        sys.exit(STATUS_BAD_INPUT)
     except FlightEnded as error:
         node.get_logger().fatal(str(error))
-        sys.exit(ENDED_EARLY)
+        sys.exit(STATUS_ENDED_EARLY)
     except Exception:
         node.get_logger().fatal(f"unexpected exception, the node ends: {traceback.format_exc()}")
         sys.exit(1)

@@ -150,9 +150,13 @@ def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOver
 def fail_on_exit(event: ProcessExited, context: LaunchContext, run: Path) -> None:
     """End the launch with exit status 1 when a process ends before the flight, with the outcome in the folder `run`."""
     if not context.is_shutdown:
-        reason = f"{event.process_name} ended before the flight did"
-        leave_outcome(run, reason)
-        raise RuntimeError(reason)
+        end_with(run, f"{event.process_name} ended before the flight did")
+
+
+def end_with(run: Path, outcome: str) -> None:
+    """End the launch with exit status 1, with the outcome in the folder `run`."""
+    leave_outcome(run, outcome)
+    raise RuntimeError(outcome)
 
 
 def say_on_exit(event: ProcessExited, context: LaunchContext) -> list[Action]:
@@ -182,7 +186,8 @@ def start_in_stages(
 ) -> list[Action]:
     """Start the first stage of a flight into the folder `run`. Once the nodes are ready, run the actions of `second`.
 
-    The arguments of `second` are the time until t = 0 and the system time of t = 0, s.
+    The arguments of `second` are the time until t = 0 and the system time of t = 0, s. A node that is not ready after
+    READY_TIMEOUT ends the launch with exit status 1.
     """
     _subscribe_states(context)
     leave_outcome(run, INTERRUPTED)  # until another outcome replaces it
@@ -194,12 +199,13 @@ def start_in_stages(
         lead = start_lead(time.monotonic() - begin)
         return () if waiting else second(lead, start_instant(lead))
 
-    def warn(context: LaunchContext) -> list[Action]:
-        names = ", ".join(spec.executable for spec in waiting)
-        return [LogInfo(msg=f"timed out waiting for {names}: not ready after {READY_TIMEOUT:g} s")] if waiting else []
+    def require_ready(context: LaunchContext) -> None:
+        if waiting and not context.is_shutdown:
+            names = ", ".join(spec.executable for spec in waiting)
+            end_with(run, f"{NEVER_FLEW}: {names} not ready after {READY_TIMEOUT:g} s")
 
     handlers = [on_state(context, spec, NodeState.READY, lambda spec=spec: ready(spec)) for spec in first]
-    return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=warn)])]
+    return [*handlers, *first.values(), TimerAction(period=READY_TIMEOUT, actions=[OpaqueFunction(function=require_ready)])]
 
 
 def begin_when_matched(
@@ -235,20 +241,16 @@ def begin_when_matched(
     def require_matched(context: LaunchContext) -> None:
         if waiting and not context.is_shutdown:
             names = ", ".join(spec.executable for spec in waiting)
-            end(f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
+            end_with(run, f"{NEVER_FLEW}: {names} not ready, or with an input without a publisher, after {READY_TIMEOUT:g} s")
 
     def require_flight(context: LaunchContext) -> None:
         if not flying and not context.is_shutdown:
             lines = "the lines of the nodes say what they wait for"
-            end(f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the aircraft; {lines}")
+            end_with(run, f"{NEVER_FLEW}: y did not reach the controller, or u did not reach the aircraft; {lines}")
 
     def give_up(context: LaunchContext) -> None:
         if not context.is_shutdown:
-            end(ended_early((held_ns[0] - start_ns[0]) / NANOSECONDS, duration))
-
-    def end(outcome: str) -> None:
-        leave_outcome(run, outcome)
-        raise RuntimeError(outcome)
+            end_with(run, ended_early((held_ns[0] - start_ns[0]) / NANOSECONDS, duration))
 
     def held(stamp_ns: int) -> bool:
         held_ns[0] = stamp_ns
