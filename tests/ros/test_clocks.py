@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of nodes on other hosts: what a node says of a clock that differs."""
+"""Clocks of other nodes: what a node says of a clock that differs."""
 
 import re
 import struct
@@ -18,7 +18,7 @@ from flight_ros.topics import DIAGNOSTICS
 pytestmark = pytest.mark.package("flight_ros")
 
 
-def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) -> None:
+def test_refusal_names_clock_of_the_other_node(start_node: Start, tmp_path: Path) -> None:
     """The clock of the aircraft is 0.15 s behind, more than `max_age` of the controller, 0.1 s."""
     (step := tmp_path / "step").write_bytes(struct.pack("=q", -150 * NANOSECONDS // 1000))
     shifted = ("env", f"LD_PRELOAD={settable_clock(tmp_path)}", f"FAULTS_CLOCK={step}")
@@ -30,7 +30,7 @@ def test_refusal_names_clock_of_other_host(start_node: Start, tmp_path: Path) ->
     def told(sentence: str) -> bool:  # the first estimate has the delays of a busy host, and one within 5 ms is not told again
         return any(float(offset) == pytest.approx(0.15, abs=0.01) for offset in re.findall(sentence, controller.output))
 
-    controller.until(partial(told, f"{estimate}: synchronise the hosts"), "the difference of the clocks, told")
+    controller.until(partial(told, f"{estimate}: the system clock of this host was set"), "the difference of the clocks, told")
     controller.until(partial(told, f"old: {estimate}"), "the refusal, with the difference of the clocks")
     with peer(topics=()) as peer_node:
         found: list[float] = []

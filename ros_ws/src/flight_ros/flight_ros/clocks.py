@@ -1,18 +1,22 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clocks of the other nodes of an aircraft, which may run on other hosts: offset and delay of each, measured both ways.
+"""Clocks of the nodes of an aircraft on several hosts: offset and delay, measured in both directions.
 
-Each node publishes once a second, on `clocks`, the least difference D_ij = (own clock at the reception) - (clock of the sender)
-of the messages of each other node j. With the delay d of a message and theta_j, the clock of j less that of i,
+A node i publishes once a second, on `clocks`, the least difference D_ij = (clock of i at the reception) - (clock of the sender)
+of the messages of a node j. With the delay d of a message and theta_j, the clock of j less that of i,
 
     D_ij = d_ji - theta_j,   D_ji = d_ij + theta_j,   so theta_j = (D_ji - D_ij) / 2   where d_ij = d_ji.
 
 Half of the difference of the two delays is the error. Source: D. L. Mills et al., RFC 5905 (2010), section 8.
+
+Nodes of a host share the monotonic clock. So a node also sends the identity of the host, and the lead of the clock of the node
+over the monotonic clock: theta_j is then exact, and a busy host that delays messages shifts no clock.
 """
 
 import time
 from collections import deque
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +35,17 @@ FORGET_NS = 5 * NANOSECONDS  # a node that is silent so long is forgotten
 DIFFERS = 0.005
 """s. Half a period of a controller at 100 Hz, and several times the error of the estimate on a local network. A larger offset
 is told: it is in every age, and of a clock ahead it delays u."""
+# Channels of `clocks` beside the names of nodes, which begin with a slash.
+HOST = "host"  # a number of the boot of the host; 0 is unknown
+AHEAD = "ahead"  # clock of the node less the monotonic clock, s
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+SYNCHRONISE = "synchronise the hosts, as by chrony or PTP"
+RESTART = "the system clock of this host was set between the starts of the two: restart all nodes"
+
+
+def number_of_host() -> float:
+    """A number of the boot of this host, which float64 holds; 0 where the system has none."""
+    return float(int(BOOT_ID.read_text(encoding="ascii")[:8], 16)) if BOOT_ID.exists() else 0.0
 
 
 class ClockOfPeer(NamedTuple):
@@ -38,18 +53,22 @@ class ClockOfPeer(NamedTuple):
 
     offset: float
     delay: float
+    advice: str = SYNCHRONISE  # for a clock that differs
 
     def __str__(self) -> str:
         return f"{abs(self.offset):.3f} s {'ahead of' if self.offset > 0.0 else 'behind'} this one"
 
 
 class Peers:
-    """The differences of clocks that a node has seen, and those that the other nodes report of it. Times in s and ns."""
+    """The differences of clocks as a node sees them, and as its peers report them. Times in s and ns."""
 
-    def __init__(self, own_name: str) -> None:
+    def __init__(self, own_name: str, host: float = 0.0) -> None:
+        self.ahead = 0.0  # of the own clock
         self._own = own_name
+        self._host = host
         self._seen: dict[str, deque[float]] = {}
         self._reported: dict[str, float] = {}
+        self._on_host: dict[str, float] = {}  # offsets of the nodes of this host
         self._heard_ns: dict[str, int] = {}
 
     def receive(self, sender: str, sent_ns: int, received_ns: int, reported: Mapping[str, float]) -> None:
@@ -62,30 +81,33 @@ class Peers:
         self._seen.setdefault(sender, deque(maxlen=WINDOW)).append((received_ns - sent_ns) / NANOSECONDS)
         if self._own in reported:
             self._reported[sender] = reported[self._own]
+            if self._host and reported.get(HOST) == self._host:
+                self._on_host[sender] = reported.get(AHEAD, self.ahead) - self.ahead
 
     def forget(self, name: str) -> None:
         """Forget a node."""
-        for known in (self._seen, self._reported, self._heard_ns):
+        for known in (self._seen, self._reported, self._heard_ns, self._on_host):
             known.pop(name, None)
 
     def differences(self) -> dict[str, float]:
-        """The least difference of every peer, to be reported."""
-        return {name: min(seen) for name, seen in self._seen.items()}
+        """The report of a node: the least difference of every peer, and the figures for nodes of this host."""
+        return {HOST: self._host, AHEAD: self.ahead} | {name: min(seen) for name, seen in self._seen.items()}
 
     def clocks(self) -> dict[str, ClockOfPeer]:
         """The clocks of the nodes that have reported."""
         seen = self.differences()
-        return {
+        clocks = {
             name: ClockOfPeer((reported - seen[name]) / 2.0, (reported + seen[name]) / 2.0)
             for name, reported in self._reported.items()
         }
+        return clocks | {name: ClockOfPeer(offset, seen[name] + offset, RESTART) for name, offset in self._on_host.items()}
 
 
 class PeerClocks:
     """Measures the clocks of the other nodes over `clocks`."""
 
     def __init__(self, node: Node, instance: str) -> None:
-        self._peers = Peers(instance)
+        self._peers = Peers(instance, number_of_host())
         self._instance = instance
         self._told: dict[str, float] = {}
         self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, NEWEST_SAMPLES).publish
@@ -93,7 +115,8 @@ class PeerClocks:
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:
-        """Take what the others have sent, and send; once a second. `ahead_ns`: the system clock less the time of the node."""
+        """Once a second: take the reports, send a report. `ahead_ns`: the system clock less the time of the node."""
+        self._peers.ahead = (time.time_ns() - ahead_ns - time.monotonic_ns()) / NANOSECONDS
         for received in self._subscription.take():
             try:
                 require_size(received.message)
@@ -107,14 +130,14 @@ class PeerClocks:
 
     def received(self) -> list[str]:
         """The received peers."""
-        return [*self._peers.differences()]
+        return [name for name in self._peers.differences() if name.startswith("/")]
 
     def clocks(self) -> dict[str, ClockOfPeer]:
         """The clocks of the peers."""
         return self._peers.clocks()
 
     def told_of(self, sender: str) -> str:
-        """The end of a sentence on a stamp of a node whose clock differs; empty for one that agrees, or is unknown."""
+        """The end of a sentence on a stamp of a node whose clock differs; empty without a known difference."""
         clock = self.clocks().get(sender)
         return bounded(f": the clock of {sender} is {clock}") if clock is not None and abs(clock.offset) > DIFFERS else ""
 
@@ -126,12 +149,12 @@ class PeerClocks:
         return report
 
     def news(self) -> list[str]:
-        """A sentence for each clock that has begun to differ, by another amount than told, or that agrees again."""
+        """A sentence for every clock with a new difference, or without a difference again."""
         sentences = []
         for name, clock in self.clocks().items():
             offset = clock.offset if abs(clock.offset) > DIFFERS else 0.0
             if abs(offset - self._told.get(name, 0.0)) > DIFFERS:
                 self._told[name] = offset
-                agrees = "agrees with this one" if offset == 0.0 else f"is {clock}: synchronise the hosts, as by chrony or PTP"
+                agrees = "agrees with this one" if offset == 0.0 else f"is {clock}: {clock.advice}"
                 sentences.append(bounded(f"the clock of {name} {agrees}"))
         return sentences
