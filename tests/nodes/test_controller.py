@@ -3,6 +3,7 @@
 """The controller's node: bumpless engagement, failsafe for stale inputs, malformed samples, parameters, lifecycle, overruns."""
 
 import math
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -429,6 +430,47 @@ def test_waiting_for_y_is_told_with_its_cause(begin: Callable[[Flight], object] 
     assert cause in waits[0]
     flight.world.run(2.0, meanwhile)
     assert sum(line.startswith("[WARNING] waiting for /y: ") for line in flight.node.log.lines) == 2  # every 2 s
+
+
+@pytest.mark.parametrize(("rate", "named"), [(9.0, True), (20.0, True), (50.0, False), (200.0, False)])
+def test_rate_of_y_too_low_for_max_age_is_named_once_with_its_mend(rate: float, named: bool, flight: Flight) -> None:
+    """At 9 Hz the law engages and holds in turns; at 20 Hz after two late samples."""
+    next_ns = 0
+
+    def send(paused: bool = False) -> None:
+        nonlocal next_ns
+        flight.world.send("/y_m", dict.fromkeys(OUTPUTS, 0.0))
+        if flight.world.clock.now_ns >= next_ns and not paused:
+            flight.world.send("/y", dict.fromkeys(OUTPUTS, 0.0))
+            next_ns = flight.world.clock.now_ns + nanoseconds(1.0 / rate)
+
+    for _ in range(3):
+        flight.world.run(1.5, send)
+        flight.world.run(0.15, lambda: send(paused=True))
+    assert Mode.HOLD in set(flight.column("mode"))
+    told = [line for line in flight.node.log.lines if "fit into max_age" in line]
+    assert len(told) == named
+    if named:
+        seen = re.search(r"/y: ([\d.]+) samples a second, of which [\d.]+ fit into max_age = 0.1 s: send 30 ", told[0])
+        assert seen
+        assert float(seen[1]) == pytest.approx(rate, rel=0.1)
+
+
+def test_long_max_age_is_named_at_start_and_in_flight(osprey_gust: Scenario) -> None:
+    with flying(osprey_gust, max_age=2.0) as flight:
+        told = [line for line in flight.node.log.lines if "[WARNING] max_age = 2 s: the failsafe begins 2 s after" in line]
+        assert len(told) == 1
+        for max_age in (0.1, 9.0):
+            assert flight.set(max_age=max_age) == (True, "")
+        assert [line for line in flight.node.log.lines if "failsafe begins 9 s after the last y" in line]
+        assert not [line for line in flight.node.log.lines if "failsafe begins 0.1 s" in line]
+
+
+def test_sample_without_stamp_is_no_old_one(flight: Flight) -> None:
+    flight.run(0.1)
+    flight.world.send("/y", dict.fromkeys(OUTPUTS, 0.0), age=flight.world.clock.time())
+    flight.run(0.1)
+    assert any("/y: sample refused: no stamp" in line for line in flight.node.log.lines)
 
 
 def test_node_waits_for_the_next_whole_period(flight: Flight) -> None:

@@ -110,7 +110,8 @@ def require_not_future(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
 def require_not_old(stamp_ns: int, now_ns: int, max_age_ns: int) -> None:
     """Raise ChannelError, reason "old", for a stamp behind the clock by more than the age limit."""
     if now_ns - stamp_ns > max_age_ns:
-        raise ChannelError("old", f"stamp {seconds(now_ns - stamp_ns):g} s old")
+        age = f"stamp {seconds(now_ns - stamp_ns):g} s old" if stamp_ns else "no stamp, expected the instant of the sample"
+        raise ChannelError("old", age)
 
 
 def select(wanted: Sequence[str], names: Sequence[str], values: Sequence[float] | FloatArray) -> FloatArray:

@@ -348,7 +348,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
             )
 
     def _warn_of_topic_silence(self, now_ns: int) -> None:
-        """Warn of a steady topic that has stopped while the publisher is there and others go on.
+        """Warn of a steady topic without messages, while the publisher is there and further topics go on.
 
         A reader may miss all of a topic: a full queue, or a message of the middleware that was forged.
         """
@@ -389,7 +389,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _weaken_qos(self, topic: _RecordedTopic) -> None:
         """Subscribe again with a weaker QoS where the publishers of a topic offer less than is requested.
 
-        A weaker publisher beside one of the stack does not lower the QoS of a topic of the stack: EndpointMonitor logs the mismatch.
+        A weaker publisher beside one of the stack does not lower the QoS: EndpointMonitor logs the mismatch.
         """
         subscription = topic.subscription
         offered = self._offered(topic.name, topic.channel.type.name)

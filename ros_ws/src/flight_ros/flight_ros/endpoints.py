@@ -43,7 +43,7 @@ class EndpointMonitor:
         self._throttle = Throttle(LOG_PERIOD_NS)
 
     def mismatches(self, subscription: PolledSubscription) -> list[str]:
-        """A sentence for each publisher that does not match a subscription of the node."""
+        """A sentence for every publisher with a type or QoS unfit for a subscription of the node."""
         kind = type_name(subscription.topic.type)
         peers = self._node.get_publishers_info_by_topic(subscription.name)
         return [sentence for peer in peers if (sentence := mismatch(peer, kind, subscription.qos))]

@@ -3,10 +3,11 @@
 """Receivers: the samples of a topic, checked and taken at a tick. Refused samples are counted and logged."""
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Generic, Protocol, TypeVar
 
+import numpy as np
 from rclpy.node import Node
 
 from flight_core.publisher_lock import SENDER, PublisherLock
@@ -21,6 +22,9 @@ LOG_PERIOD_NS = 2 * NANOSECONDS  # between two lines on refused samples of one t
 GROWTH = 2
 """Size of a message over that of the longest valid one. A publisher may leave channels out, as a bridge those of a pose that
 are not fresh: three of seven channels have half of the bytes."""
+
+RECENT = 9  # samples, of which the median interval is taken
+FEWEST = 3  # samples within an age limit: one of them may be late, and one lost
 
 
 class Sample(Protocol):
@@ -116,6 +120,7 @@ class Receiver(Generic[S]):
         self._max_size = max_size or MAX_SIZE
         self._grows = max_size is not None
         self._longest = 0  # bytes, of the valid messages
+        self._stamps_ns = deque[int](maxlen=RECENT)  # of the last samples
         self._refusals = refusals
         self._decode = decode
         self._take = take
@@ -148,6 +153,16 @@ class Receiver(Generic[S]):
             return False
         return True
 
+    def slowness(self, max_age_ns: int) -> str:
+        """Why samples at their rate exceed an age limit at times, as a sentence; empty where FEWEST of them fit."""
+        if len(self._stamps_ns) < RECENT or (period_ns := float(np.median(np.diff(self._stamps_ns)))) <= 0.0:
+            return ""
+        fit = max_age_ns / period_ns
+        max_age = max_age_ns / NANOSECONDS
+        mend = f"send {FEWEST / max_age:.3g} a second or more, or set max_age to {FEWEST * period_ns / NANOSECONDS:.2g} or more"
+        slow = f"{NANOSECONDS / period_ns:.3g} samples a second, of which {fit:.1f} fit into max_age = {max_age:g} s"
+        return f"{slow}: {mend}" if fit < FEWEST else ""
+
     def receive(self) -> list[S | None]:
         """Lockstep: decode the messages since the last call, for `accept`. None: without channels, or refused."""
         samples: list[S | None] = []
@@ -178,5 +193,6 @@ class Receiver(Generic[S]):
             except ChannelError as error:
                 raise ChannelError(error.reason, f"{error}{self._refusals.clock_of(sample.sender)}") from None
         self._take(sample, now_ns)
+        self._stamps_ns.append(sample.stamp_ns)
         if self.lock is not None:
             self.lock.refresh(sample.sender, now_ns)

@@ -12,7 +12,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 
 from flight_core.modes import Mode
 from flight_core.publisher_lock import PublisherLock
-from flight_core.rates import nanoseconds, period_ns, seconds
+from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError, StampedVector
 from flight_ros import reports
@@ -22,6 +22,7 @@ from flight_ros.messages import NO_CHANNELS, Decoder
 from flight_ros.rclpy_private import answer_invalid_transitions
 from flight_ros.reports import MAX_REPORT_SIZE, Report
 from flight_ros.subscriptions import PolledSubscription
+from flight_ros.throttle import Throttle
 from flight_ros.ticker import Tick
 from flight_ros.topics import AUTHORITY, INTERNALS, LEARNING, LOCKSTEP, PROPOSAL, PROPOSALS, Y_M, U, Y
 from rise_di_controller.controller import Controller
@@ -30,6 +31,8 @@ from rise_di_controller.params import ControllerConfig
 from rise_di_controller.proposals import AUTHORITY_TICKS, Event, EventKind, Learning, Proposal, authority_names
 from rise_di_controller.rise_di_config import RiseDiConfig
 
+LONG_MAX_AGE = 1.0  # s, from which a failsafe is named as late
+SLOW_PERIOD_NS = 60 * NANOSECONDS  # between two lines on a rate too low for max_age
 BEHIND_NS = 1_000_000
 """From the instants of y and y_m at 500 Hz, whole 2 ms of the system clock, to a tick: both have arrived, and their nodes have
 finished their ticks of up to 1 ms. Ticks at a random part of the period delay u by up to 2 ms more, and those at the instants
@@ -72,6 +75,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         self._last_ns = 0  # of the last tick
         self._still_vanes: tuple[str, ...] = ()
         self._restarts = 0  # of the law, by itself
+        self._slow = Throttle(SLOW_PERIOD_NS)
         if self.parameters.autostart:
             self.trigger_configure()
             if self.parameters.start_active:
@@ -83,6 +87,7 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         """Reset the law. The parameters were validated when they were set."""
         self._controller.restart()  # keeps u, so that a node that is configured again transfers without a bump
         self.get_logger().info(self.parameters.summary())
+        self._warn_long_max_age(self.parameters)
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -100,6 +105,13 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
     def on_parameters(self, parameters: ControllerConfig) -> None:
         """Replace the parameters between two ticks, all at once and without a jump of u."""
         self._controller.retune(parameters)
+        if parameters.max_age != self.parameters.max_age:
+            self._warn_long_max_age(parameters)
+
+    def _warn_long_max_age(self, parameters: ControllerConfig) -> None:
+        if parameters.max_age > LONG_MAX_AGE:
+            late = f"the failsafe begins {parameters.max_age:g} s after the last y or y_m"
+            self.get_logger().warning(f"max_age = {parameters.max_age:g} s: {late}")
 
     def period_ns(self) -> int:
         return self._controller.period_ns
@@ -282,6 +294,8 @@ class ControllerNode(LifecycleNodeMixin, FlightNode[ControllerConfig]):
         for receiver in (self._y, self._y_m):
             if receiver.subscription.topic.name in stale:
                 self.warn_no_publisher(receiver.subscription)
+                if (sentence := receiver.slowness(self._max_age_ns())) and self._slow.due(receiver.name):
+                    self.get_logger().warning(f"{receiver.name}: {sentence}")
         if not stale:
             publisher = None if self._y.lock is None else self._y.lock.publisher
             why = self.clock_of(publisher or "") or ": check for a delay and for different clocks"
