@@ -3,6 +3,7 @@
 """The recorder's node: its topics and their qualities, lost messages, silences, a full disk, and the end of the log."""
 
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ from tests.small_disk import small_disk
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, period_ns
+from flight_log.follow import Follower, Messages
+from flight_log.repair import repair
 from flight_log.tape_reader import read_run
 from flight_recorder.node import RecorderNode
 from flight_ros.messages import Encoder, stamp_of
@@ -165,6 +168,31 @@ def test_flight_of_which_part_is_recorded_is_no_silent_failure(recorder: Recordi
     for topic in ("y_m", "u"):
         assert recorder.logged(f"[WARNING] waiting for /{topic}: no publisher")
     assert not recorder.logged("waiting for /y:")
+
+
+def test_log_of_remapped_topics_names_them_as_the_stack_does(osprey_gust: Scenario, tmp_path: Path) -> None:
+    """The topics of the file keep the names by which they were sent."""
+    names = {"y": "/sensors/y", "u": "/act/command", "y_m": "/uav1/ref/y_m"}
+    remaps = [word for name, topic in names.items() for word in ("-r", f"{name}:={topic}")]
+    arguments = ("--params-file", str(osprey_gust.path), "-r", "__ns:=/uav1", "-p", f"directory:={tmp_path / 'run'}")
+    with world_of(*arguments, *remaps) as world:
+        recorder = Recording(world, tmp_path / "run")
+        recorder.run(1.0, *(topic.removeprefix("/") for topic in names.values()), "uav1/truth", "elsewhere")
+        recorder.world.end(recorder.node)
+    assert {topic for topic, count in count_messages(tmp_path / "run").items() if count} >= {*names.values(), "/uav1/truth"}
+    for folder in (tmp_path / "run", tmp_path / "repaired"):
+        log = read_run(folder)
+        assert log.namespace == "/uav1"
+        assert {"y", "y_m", "u", "truth"} <= log.tape.signals.keys()
+        shown: set[str] = set()
+        for record in Follower(folder, lambda topic, _: 1e9).read():
+            shown |= {record.topic} if isinstance(record, Messages) else set()
+        assert {"/uav1/y", "/uav1/y_m", "/uav1/u", "/uav1/truth"} <= shown
+        if folder.name == "run":
+            shutil.copytree(folder, tmp_path / "repaired")
+            file = next((tmp_path / "repaired").glob("*.mcap"))
+            file.write_bytes(file.read_bytes()[:-100])
+            repair(tmp_path / "repaired")
 
 
 def test_log_reaches_as_far_as_oldest_of_y_y_m_and_u(recorder: Recording) -> None:

@@ -144,6 +144,28 @@ def test_log_without_flight_names_its_topics(command: str, messages: list[Record
     assert "/joint_states" in refusal(command, str(tmp_path / "arm"))
 
 
+REMAPS = {"y": "/sensors/y", "u": "/act/command", "y_m": "/ref/y_m"}
+
+
+def test_remapped_topics_are_one_aircraft_where_the_reader_is_told_their_names(
+    messages: list[Recorded], osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    names = {f"/{name}": topic for name, topic in REMAPS.items()}
+    write_mcap(tmp_path / "plain", messages)
+    write_mcap(tmp_path / "bag", [message._replace(topic=names.get(message.topic, message.topic)) for message in messages])
+    words = [word for name, topic in REMAPS.items() for word in ("--remap", f"{name}:={topic}")]
+    for command in ("report", "replay"):
+        given = ["--scenario", "osprey_gust"]
+        assert refusal(command, str(tmp_path / "bag"), *given)
+        assert "expected NAME:=/TOPIC" in refusal(command, str(tmp_path / "bag"), *given, "--remap", "y=/sensors/y")
+        results = [
+            CliRunner().invoke(application([command]), [command, str(tmp_path / folder), *given, *options, "--json"])
+            for folder, options in (("plain", []), ("bag", words))
+        ]
+        assert results[1].stdout == results[0].stdout.replace(str(tmp_path / "plain"), str(tmp_path / "bag"))
+        assert results[1].exit_code == results[0].exit_code == 0
+
+
 def test_two_aircraft_are_shown_one_at_time(messages: list[Recorded], osprey_gust: Scenario, tmp_path: Path) -> None:
     bag, shorter = tmp_path / "bag", [message for message in messages if message.log_ns < EPOCH + 1000 * MS]
     both = [*in_namespace("/uav1", messages), *in_namespace("/uav2", shorter)]

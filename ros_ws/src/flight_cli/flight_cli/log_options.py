@@ -11,7 +11,7 @@ import typer
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.run_folder import log_account
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_log.bag import COMPARED, IMPORTED
 from flight_log.tape_reader import RecordedRun, read_run
 
@@ -19,6 +19,19 @@ LogNamespace = Annotated[str | None, typer.Option("--namespace", help="Namespace
 LogScenario = Annotated[
     str | None, typer.Option("--scenario", help="Scenario of the flight, a name or a file; by default that in the log.")
 ]
+
+LogRemaps = Annotated[
+    list[str] | None,
+    typer.Option("--remap", metavar="NAME:=TOPIC", help="A topic of remapped nodes, as in y:=/sensors/y; may be repeated."),
+]
+
+
+def remaps_of(words: list[str] | None) -> dict[str, str]:
+    """Topics of a log by names of the stack. Raises ParameterError."""
+    remaps = [word.partition(":=") for word in words or ()]
+    for name, _, topic in remaps:
+        require(bool(name) and topic.startswith("/"), "--remap", f"{name}:={topic}", "NAME:=/TOPIC, as in y:=/sensors/y")
+    return {name: topic for name, _, topic in remaps}
 
 
 def scenario_file(name: str | None) -> Path | None:

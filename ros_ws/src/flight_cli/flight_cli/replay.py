@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.replay import replay as recompute
 from flight_analysis.metrics import error_metrics
 from flight_analysis.report.account import WHOLE
 from flight_analysis.report.run_folder import log_account
-from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
+from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_cli.settings import Settings, parse_settings
 from flight_core.outcome import STATUS_INCOMPLETE
@@ -36,6 +36,7 @@ def replay(
     settings: Settings = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
+    remap: LogRemaps = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
@@ -49,7 +50,7 @@ def replay(
     changed = {name.removeprefix("controller."): value for name, value in changes.items()}
     scenario_source = scenario_file(scenario)
     with Console(stderr=True, quiet=as_json).status(f"computing {printable(str(run))} again"):
-        recorded = read_run(run, namespace, scenario_source)
+        recorded = read_run(run, namespace, scenario_source, remaps_of(remap))
         recorded.require()
         parameters = recorded_parameters(recorded.scenario_file())
         others = vary(parameters, changed) if changed else None

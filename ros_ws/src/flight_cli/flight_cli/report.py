@@ -13,7 +13,7 @@ from flight_analysis.report import comparison
 from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
-from flight_cli.log_options import LogNamespace, LogScenario, scenario_file
+from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, options, print_json, show_flight
 from flight_core.files import display_path
 from flight_core.outcome import STATUS_INCOMPLETE
@@ -34,6 +34,7 @@ def report(
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
+    remap: LogRemaps = None,
     figure: Annotated[
         Path | None, typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
     ] = None,
@@ -68,6 +69,7 @@ def report(
             latex=latex,
             namespace=namespace,
             scenario=scenario_source,
+            remaps=remaps_of(remap),
         )
     if as_json:
         summaries = [flight.summary for flight in flights]

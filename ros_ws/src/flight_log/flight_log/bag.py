@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Self, cast
 from mcap._chunk_builder import ChunkBuilder
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, Message, MessageIndex
+from mcap.records import Channel, ChunkIndex, Message, MessageIndex
 from mcap.writer import CompressionType, Writer
 
 from flight_core.files import read_yaml, write_file
@@ -24,6 +24,7 @@ from flight_log.scan import RECORD
 
 SCENARIO_MEDIA_TYPE = "application/yaml"  # of attachments: the scenario
 FILE_MEDIA_TYPE = "text/yaml"  # and other files
+BEFORE_REMAP = "rise_di_topic"  # of a channel: the full name of its topic before a remap of ROS 2
 OUTCOME = "rise_di_outcome"  # name of the metadata record with the outcome of the flight
 SILENCES = "rise_di_silent"  # name of the metadata record with the silences of topics, s
 OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recorder
@@ -119,6 +120,11 @@ class _ChunkIndexes:
         stream.write(self._file.kept_data())
 
 
+def stack_topic(channel: Channel, remaps: Mapping[str, str] = {}) -> str:
+    """The full name that a topic of a log has in the stack: `remaps`, by topics of the log, come before those of the log."""
+    return remaps.get(channel.topic) or channel.metadata.get(BEFORE_REMAP) or channel.topic
+
+
 class BagWriter:
     """Writes a bag into a folder. `flush` closes the chunk: closed chunks stay readable after a kill of the process.
 
@@ -170,14 +176,16 @@ class BagWriter:
         """Store a named set of strings as an MCAP metadata record."""
         self._writer.add_metadata(name, dict(values))
 
-    def add_topic(self, topic: str, type_name: str, qos: str) -> BagChannel:
-        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles.
+    def add_topic(self, topic: str, type_name: str, qos: str, before_remap: str = "") -> BagChannel:
+        """Add a topic by the full name. `qos` is rosbag2's YAML list of offered profiles, `before_remap` the name in the stack.
 
         Raises ParameterError when the definition of the type is unknown.
         """
         known = definition(type_name)
         schema = self._writer.register_schema(known.name, "ros2msg", known.text.encode())
         metadata = {"offered_qos_profiles": qos, "topic_type_hash": known.type_hash}
+        if before_remap not in {"", topic}:
+            metadata[BEFORE_REMAP] = before_remap
         channel = BagChannel(topic, known, qos, self._writer.register_channel(topic, "cdr", schema, metadata))
         self.channels.append(channel)
         return channel

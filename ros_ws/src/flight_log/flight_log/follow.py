@@ -24,6 +24,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from flight_core.rates import NANOSECONDS
+from flight_log.bag import stack_topic
 from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, SQLITE, file_kind
 from flight_log.named_vectors import full_name, stamp_of
 from flight_log.open_log import ROSBAG2, open_scan, plain_message
@@ -281,7 +282,8 @@ class Follower:
         elif isinstance(record, Channel):
             type_name = full_name(self._schemas.get(record.schema_id, "")) if record.message_encoding == "cdr" else ""
             if record.id not in self._channels:
-                self._channels[record.id] = _Channel(record.topic, type_name, self._rate_of(record.topic, type_name))
+                topic = stack_topic(record)
+                self._channels[record.id] = _Channel(topic, type_name, self._rate_of(topic, type_name))
 
 
 def _step(rate: float, count: int, ends: Sequence[bytes]) -> int:

@@ -24,7 +24,7 @@ from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape, refusal_note
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
-from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES
+from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES, stack_topic
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
@@ -115,17 +115,20 @@ def listed(topics: Mapping[str, str]) -> str:
     return ", ".join(names[:NAMED]) + (f" and {unnamed} more topics" if unnamed > 0 else "")
 
 
-def read_run(run: FilePath, namespace: str | None = None, scenario: FilePath | None = None) -> RecordedRun:
+def read_run(
+    run: FilePath, namespace: str | None = None, scenario: FilePath | None = None, remaps: Mapping[str, str] = {}
+) -> RecordedRun:
     """Read the folder or a file of a run: named vectors by topic name (without the namespace), samples by stamp.
 
     The bag comes from this stack or from `ros2 bag record`: MCAP or SQLite, in one or several files, compressed or not. A
     truncated MCAP file is read up to the last complete chunk, and a note of the tape says so. The file `scenario` replaces the
-    scenario in the log. Raises ParameterError for a missing bag, for a bag without a sample, for several aircraft, in a
+    scenario in the log. `remaps` gives topics of the log by names of the stack, as {"y": "/sensors/y"}, for a log of remapped
+    nodes without these names. Raises ParameterError for a missing bag, for a bag without a sample, for several aircraft, in a
     namespace each, of which `namespace` names none, and for a scenario file that cannot be read.
     """
     run = as_path(run, "run", A_RUN)
     replacement = None if scenario is None else stored_scenario(as_path(scenario, "scenario", A_SCENARIO))
-    log = _read(run)
+    log = _read(run, {topic: f"/{name.lstrip('/')}" for name, topic in remaps.items()})
     filled = {
         topic: signal
         for topic, samples in log.topics.items()
@@ -332,7 +335,8 @@ class _TopicSamples:
 class _Log:
     """The content of the files of a bag."""
 
-    def __init__(self) -> None:
+    def __init__(self, remaps: Mapping[str, str]) -> None:
+        self.remaps = remaps
         self.topics: dict[str, _TopicSamples] = {}  # by full topic name
         self.notes: list[str] = []
         self.scenario: StoredFile | None = None
@@ -413,8 +417,8 @@ class _Log:
         return [*truncated, *self.notes, *lost, *silent]
 
 
-def _read(run: Path) -> _Log:
-    log = _Log()
+def _read(run: Path, remaps: Mapping[str, str]) -> _Log:
+    log = _Log(remaps)
     files = log_files(run)
     if is_folder(run):
         for folder in dict.fromkeys(file.parent for file in files):
@@ -456,8 +460,9 @@ def _read_file(file: Path, log: _Log) -> None:
                     expected = scan.message_counts.get(record.id, 0)
                     type_name = schemas.get(record.schema_id, "")
                     is_cdr = record.message_encoding == "cdr"
-                    log.kinds.setdefault(record.topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}")
-                    if is_cdr and (take := log.reader_of(record.topic, full_name(type_name), expected)) is not None:
+                    topic = stack_topic(record, log.remaps)
+                    log.kinds.setdefault(topic, type_name if is_cdr else f"{type_name} in {record.message_encoding}")
+                    if is_cdr and (take := log.reader_of(topic, full_name(type_name), expected)) is not None:
                         channels[record.id] = take
                 else:
                     log.add(record)

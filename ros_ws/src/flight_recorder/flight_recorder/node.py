@@ -156,7 +156,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _record(self, subscription: PolledSubscription, offered: Sequence[QoSProfile]) -> _RecordedTopic:
         qos = dump_yaml(rosbag2_profiles(offered), flow=False)
-        channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos)
+        before_remap = self.resolve_topic_name(subscription.topic.name, only_expand=True)
+        channel = self._bag.add_topic(subscription.name, type_name(subscription.topic.type), qos, before_remap)
         return _RecordedTopic(subscription, channel)
 
     def period_ns(self) -> int:

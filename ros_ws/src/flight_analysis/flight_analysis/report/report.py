@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report of recorded runs: the page of one run or of a comparison, and the data for other programs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -41,6 +41,7 @@ def report(
     tables: FilePath | None = None,
     latex: FilePath | None = None,
     namespace: str | None = None,
+    remaps: Mapping[str, str] = {},
     scenario: FilePath | None = None,
 ) -> Report:
     """Write the report page of a recorded run, or a page that compares several runs with the first, as `rise-di report` does.
@@ -59,6 +60,7 @@ def report(
         tables: Folder for a CSV a topic.
         latex: File for the tables of errors and inputs as LaTeX.
         namespace: Namespace of the aircraft, for logs with several aircraft.
+        remaps: Topics of the log by names of the stack, for logs of remapped nodes, as {"y": "/sensors/y"}.
         scenario: Scenario file of the flights, for logs without a scenario; None: the scenario in each log.
 
     Raises ParameterError for a run that cannot be read, and for a file that cannot be written.
@@ -82,11 +84,11 @@ def report(
     require(output is None or alone, "output", "a comparison", "one run; html for several")
     if alone:
         folder = None if output is None else as_path(output, "output", "the path of a folder")
-        result = write_report(folders[0], output=folder, namespace=namespace, scenario=scenario)
+        result = write_report(folders[0], output=folder, namespace=namespace, scenario=scenario, remaps=remaps)
         page = result.report
         flights = [result.flight]
     else:
-        flights = [read_flight(folder, namespace=namespace, scenario=scenario) for folder in folders]
+        flights = [read_flight(folder, namespace=namespace, scenario=scenario, remaps=remaps) for folder in folders]
         for folder, flight in zip(folders, flights, strict=True):
             expected = "a flight of the stack: a comparison is of tracking errors"
             require(len(flights) == 1 or flight.scenario is not None, str(folder), "an imported log", expected)

@@ -89,14 +89,18 @@ def _write(path: Path, text: str | bytes) -> Path:
 
 
 def read_flight(
-    run: Path, outcome: str | None = None, namespace: str | None = None, scenario: FilePath | None = None
+    run: Path,
+    outcome: str | None = None,
+    namespace: str | None = None,
+    scenario: FilePath | None = None,
+    remaps: Mapping[str, str] = {},
 ) -> RecordedFlight:
     """Read a recorded flight and summarise it. No file is written.
 
     Without an outcome, the outcome in the run's summary is kept. Raises ParameterError where the log cannot be read, or holds
-    no scenario. `namespace` and `scenario` as in `read_run`.
+    no scenario. `namespace`, `scenario` and `remaps` as in `read_run`.
     """
-    return _flight(read_run(run, namespace, scenario), run, outcome)
+    return _flight(read_run(run, namespace, scenario, remaps), run, outcome)
 
 
 def _flight(recorded: RecordedRun, run: Path, outcome: str | None) -> RecordedFlight:
@@ -193,6 +197,7 @@ def write_report(
     output: Path | None = None,
     namespace: str | None = None,
     scenario: FilePath | None = None,
+    remaps: Mapping[str, str] = {},
 ) -> FlightResult:
     """Read the bag back, write scenario, summary.json and report.html, and link runs/latest to the run.
 
@@ -202,7 +207,7 @@ def write_report(
     """
     from flight_analysis.report.html import write_page  # noqa: PLC0415 - loads jinja2, which a flight does not need
 
-    recorded = read_run(run, namespace, scenario)
+    recorded = read_run(run, namespace, scenario, remaps)
     flight = _flight(recorded, run, outcome)
     folder = output or _folder(run)
     with writing("", folder, "a folder that can"):
