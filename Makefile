@@ -76,6 +76,7 @@ check: setup-all
 
 docs: setup-all
 	$(BIN)/python -m tools.parameters
+	$(BIN)/python -m tools.topics
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build --quiet)
 
 evidence: setup-all

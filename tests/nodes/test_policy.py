@@ -1,19 +1,12 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The access control policy allows no wildcard, one client of services, and the topics of the graph of a flight."""
-
-import re
+"""The access control policy allows no wildcard, one client of services, and the topics of the one table."""
 
 import pytest
-from tests.conftest import REPOSITORY
 from tests.ros.test_policy import allowed
-
-from flight_bringup.graph import BRIDGE, PUBLISHED_TOPICS, NodeSpec
+from tools import topics
 
 pytestmark = pytest.mark.package("flight_bringup")
-
-OF_EACH_NODE = frozenset({"clocks", "node_state", "diagnostics", "parameter_events", "rosout", "clock", "tf"})
-"""Also the clock of a lockstep flight, and the transforms of guidance."""
 
 
 def test_the_policy_allows_no_wildcard() -> None:
@@ -28,13 +21,6 @@ def test_policy_allows_no_service_request_but_those_of_bridge_to_controller_and_
     assert allowed()[node].request == (frozenset(requested) if node == "bridge" else frozenset())
 
 
-@pytest.mark.parametrize("node", PUBLISHED_TOPICS, ids=lambda node: node.executable)
-def test_topics_of_a_node_are_those_of_policy_and_of_page(node: NodeSpec) -> None:
-    """The bridge also has the topics of the channel maps, which no table lists."""
-    names = set(PUBLISHED_TOPICS[node])
-    published = {name.removeprefix("/") for name in allowed()[node.executable].publish} - OF_EACH_NODE
-    published -= {f"alive/{node.executable}", f"{node.executable}/transition_event"}
-    assert names <= published if node is BRIDGE else names == published
-    page = (REPOSITORY / "docs" / "interfaces.md").read_text(encoding="utf-8")
-    listed = {name for row in page.splitlines() if row.startswith("| `") for name in re.findall("`([^`]+)`", row.split("|")[1])}
-    assert names <= listed
+def test_policy_and_page_are_those_of_the_table_of_topics() -> None:
+    for path, text in ((topics.POLICY, topics.policy()), (topics.PAGE, topics.page())):
+        assert path.read_text(encoding="utf-8") == text, "python -m tools.topics writes it again"

@@ -48,9 +48,8 @@ from flight_ros.messages import Decoder, Encoder
 from flight_ros.rclpy_private import DeserializationError
 from flight_ros.subscriptions import PolledSubscription
 from flight_ros.ticker import Tick
-from flight_ros.topics import ENGAGEMENT, POSE, PUBLISH, Topic, U, Y
+from flight_ros.topics import ENGAGEMENT, EXTERNAL, POSE, PUBLISH, WOULD_SEND, Topic, U, Y
 
-WOULD_SEND = Topic("bridge/would_send", JointState)
 LEFT = "no publisher any more. Where the autopilot flies on, its client may not come back by itself: start its agent again"
 RC_OVERRIDE = f"{MAVLINK}/RC_CHANNELS_OVERRIDE"  # the topic
 RELEASES_AT_SHUTDOWN = 5  # messages with release values at the end of the node; a single one may be lost
@@ -94,7 +93,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
                 _require_field(kind(), name, row)
             if fault := version_fault(topic, kind):
                 self.get_logger().warning(fault)
-            self._readers.append((self._reader(Topic(topic, kind, foreign=True)), rows))
+            self._readers.append((self._reader(Topic(topic, kind, EXTERNAL)), rows))
         self._outgoing = {name: self._make(name, row) for name, row in self._map.messages.items()}
         decode = Decoder(self._bridge.inputs).decode
         self._u = self.receive(U, decode, self._bridge.take_u, max_age_ns=self._bridge.max_u_age_ns, lock=self._bridge.u_lock)

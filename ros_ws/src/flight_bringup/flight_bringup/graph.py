@@ -4,14 +4,14 @@
 
 import re
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 from autopilot_bridge.params import ChannelMap, find_map, load_map
 from flight_analysis.closed_loop.scenario import ParameterOverrides, Scenario, require_guidable
 from flight_analysis.report.run_folder import attachments_for
+from flight_core import topics
 from flight_core.parameters import require
 from rise_di_controller.proposals import AUTHORITY_TICKS
 
@@ -45,27 +45,6 @@ FIRST_STAGE = (RECORDER, CONTROLLER)
 SECOND_STAGE = (AIRCRAFT, REFERENCE_MODEL)
 SECOND_STAGE_WITH_BRIDGE = (BRIDGE, REFERENCE_MODEL)
 
-POSE = "pose"
-WOULD_SEND = "bridge/would_send"
-ENGAGEMENT = "bridge/engagement"
-
-GUIDANCE_VIEWS = ("odometry", "path", "markers", "guidance/imu", "guidance/fix", "guidance/wind")
-OF_LEARNING = ("proposal", "learned", "learning", "authority")  # of a learner, and of a controller that takes its models
-
-# The bridge also publishes the messages of its channel map.
-PUBLISHED_TOPICS: Mapping[NodeSpec, tuple[str, ...]] = MappingProxyType(
-    {
-        AIRCRAFT: ("y", POSE, "truth"),
-        REFERENCE_MODEL: ("y_m",),
-        GUIDANCE: ("u_m", "guidance", *GUIDANCE_VIEWS),
-        CONTROLLER: ("u", "internals", "learning", "authority"),
-        LEARNER: ("proposal", "learned"),
-        BRIDGE: ("y", POSE, WOULD_SEND, ENGAGEMENT),
-        RECORDER: ("recorded",),
-    }
-)
-
-
 NAME = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")  # of a namespace: stricter than ROS 2, which permits _ at the ends
 
 
@@ -84,12 +63,12 @@ class Autopilot(NamedTuple):
 
     channel_map: ChannelMap
     map_path: Path
-    dry_run: bool  # publish on WOULD_SEND what the map would send, and send nothing
+    dry_run: bool  # publish on `bridge/would_send` what the map would send, and send nothing
 
     @property
     def topics(self) -> list[str]:
-        """The topics to record: topics of the map, the pose of a map with a pose, WOULD_SEND, ENGAGEMENT."""
-        return [*self.channel_map.recorded_topics, *([POSE] if self.channel_map.pose else []), WOULD_SEND, ENGAGEMENT]
+        """The topics to record: those of the map, and those of the bridge."""
+        return [*self.channel_map.recorded_topics, *topics.recorded_with("bridge")]
 
 
 def find_autopilot(map_name: str, *, dry_run: bool) -> Autopilot:
@@ -171,15 +150,15 @@ def parameter_overrides(
         return {} if autopilot is None else {"map": str(autopilot.map_path), "dry_run": autopilot.dry_run}
     one_process = spec is ONE_PROCESS
     guidance = scenario.guidance
-    further = tuple[str, ...]()
+    further: list[str] = []
     stages = (*FIRST_STAGE, *SECOND_STAGE, *_optional(scenario))
     overrides: dict[NodeSpec, ParameterOverrides] = {node: {"lockstep": lockstep} for node in stages}
     if guidance is not None:
         overrides[GUIDANCE] |= {name: list(value) if isinstance(value, tuple) else value for name, value in guidance.by_rule()}
-        further += GUIDANCE_VIEWS
+        further += topics.recorded_with("guidance")
     if scenario.learns():
         overrides[LEARNER]["scenario_file"] = str(scenario.path)
-        further += OF_LEARNING
+        further += topics.recorded_with("learner")
     if further:
         overrides[RECORDER]["topics"] = [*scenario.recorder.topics, *further]
     overrides[RECORDER]["directory"] = str(run)
@@ -223,7 +202,8 @@ def replayed_topics(
     `namespace` belongs to the nodes. A bridge among the nodes also publishes the messages of its channel map.
     """
     prefix = f"/{namespace.strip('/')}/".replace("//", "/")
-    published = {prefix + name for node in nodes for name in PUBLISHED_TOPICS[node]}
+    names = {name for node in nodes for name in topics.published_by(node.executable)}
+    published = {prefix + name for name in names if not name.startswith("/")}  # else others publish the topic, too
     if BRIDGE in nodes and autopilot is not None:
         sent = (message.topic for message in autopilot.channel_map.messages.values())
         published |= {topic if topic.startswith("/") else prefix + topic for topic in sent}

@@ -23,11 +23,11 @@ from flight_ros.topics import (
     PUBLISH,
     RECORDED,
     START,
-    STATE,
     STATES,
     Y_M,
     NodeState,
     Y,
+    offered,
 )
 
 MODES = {float(mode): mode.name for mode in Mode}
@@ -44,7 +44,7 @@ class FlightMonitor(Client):
         self._recorded = PolledSubscription(self._node, RECORDED, LOCKSTEP, raw=True)
         self._node_state = PolledSubscription(self._node, NODE_STATE, STATES)
         self._states: dict[str, str] = {}  # by process
-        self._publish_start = self._node.create_publisher(START.type, START.name, STATE).publish
+        self._publish_start = self._node.create_publisher(START.type, START.name, offered(START)).publish
         self._engagement = None if lockstep else PolledSubscription(self._node, ENGAGEMENT, PUBLISH)
         self._learning = PolledSubscription(self._node, LEARNING, PUBLISH, raw=True) if learns else None
         self._decoder = Decoder(("mode", *(f"e.{output}" for output in outputs)))

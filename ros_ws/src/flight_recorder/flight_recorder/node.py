@@ -9,11 +9,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.validate_topic_name import validate_topic_name
@@ -33,6 +31,7 @@ from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
 from flight_ros.ticker import Tick
 from flight_ros.topics import (
+    EXTERNAL,
     FLIGHT,
     INTERNALS,
     POSE,
@@ -63,9 +62,6 @@ TOPIC_SILENCE_NS = NANOSECONDS
 
 DRAIN_NS = 10 * NANOSECONDS  # at most, at the end, for the messages that were sent before
 QUIET_NS = NANOSECONDS // 5  # without a message: none is left
-
-# Published by ROS 2 itself (rmw: rmw_qos_profile_rosout_default, rmw_qos_profile_parameter_events).
-PARAMETER_EVENTS = Topic("/parameter_events", ParameterEvent, foreign=True)
 
 
 @dataclass
@@ -100,11 +96,10 @@ class RecorderNode(FlightNode[RecorderConfig]):
         super().__init__("recorder", RecorderConfig)
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
-        self._topics = [
-            *(self._record(self._poll(topic, RECORD_FOREIGN if topic.foreign else RECORD), [PUBLISH]) for topic in FLIGHT),
-            self._record(self._poll(ROSOUT, RECORD), [RECORD]),
-            self._record(self._poll(PARAMETER_EVENTS, RECORD_FOREIGN), [RECORD_FOREIGN]),
-        ]
+        self._topics: list[_RecordedTopic] = []
+        for topic in FLIGHT:
+            qos = RECORD_FOREIGN if topic.foreign and topic is not ROSOUT else RECORD  # ROS 2 keeps the lines of the log
+            self._topics.append(self._record(self._poll(topic, qos), [PUBLISH]))
         recorded = {topic.name for topic in self._topics}
         self._missing = [name for name in dict.fromkeys(wanted) if name not in recorded]
         self._publish_recorded = self.advertise(RECORDED)
@@ -151,6 +146,11 @@ class RecorderNode(FlightNode[RecorderConfig]):
         least = self.parameters.min_free
         return "" if free >= least else f"found {free:.1f} MB free in {directory}, expected at least {least:g} MB"
 
+    def _among(self, topics: Sequence[Topic], *, heard: bool = False) -> list[_RecordedTopic]:
+        """The recorded topics among `topics`; `heard`: with messages."""
+        chosen = (topic for topic in self._topics if topic.subscription.topic in topics)
+        return [topic for topic in chosen if topic.channel.messages or not heard]
+
     def _poll(self, topic: Topic, qos: QoSProfile) -> PolledSubscription:
         return PolledSubscription(self, topic, qos, raw=True)
 
@@ -164,7 +164,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         return period_ns(self.parameters.rate, "rate")
 
     def inputs(self) -> Sequence[PolledSubscription]:
-        return [topic.subscription for topic in self._topics if topic.subscription.topic in LOOP]
+        return [topic.subscription for topic in self._among(LOOP)]
 
     def runs_in_lockstep(self) -> bool:
         return False  # in lockstep the recorder also writes at ticks, many instants at a time, and publishes the progress
@@ -235,7 +235,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _publish_span(self) -> None:
         """In real time: the stamp up to which y, y_m and u are in the log. A flight ends once these span it."""
-        stamps = [topic.stamp_ns for topic in self._topics if topic.subscription.topic in LOOP]
+        stamps = [topic.stamp_ns for topic in self._among(LOOP)]
         if not self.parameters.lockstep and min(stamps) >= 0:
             self._publish_recorded(instant(min(stamps)))
 
@@ -326,18 +326,16 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _warn_of_a_part(self) -> None:
         """Warn of a log with some of y, y_m and u: a flight has y, y_m and u, but discovery may fail on a busy domain."""
-        loop = [topic for topic in self._topics if topic.subscription.topic in LOOP]
-        if any(topic.channel.messages for topic in loop):
-            for topic in loop:
-                if not topic.channel.messages:
-                    self.warn_no_publisher(topic.subscription)
+        silent = [topic for topic in self._among(LOOP) if not topic.channel.messages]
+        for topic in silent if len(silent) < len(LOOP) else ():
+            self.warn_no_publisher(topic.subscription)
 
     def _warn_of_silence(self, now_ns: int) -> None:
         """Warn, once, when y, y_m and u have stopped: the publishers have ended, or this process receives nothing.
 
         Fast DDS can block the receiving threads during the removal of a leaving participant (eProsima/Fast-DDS, issue 6502).
         """
-        heard = sum(topic.channel.messages for topic in self._topics if topic.subscription.topic in LOOP)
+        heard = sum(topic.channel.messages for topic in self._among(LOOP))
         if heard != self._heard:
             self._heard = heard
             self._heard_ns = now_ns
@@ -353,7 +351,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
         A reader may miss all of a topic: a full queue, or a message of the middleware that was forged.
         """
-        steady = [topic for topic in self._topics if topic.subscription.topic in STEADY and topic.channel.messages]
+        steady = self._among(STEADY, heard=True)
         newest_ns = max((topic.heard_ns for topic in steady), default=0)
         for topic in steady:
             count = topic.channel.messages
@@ -366,16 +364,14 @@ class RecorderNode(FlightNode[RecorderConfig]):
                 self.get_logger().warning(f"{topic.name}: no message for 1 s while others go on: {why}")
 
     def _subscribe(self, name: str, message_type: str) -> None:
-        package, _, kind = message_type.partition("/msg/")
+        topic = Topic(name, message_type, EXTERNAL)
         try:
-            message = getattr(import_module(f"{package}.msg"), kind)
-            definition(message_type)
+            definition(type_name(topic.type))
         except (ImportError, AttributeError, ParameterError):
             self.get_logger().warning(bounded(f"{name} is not recorded: its type {message_type} is not installed"))
             return
         offered = self._offered(name, message_type)
-        topic = self._poll(Topic(name, message, foreign=True), strongest_compatible(offered))
-        self._topics.append(self._record(topic, offered))
+        self._topics.append(self._record(self._poll(topic, strongest_compatible(offered)), offered))
 
     def graph_checks(self) -> list[Callable[[], None]]:
         return [*super().graph_checks(), *(partial(self._check_publishers, topic) for topic in self._topics)]
@@ -427,8 +423,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         heard_ns = end_ns
         self._drain_subscriptions()
         while (now_ns := time.monotonic_ns()) - end_ns < DRAIN_NS and now_ns - heard_ns < QUIET_NS:
-            waiting = [topic for topic in self._topics if topic.subscription.topic in STEADY and topic.channel.messages]
-            if all(topic.sent_ns >= sent_ns for topic in waiting):
+            if all(topic.sent_ns >= sent_ns for topic in self._among(STEADY, heard=True)):
                 return
             time.sleep(QUIET_NS / 20 / NANOSECONDS)
             before = sum(channel.messages for channel in self._bag.channels)

@@ -27,7 +27,7 @@ from flight_core.text import bounded
 from flight_core.vectors import ChannelError
 from flight_ros.messages import Encoder, NamedDecoder, require_size
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.topics import CLOCKS, NEWEST_SAMPLES
+from flight_ros.topics import CLOCKS, offered
 
 WINDOW = 8  # differences of a node, of which the least has the least delay
 PEERS = 100  # nodes at most: names can be forged
@@ -110,8 +110,8 @@ class PeerClocks:
         self._peers = Peers(instance, number_of_host())
         self._instance = instance
         self._told: dict[str, float] = {}
-        self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, NEWEST_SAMPLES).publish
-        self._subscription = PolledSubscription(node, CLOCKS, NEWEST_SAMPLES, raw=True)
+        self._publish = node.create_publisher(CLOCKS.type, CLOCKS.name, offered(CLOCKS)).publish
+        self._subscription = PolledSubscription(node, CLOCKS, offered(CLOCKS), raw=True)
         self._decoder = NamedDecoder()
 
     def exchange(self, ahead_ns: int) -> None:

@@ -35,11 +35,10 @@ from flight_ros.topics import (
     LOCKSTEP,
     NEWEST_SAMPLES,
     NODE_STATE,
-    PUBLISH,
     START,
-    STATE,
     NodeState,
     Topic,
+    offered,
     publisher_qos,
 )
 
@@ -80,10 +79,10 @@ class FlightNode(Node, Generic[P]):
         self.receivers: list[Receiver[Any]] = []
         self._flight_publishers: list[Publisher] = []
         self._waiting: dict[str, tuple[int, int]] = {}  # by topic: last call, and when to log it next
-        self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, PUBLISH)
-        self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, STATE)
+        self._diagnostics = self.create_publisher(DIAGNOSTICS.type, DIAGNOSTICS.name, offered(DIAGNOSTICS))
+        self._node_state = self.create_publisher(NODE_STATE.type, NODE_STATE.name, offered(NODE_STATE))
         is_start_awaited = getattr(self.parameters, "start_time", 0.0) < 0.0 and not self.parameters.lockstep
-        self._start_subscription = PolledSubscription(self, START, STATE, raw=True) if is_start_awaited else None
+        self._start_subscription = PolledSubscription(self, START, offered(START), raw=True) if is_start_awaited else None
         self._matched = False
         self._adopted: P | None = None
         self._tick_times = TickTimes()

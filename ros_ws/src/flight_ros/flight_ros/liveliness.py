@@ -12,7 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from flight_ros.rclpy_private import take_messages
-from flight_ros.topics import LIVELINESS
+from flight_ros.topics import LIVELINESS, NODES
 
 SHUTDOWN_GRACE_NS = 600_000_000
 """Time for the report of a peer to arrive that shuts down because it lost a role. A peer of another cause sends no report."""
@@ -20,7 +20,7 @@ SHUTDOWN_GRACE_NS = 600_000_000
 REPORT_TIMEOUT = Duration(seconds=0.2)
 """Longest wait until all peers have a report, after which the node ends. The lost peer never acknowledges it."""
 
-ROLES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder")
+ROLES = NODES[:-1]  # a bridge flies in real time alone
 
 
 class LivelinessMonitor:

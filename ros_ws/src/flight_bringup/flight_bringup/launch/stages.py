@@ -41,7 +41,7 @@ from flight_log.bag import BagWriter, LogAttachments
 from flight_log.open_log import ROSBAG2
 from flight_ros import transport
 from flight_ros.messages import instant
-from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, START, STATE, STATES, NodeState, U
+from flight_ros.topics import FLIGHT, LOCKSTEP, NEWEST_SAMPLES, NODE_STATE, RECORDED, START, STATES, NodeState, U, offered
 from launch import Event, EventHandler, LaunchContext
 
 BOOLEAN = ["true", "false"]
@@ -141,7 +141,7 @@ def rosbag2(context: LaunchContext, scenario: Scenario, overrides: ParameterOver
         )
         bag.add_attachments(files, time.time_ns())
     further = overrides.get("topics", scenario.recorder.topics)
-    topics = [*(topic.name for topic in FLIGHT), "/rosout", "/parameter_events", *further]
+    topics = [*(topic.name for topic in FLIGHT), *further]
     names = dict.fromkeys(name if name.startswith("/") else f"{_namespace(context)}/{name}" for name in topics)
     command = ["ros2", "bag", "record", "--storage", "mcap", "--output", str(run / ROSBAG2), "--topics", *names]
     return ExecuteProcess(cmd=command, name="recorder", output="screen", on_exit=partial(fail_on_exit, run=run))
@@ -220,7 +220,7 @@ def begin_when_matched(
     flying = []
     start_ns = [0]
     held_ns = [-1]
-    publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", STATE).publish
+    publish = get_ros_node(context).create_publisher(START.type, f"{_namespace(context)}/{START.name}", offered(START)).publish
 
     def matched(spec: NodeSpec) -> Sequence[Action]:
         del waiting[spec]

@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The topics of a flight: name, message, publishers, subscribers, and what the log and the pages say of them.
+
+Transport, recorder and launch read this table. `python -m tools.topics` writes the table of docs/interfaces.md and the access
+control policy from it.
+"""
+
+from importlib import import_module
+from typing import Any, NamedTuple
+
+EXTERNAL = "external"  # publishers and subscribers that are no nodes of the stack
+NODES = ("aircraft", "reference_model", "guidance", "controller", "learner", "recorder", "bridge")
+LOG = "log"  # as a subscriber: the recorder
+HISTORY = "2 s"  # what a publisher keeps for a late subscriber: the samples of two seconds,
+LAST = "last"  # the last message,
+NOTHING = "-"  # or nothing, without retransmissions
+
+VECTOR = "sensor_msgs/msg/JointState"
+DIAGNOSTIC = "diagnostic_msgs/msg/DiagnosticArray"
+KEY_VALUE = "diagnostic_msgs/msg/KeyValue"
+TIME = "builtin_interfaces/msg/Time"
+PLAN = "nav_msgs/msg/Path"
+
+
+class Topic(NamedTuple):
+    """A topic by its relative name."""
+
+    name: str
+    message: str | type  # as "sensor_msgs/msg/JointState", or the class
+    ends: str = "->"  # names of the nodes, as "aircraft, bridge -> controller, log"; "nodes" are NODES
+    meaning: str = ""  # channels, units and use: Markdown
+    keeps: str = HISTORY
+    only_with: str = ""  # the node without which the topic is not recorded
+
+    @property
+    def publishers(self) -> list[str]:
+        """The names of the nodes that publish the topic."""
+        return _names(self.ends.partition("->")[0])
+
+    @property
+    def subscribers(self) -> list[str]:
+        """The names of the nodes that subscribe the topic, and LOG."""
+        return _names(self.ends.partition("->")[2])
+
+    @property
+    def foreign(self) -> bool:
+        """Whether programs of others publish the topic, at any quality of service."""
+        return EXTERNAL in self.publishers
+
+    @property
+    def type(self) -> Any:
+        """The class of the messages. Raises ImportError or AttributeError where the package lacks the message."""
+        if not isinstance(self.message, str):
+            return self.message
+        package, _, name = self.message.partition("/msg/")
+        return getattr(import_module(f"{package}.msg"), name)
+
+
+def _names(end: str) -> list[str]:
+    return end.replace("nodes", ",".join(NODES)).replace(",", " ").split()
+
+
+Y = Topic(
+    "y", VECTOR, "aircraft, bridge -> controller, guidance, log",
+    "outputs: q, V, p, r (rad/s, m/s)",
+)  # fmt: skip
+Y_M = Topic("y_m", VECTOR, "reference_model -> controller, log", "the same")
+U = Topic(
+    "u", VECTOR, "controller -> aircraft, bridge, log",
+    "elevator, aileron, rudder (rad), thrust (1); stamp = that of its y",
+)  # fmt: skip
+U_M = Topic(
+    "u_m", VECTOR, "guidance, external -> reference_model, log",
+    "[live commands](#live-commands) by output; optional phi, theta (rad) for their ending",
+)  # fmt: skip
+POSE = Topic(
+    "pose", VECTOR, "aircraft, bridge -> guidance, log",
+    "phi, theta, psi, beta (rad), north, east, altitude (m), v_north, v_east, climb (m/s), "
+    "those that are [known](#pose-and-wind)",
+)  # fmt: skip
+GUIDANCE = Topic(
+    "guidance", VECTOR, "guidance -> log",
+    "modes, leg, fence, errors, commands, limits, wind, y and pose as used: "
+    "`flight_guidance.guidance.names`",
+)  # fmt: skip
+TARGET = Topic(
+    "target", VECTOR, "external -> guidance, log",
+    "phi (and r), heading or course (rad), leg (joined at `along`, m), or orbit (north, "
+    "east, radius, m); theta, climb or altitude; V",
+)  # fmt: skip
+ROUTE = Topic(
+    "route", PLAN, "external -> guidance, log",
+    "in the frame `map` (east, north, altitude)",
+)  # fmt: skip
+ODOMETRY = Topic(
+    "odometry", "nav_msgs/msg/Odometry", "guidance -> external, log",
+    "at 10 Hz, east-north-up",
+    only_with="guidance",
+)  # fmt: skip
+PATH = Topic(
+    "path", PLAN, "guidance -> external, log",
+    "at 1 Hz, east-north-up",
+    only_with="guidance",
+)  # fmt: skip
+MARKERS = Topic(
+    "markers", "visualization_msgs/msg/MarkerArray", "guidance -> external, log",
+    "at 1 Hz, east-north-up",
+    only_with="guidance",
+)  # fmt: skip
+IMU = Topic(
+    "guidance/imu", "sensor_msgs/msg/Imu", "guidance -> external, log",
+    "at 10 Hz",
+    only_with="guidance",
+)  # fmt: skip
+FIX = Topic(
+    "guidance/fix", "sensor_msgs/msg/NavSatFix", "guidance -> external, log",
+    "at 10 Hz",
+    only_with="guidance",
+)  # fmt: skip
+WIND = Topic(
+    "guidance/wind", "geometry_msgs/msg/Vector3Stamped", "guidance -> external, log",
+    "at 10 Hz",
+    only_with="guidance",
+)  # fmt: skip
+INTERNALS = Topic("internals", VECTOR, "controller -> guidance, learner, monitor, log", "below")
+TRUTH = Topic("truth", VECTOR, "aircraft -> log", "below")
+PROPOSAL = Topic(
+    "proposal", DIAGNOSTIC, "learner -> controller, log",
+    "what was learned, digests, parameters as JSON ([learning](learning.md#the-learners-node))",
+    only_with="learner",
+)  # fmt: skip
+LEARNED = Topic(
+    "learned", VECTOR, "learner -> log",
+    "`proposed` (1 or 0), `value.*` and `deviation.*` of each learned entry of A and B, SI",
+    only_with="learner",
+)  # fmt: skip
+LEARNING = Topic(
+    "learning", DIAGNOSTIC, "controller -> monitor, log",
+    "what became of a proposal, and fallbacks; the kind is the value `event`",
+    only_with="learner",
+)  # fmt: skip
+AUTHORITY = Topic(
+    "authority", VECTOR, "controller -> guidance, log",
+    "`down.*` and `up.*` by output: least change by its input, units/s "
+    "([limits](guidance.md#limits-that-were-learned))",
+    only_with="learner",
+)  # fmt: skip
+DIAGNOSTICS = Topic(
+    "/diagnostics", DIAGNOSTIC, "nodes, external -> log",
+    "at 1 Hz: times of ticks, refused samples by reason, mode, law",
+)  # fmt: skip
+ROSOUT = Topic(
+    "/rosout", "rcl_interfaces/msg/Log", "nodes, monitor, external -> log",
+    "of ROS 2: the log lines",
+)  # fmt: skip
+PARAMETER_EVENTS = Topic(
+    "/parameter_events", "rcl_interfaces/msg/ParameterEvent", "nodes, monitor, external -> log",
+    "of ROS 2: changes of parameters",
+)  # fmt: skip
+WOULD_SEND = Topic(
+    "bridge/would_send", VECTOR, "bridge -> log",
+    "raw values of the autopilot's fields for the newest u, also in a dry run",
+    only_with="bridge",
+)  # fmt: skip
+ENGAGEMENT = Topic(
+    "bridge/engagement", KEY_VALUE, "bridge -> monitor, log",
+    "DISENGAGED, ENGAGING, ENGAGED, NEUTRAL or RELEASE, and why it is not engaged",
+    only_with="bridge",
+)  # fmt: skip
+START = Topic(
+    "start", TIME, "monitor -> aircraft, reference_model, guidance",
+    "t = 0 of a flight in real time",
+    keeps=LAST,
+)  # fmt: skip
+NODE_STATE = Topic(
+    "node_state", KEY_VALUE, "nodes -> monitor",
+    "instance, and `ready`, `matched`, `flying` or `completed`",
+    keeps=LAST,
+)  # fmt: skip
+CLOCKS = Topic(
+    "clocks", VECTOR, "nodes -> nodes",
+    "in real time, at 1 Hz: least time of reception less that of sending by node, s ([two "
+    "hosts](fleets.md#two-hosts))",
+    keeps=NOTHING,
+)  # fmt: skip
+CLOCK = Topic(
+    "clock", "rosgraph_msgs/msg/Clock", "aircraft -> reference_model",
+    "in lockstep: the instant up to which the aircraft flies without another u",
+)  # fmt: skip
+RECORDED = Topic(
+    "recorded", TIME, "recorder -> aircraft, monitor",
+    "the instant up to which the log is complete",
+)  # fmt: skip
+
+TOPICS = tuple(row for row in list(globals().values()) if isinstance(row, Topic))
+FLIGHT = tuple(topic for topic in TOPICS if LOG in topic.subscribers and not topic.only_with)
+
+
+def recorded_with(node: str) -> list[str]:
+    """The topics to record of a flight with a node beside those of every flight."""
+    return [topic.name for topic in TOPICS if topic.only_with == node]
+
+
+def published_by(node: str) -> list[str]:
+    """The topics of a node."""
+    return [topic.name for topic in TOPICS if node in topic.publishers]
