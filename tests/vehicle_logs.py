@@ -5,6 +5,7 @@
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -43,9 +44,16 @@ def write_dataflash(
 
 
 def write_ulog(
-    path: Path, topics: Mapping[str, tuple[str, Rows]], parameters: Mapping[str, float], changes: Changes = ()
+    path: Path,
+    topics: Mapping[str, tuple[str, Rows]],
+    parameters: Mapping[str, float],
+    changes: Changes = (),
+    second: Mapping[str, Rows] = MappingProxyType({}),
 ) -> None:
-    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file format)."""
+    """A ULog of topics by name: the fields as PX4 declares them, all float (PX4 guide, ULog file format).
+
+    `second` has the samples of the instance 1 by topic.
+    """
 
     def message(kind: bytes, content: bytes) -> bytes:
         return struct.pack("<H", len(content)) + kind + content
@@ -60,13 +68,14 @@ def write_ulog(
         return message(b"P", key_value(f"float {name}", struct.pack("<f", value)))
 
     parts += [parameter(name, value) for name, value in parameters.items()]
-    parts += [message(b"A", bytes([0]) + struct.pack("<H", k) + name.encode()) for k, name in enumerate(topics)]
+    series = [*((0, name, rows) for name, (_, rows) in topics.items()), *((1, name, rows) for name, rows in second.items())]
+    parts += [message(b"A", bytes([i]) + struct.pack("<H", k) + name.encode()) for k, (i, name, _) in enumerate(series)]
     samples = [
         (stamp, k, message(b"D", struct.pack(f"<HQ{len(values)}f", k, stamp, *values)))
-        for k, (_, rows) in enumerate(topics.values())
+        for k, (_, _, rows) in enumerate(series)
         for stamp, values in rows
     ]
-    samples += [(stamp, len(topics), parameter(name, value)) for stamp, name, value in changes]  # after samples of its stamp
+    samples += [(stamp, len(series), parameter(name, value)) for stamp, name, value in changes]  # after samples of its stamp
     path.write_bytes(b"".join([*parts, *(packet for _, _, packet in sorted(samples, key=lambda sample: sample[:2]))]))
 
 

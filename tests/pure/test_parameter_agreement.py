@@ -11,7 +11,15 @@ from tests.maps import named_map
 
 from autopilot_bridge.params import ChannelMap
 from flight_core.parameters import ParameterError
-from flight_design.identification.parameter_agreement import Servo, Stick, changes, require_agreement, servo_of, stick_of
+from flight_design.identification.parameter_agreement import (
+    Servo,
+    Stick,
+    changes,
+    compared,
+    require_agreement,
+    servo_of,
+    stick_of,
+)
 from flight_log.vehicle_log import ParameterRecord
 
 pytestmark = pytest.mark.package("flight_design")
@@ -32,7 +40,7 @@ def agreement(channel_map: ChannelMap, values: Mapping[str, float], later: Mappi
     sticks = [stick_of(channel_map, name) for name in channel_map.inputs]
     recorded = {name: (ParameterRecord(0, value),) for name, value in values.items()}
     recorded |= {name: (ParameterRecord(10**12, value),) for name, value in (later or {}).items()}
-    return require_agreement(channel_map.name, sticks, recorded, values)
+    return require_agreement(channel_map.name, compared(sticks, recorded, values))
 
 
 def changed(name: str, section: str, **values: Any) -> ChannelMap:

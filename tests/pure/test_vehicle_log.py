@@ -161,7 +161,8 @@ def stamped(flight: Flight, values: FloatArray) -> list[tuple[int, FloatArray]]:
     return list(zip(flight.stamp_us, values, strict=True))
 
 
-def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float) -> Path:
+def ulog(path: Path, flight: Flight, changes: Changes = (), *, vtol: bool = False) -> Path:
+    """A log of PX4. A VTOL flies the first half on its rotors, whose torques in instance 0 oppose the rates to the end."""
     elevator, thrust, aileron, rudder = flight.u.T
     still = np.zeros(len(thrust))
     level = np.column_stack([np.ones(len(thrust)), still, still, still])
@@ -172,7 +173,14 @@ def ulog(path: Path, flight: Flight, changes: Changes = (), **parameters: float)
         "vehicle_torque_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([aileron, elevator, rudder]) / FULL)),
         "vehicle_thrust_setpoint": ("float[3] xyz;", stamped(flight, np.column_stack([THROTTLE + thrust, still, still]))),
     }
-    write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0} | parameters, changes)
+    second = {}
+    if vtol:
+        name = "vehicle_torque_setpoint"
+        second[name] = topics[name][1]
+        topics[name] = ("float[3] xyz;", stamped(flight, -0.1 * flight.y[:, [2, 0, 3]]))
+        kinds = np.where(np.arange(len(thrust)) < len(thrust) // 2, 1.0, 2.0)
+        topics["vehicle_status"] = ("float vehicle_type;float is_vtol;", stamped(flight, np.column_stack([kinds, kinds > 0])))
+    write_ulog(path, topics, {"FW_AIRSPD_TRIM": 25.0}, changes, second)
     return path
 
 
@@ -430,19 +438,197 @@ def test_log_cut_in_the_middle_gives_what_it_has(flight: Flight, tmp_path: Path)
     assert rates[0] == pytest.approx(rates[1] / 2, rel=0.02)  # the head has the definitions
 
 
-def test_tlog_of_two_autopilots_is_that_of_the_first_and_says_so(flight: Flight, tmp_path: Path) -> None:
-    """The second one flies too: its rates are the opposite, half a sample later, and its RC2 is reversed."""
-    later = Flight([stamp + 10_000 for stamp in flight.stamp_us], -flight.y, -flight.u)
-    first = tlog(tmp_path / "one.tlog", flight, {"RC2_REVERSED": 0.0}).read_bytes()
-    second = tlog(tmp_path / "other.tlog", later, {"RC2_REVERSED": 1.0}, system=7).read_bytes()
-    (tmp_path / "both.tlog").write_bytes(in_order(first + second))
-    both, one = (read_vehicle_log(tmp_path / name) for name in ("both.tlog", "one.tlog"))
-    assert both.kind == "a tlog of MAVLink, system 1 alone; it also has 7"
-    for name, table in one.tables.items():
-        np.testing.assert_array_equal(both.tables[name].stamp_ns, table.stamp_ns)
+def two_systems(folder: Path, flight: Flight, second: Flight) -> tuple[Path, Path]:
+    """A tlog of the systems 1 and 7, whose RC2 is reversed, and that of the system 1 alone."""
+    alone = tlog(folder / "one.tlog", flight, {"RC2_REVERSED": 0.0})
+    other = tlog(folder / "other.tlog", second, {"RC2_REVERSED": 1.0}, system=7)
+    (folder / "both.tlog").write_bytes(in_order(other.read_bytes() + alone.read_bytes()))
+    return folder / "both.tlog", alone
+
+
+def test_system_of_a_tlog_that_flew_is_taken_and_named(flight: Flight, tmp_path: Path) -> None:
+    """The other one stands, half a sample later: its gyroscopes have noise alone."""
+    still = Flight([stamp + 10_000 for stamp in flight.stamp_us], 0.01 * flight.y, flight.u)
+    path, alone = two_systems(tmp_path, flight, still)
+    both, expected = read_vehicle_log(path), read_vehicle_log(alone)
+    assert both.taken == (("system", "1 of 7 and 1: it alone moves"),)
+    assert both.parameters == expected.parameters
+    for name, table in expected.tables.items():
         for field, values in table.fields.items():
             np.testing.assert_array_equal(both.tables[name].fields[field], values)
-    assert both.parameters == one.parameters
+    result = imported(path, tmp_path / "bag")
+    assert result.exit_code == 0
+    assert "1 of 7 and 1: it alone moves" in result.stdout
+
+
+def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(flight: Flight, tmp_path: Path) -> None:
+    later = Flight([stamp + 10_000 for stamp in flight.stamp_us], -flight.y, -flight.u)
+    path, _ = two_systems(tmp_path, flight, later)
+    sentence = "the log: found motion of the systems 7 and 1, expected --system 7 or --system 1"
+    assert str(imported(path, tmp_path / "bag").exception) == sentence
+    assert "--system: found 3, expected one of 7 and 1" in str(imported(path, tmp_path / "bag", "--system", "3").exception)
+    assert imported(path, tmp_path / "bag", "--system", "1").exit_code == 0
+    assert "found RC2_REVERSED 1" in str(imported(path, tmp_path / "other", "--system", "7").exception)
+
+
+def arrivals(path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None) -> Path:
+    """A tlog with other times of arrival, us; with `copies` a second link brings each message again at its own time."""
+    packets: list[tuple[int, bytes]] = []
+    content = path.read_bytes()
+    start = 0
+    while start < len(content):
+        end = start + 8 + 12 + int(content[start + 9])
+        (stamp,) = struct.unpack(">Q", content[start : start + 8])
+        clocks = [clock for clock in (arrival, copies) if clock is not None]
+        packets += [(clock(stamp), content[start + 8 : end]) for clock in clocks]
+        start = end
+    packets.sort(key=lambda packet: packet[0])
+    path.write_bytes(b"".join(struct.pack(">Q", stamp) + packet for stamp, packet in packets))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arrival", "copies"),
+    [
+        (lambda stamp: (stamp // 500_000 + 1) * 500_000, None),
+        (lambda stamp: stamp, lambda stamp: stamp + 250_000),
+        (lambda stamp: stamp, lambda stamp: stamp + 3_000_000),
+        (lambda stamp: stamp + 40_000 * (stamp // 1_000_000 % 3), lambda stamp: (stamp // 300_000 + 1) * 300_000),
+    ],
+    ids=["bunched", "second link", "slow second link", "both links uneven"],
+)
+def test_messages_of_a_tlog_have_the_time_of_their_autopilot(
+    arrival: Callable[[int], int], copies: Callable[[int], int] | None, flight: Flight, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    assert imported(arrivals(tlog(tmp_path / "a.tlog", flight), arrival, copies=copies), bag).exit_code == 0
+    tape = read_run(bag).tape
+    assert np.diff(tape["y"].stamp_ns) == pytest.approx(1e9 / RATE)
+    assert len(tape["y"].stamp_ns) == pytest.approx(len(flight.y), abs=1)
+    response = recorded_response(bag, OUTPUTS, INPUTS)
+    deviations = response.Omega_deviation.diagonal()
+    assert np.abs(response.Omega.diagonal() - OMEGA) / deviations == pytest.approx(np.zeros(4), abs=3.0)
+
+
+def sensors(
+    path: Path, flight: Flight, name: str, parameters: Mapping[str, float], *instances: FloatArray, **flags: Any
+) -> Path:
+    """A log of ArduPlane with several sensors: values by instance, shape (N, fields), and flags by field, a value for each."""
+    fields = {"ARSP": ("Airspeed",), "IMU": ("GyrX", "GyrY", "GyrZ")}[name]
+    rows = []
+    for number, values in enumerate(instances):
+        flag_values = [flag[number] for flag in flags.values()]
+        rows += [(stamp, (number, *row, *flag_values)) for stamp, row in zip(flight.stamp_us, values, strict=True)]
+    messages: dict[str, tuple[tuple[str, ...], Any]] = {
+        "MODE": (("Mode", "ModeNum"), [(1, (0, 0))]),
+        "IMU": (("GyrX", "GyrY", "GyrZ"), stamped(flight, flight.y[:, [2, 0, 3]])),
+        "CTUN": (("Aspd", "E2T"), stamped(flight, np.column_stack([flight.y[:, 1] + SPEED, np.ones(len(flight.y))]))),
+        "RCIN": (("C1", "C2", "C3", "C4"), stamped(flight, sticks(flight.u))),
+    } | {name: (("I", *fields, *flags), rows)}
+    write_dataflash(path, messages, {**PARAMETERS, **parameters}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    return path
+
+
+DEAD = np.random.default_rng(3).normal(2.0, 0.3, (round(DURATION * RATE), 1))  # m/s
+
+
+@pytest.mark.parametrize(
+    ("flags", "taken"),
+    [
+        ({"H": (0, 1), "U": (0, 1), "Pri": (1, 1)}, "1 of 0 and 1: the primary"),
+        ({"H": (0, 1), "U": (1, 1), "Pri": (0, 0)}, "1 of 0 and 1: healthy and used"),
+        ({"H": (1, 1), "U": (0, 1)}, "1 of 0 and 1: healthy and used"),
+        ({}, "1 of 0 and 1: healthy and used"),
+    ],
+    ids=["primary", "dead primary", "not used", "no flags"],
+)
+def test_airspeed_is_that_of_the_sensor_that_measures(
+    flags: Mapping[str, tuple[int, int]], taken: str, flight: Flight, tmp_path: Path
+) -> None:
+    path = sensors(tmp_path / "a.bin", flight, "ARSP", {}, DEAD, flight.y[:, [1]] + SPEED, **flags)
+    log = read_vehicle_log(path)
+    assert log.taken == (("ARSP", taken),)
+    assert log.tables["ARSP"].fields["Airspeed"] == pytest.approx(flight.y[:, 1] + SPEED, abs=1e-4)
+
+
+def test_airspeed_of_a_primary_that_changes_in_flight_is_that_of_each_instant(flight: Flight, tmp_path: Path) -> None:
+    half = len(flight.y) // 2
+    dies = np.vstack([flight.y[:half, [1]] + SPEED, DEAD[half:]])
+    path = sensors(tmp_path / "a.bin", flight, "ARSP", {}, dies, flight.y[:, [1]] + SPEED, H=(1, 1), U=(1, 1), Pri=(0, 0))
+    assert "found ARSP of 0 and 1, which differ, expected --instance ARSP=0 or --instance ARSP=1" in str(
+        imported(path, tmp_path / "no").exception
+    )
+    assert imported(path, tmp_path / "bag", "--instance", "ARSP=1").exit_code == 0
+    rows = [
+        (stamp, (number, dies[k, 0] if number == 0 else flight.y[k, 1] + SPEED, number or k < half, 1, int(k >= half)))
+        for k, stamp in enumerate(flight.stamp_us)
+        for number in (0, 1)
+    ]
+    write_dataflash(path, {"ARSP": (("I", "Airspeed", "H", "U", "Pri"), rows)}, {}, "ArduPlane V4.6.0 (1f2e3d4c)")
+    log = read_vehicle_log(path)
+    assert log.taken == (("ARSP", "0 and 1 of 0 and 1: the primary"),)
+    assert log.tables["ARSP"].fields["Airspeed"] == pytest.approx(flight.y[:, 1] + SPEED, abs=1e-4)
+
+
+def test_gyroscope_is_one_that_is_used_and_two_that_differ_are_refused(flight: Flight, tmp_path: Path) -> None:
+    rates = flight.y[:, [2, 0, 3]]
+    not_used = sensors(tmp_path / "a.bin", flight, "IMU", {"INS_USE": 0.0, "INS_USE2": 1.0}, -rates, rates)
+    log = read_vehicle_log(not_used)
+    assert log.taken == (("IMU", "1 of 0 and 1: it alone is used and moves"),)
+    assert log.tables["IMU"].fields["GyrY"] == pytest.approx(rates[:, 1], abs=1e-6)
+    turned = sensors(tmp_path / "b.bin", flight, "IMU", {}, rates, -rates)
+    with pytest.raises(ParameterError, match="found IMU of 0 and 1, which differ, expected --instance IMU=0 or"):
+        read_vehicle_log(turned)
+    equal = sensors(tmp_path / "c.bin", flight, "IMU", {}, rates, rates + 0.001)
+    assert read_vehicle_log(equal).taken == (("IMU", "0 of 0 and 1: the first of those that agree"),)
+
+
+def test_vtol_of_px4_is_flown_by_its_surfaces_as_a_plane(flight: Flight, tmp_path: Path) -> None:
+    path, bag = ulog(tmp_path / "vtol.ulg", flight, vtol=True), tmp_path / "bag"
+    result = imported(path, bag, map_name="px4")
+    assert result.exit_code == 0, result.output
+    assert "1 of 0 and 1: the surfaces of a VTOL" in " ".join(result.stdout.split())
+    tape = read_run(bag).tape
+    half = len(flight.u) // 2  # the first half is flown on the rotors
+    assert tape["u"].values == pytest.approx(flight.u[half:] - np.median(flight.u[half:], axis=0), abs=1e-5)
+
+
+def test_log_of_the_other_kind_of_vehicle_than_the_map_is_refused(flight: Flight, tmp_path: Path) -> None:
+    path = multicopter(tmp_path / "copter.bin", flight)
+    sentence = "the log: found one of a multicopter, expected one of a plane as in the map ardupilot, or another --map"
+    assert str(imported(path, tmp_path / "no").exception) == sentence
+
+
+def test_log_without_the_gyroscope_names_the_mask_of_the_log(flight: Flight, tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"LOG_BITMASK": 65407.0})
+    path.write_bytes(path.read_bytes().replace(b"IMU\0", b"XMU\0", 1))
+    sentence = "outputs.q: found no q in the log, expected IMU: LOG_BITMASK is 65407"
+    assert str(imported(path, tmp_path / "no").exception) == sentence
+
+
+def test_log_of_px4_before_2017_is_named(flight: Flight, tmp_path: Path) -> None:
+    rows = stamped(flight, flight.y[:, [2, 0, 3]])
+    write_dataflash(tmp_path / "old.px4log", {"IMU": (("GyroX", "GyroY", "GyroZ"), rows)}, {}, "")
+    with pytest.raises(ParameterError, match=r"found a log of PX4 before 2017 .*, expected a ULog"):
+        read_vehicle_log(tmp_path / "old.px4log")
+
+
+def test_what_the_log_says_stands_beside_what_the_map_says(flight: Flight, tmp_path: Path) -> None:
+    path = dataflash(tmp_path / "flight.bin", flight, parameters=PARAMETERS | {"RC1_MIN": 1100.0})
+    refused = imported(path, tmp_path / "no")
+    assert refused.exception
+    table = dict(re.findall(r"(\w+) +(.*?) *\n", refused.stdout))
+    assert (table["RC1_MIN"].split(), table["RC2_MIN"].split()) == (["1100", "1000"], ["1000", "1000"])
+    assert table["vehicle"].split() == ["plane", "plane"]
+
+
+def test_loss_of_airspeed_is_told_with_the_instant(flight: Flight, tmp_path: Path) -> None:
+    lost = flight.y.copy()
+    lost[len(lost) // 2 :, 1] = np.nan
+    result = imported(ulog(tmp_path / "a.ulg", flight._replace(y=lost)), tmp_path / "bag", map_name="px4")
+    assert result.exit_code == 0
+    sentence = "warning: no airspeed or thrust at 1000 of 2000 samples, from 20.0 s of the log on"
+    assert sentence in result.stderr
 
 
 def test_log_without_what_the_map_needs_is_one_sentence(flight: Flight, tmp_path: Path) -> None:

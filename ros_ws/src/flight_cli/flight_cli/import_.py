@@ -16,11 +16,12 @@ from flight_cli.output import new_table, options
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
-from flight_design.identification.log_import import PARAMETERS, Window, imported
+from flight_design.identification.log_import import PARAMETERS, Window, imported, kind_of_map
+from flight_design.identification.parameter_agreement import Agreement
 from flight_log.bag import CHANNEL_UNITS, COMPARED, IMPORTED, LogAttachments
 from flight_log.provenance import provenance
 from flight_log.tape_writer import write_run
-from flight_log.vehicle_log import read_foreign_log
+from flight_log.vehicle_log import Choice, read_foreign_log
 
 
 def import_(
@@ -32,6 +33,11 @@ def import_(
     servos: Annotated[
         bool, typer.Option("--servos", help="u from the servos of ArduPilot, in any mode; without, from the sticks in MANUAL.")
     ] = False,
+    system: Annotated[int | None, typer.Option(help="MAVLink system of a tlog of several; without, the one that flew.")] = None,
+    instances: Annotated[
+        list[str] | None,
+        typer.Option("--instance", metavar="MESSAGE=NUMBER", help="Sensor or instance of several, as IMU=1; repeat for more."),
+    ] = None,
 ) -> None:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
@@ -44,8 +50,17 @@ def import_(
         for name, value in (("from", start), ("until", stop)):
             require(value is None or value >= 0.0, name, value, "0 s or more")
     channel_map = load_map(map_name)
-    read = read_foreign_log(log)
-    tape, parameters, notes = imported(channel_map, read, Window(start, stop), servos=servos)
+    console = Console()
+
+    def show(rows: list[Agreement]) -> None:
+        headings = ("", "what the log says", "what the map says")
+        table = new_table("", headings, headings, headings)
+        for row in rows:
+            table.add_row(row.what, row.logged or "not recorded", row.mapped, style="bold red" if row.differs else None)
+        console.print(table)
+
+    read = read_foreign_log(log, Choice(system, _numbers(instances or []), kind_of_map(channel_map)))
+    tape, parameters, notes = imported(channel_map, read, Window(start, stop), show, servos=servos)
     folder = output or Path("runs") / log.stem
     require(not folder.exists(), "--output", f"{folder}, which exists", "the name of a new folder")
     with writing("--output", folder, "a folder that can"):
@@ -65,10 +80,19 @@ def import_(
         rate = (len(signal.stamp_ns) - 1) / float(gaps.sum()) if len(gaps) else 0.0
         longest = float(gaps.max()) if len(gaps) else 0.0
         table.add_row(topic, str(len(signal.stamp_ns)), f"{rate:.3g}", f"{longest:.3g}")
-    console = Console()
     console.print(table)
     begin = (tape.start_ns - read.start_ns(channel_map.outputs[channel_map.instant].motion[0])) / NANOSECONDS
     length = (int(tape["y"].stamp_ns[-1]) - tape.start_ns) / NANOSECONDS
     console.print(
         f"taken: {begin:.1f} to {begin + length:.1f} s of the log\nlog:   {display_path(bag)}", highlight=False, soft_wrap=True
     )
+
+
+def _numbers(instances: list[str]) -> dict[str, int]:
+    """Numbers by message of MESSAGE=NUMBER. Raises ParameterError."""
+    numbers = {}
+    for text in instances:
+        message, _, number = text.partition("=")
+        require(number.isdecimal(), "--instance", repr(text), "MESSAGE=NUMBER, as IMU=1")
+        numbers[message] = int(number)
+    return numbers

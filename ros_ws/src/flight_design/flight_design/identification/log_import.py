@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """y, u and pose of a channel map, from the log of an autopilot that the stack did not fly."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,14 +12,16 @@ from autopilot_bridge.channel_map import Line, to_channel
 from autopilot_bridge.params import ChannelMap, InputRow
 from flight_core.files import parse_yaml
 from flight_core.parameters import ParameterError, require
-from flight_core.rates import nanoseconds
+from flight_core.rates import nanoseconds, seconds
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
 from flight_design.identification.parameter_agreement import (
     SAME_LINE,
+    Agreement,
     Servo,
     Stick,
     changes,
+    compared,
     require_agreement,
     servo_of,
     stick_of,
@@ -32,6 +34,9 @@ COMMANDS = "commands"  # the topic with trim + u, by input
 AIRBORNE = 0.5  # of the typical airspeed, of a multicopter the typical thrust: below, the aircraft is on the ground
 TYPICAL = 90.0  # percentile of either in a log, which may have more time on the ground than in the air
 LEAST = 2.0  # s of flight that are worth a bag
+
+FLOWN_AS = Source("vehicle_status", "vehicle_type")
+VEHICLE_TYPES = {COPTER: 1.0, PLANE: 2.0}  # PX4, VehicleStatus.msg
 
 PARAMETERS = "vehicle_parameters.yaml"  # in the folder and in the log
 
@@ -53,35 +58,76 @@ class Imported(NamedTuple):
     notes: tuple[str, ...]
 
 
-def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos: bool) -> Imported:
+def kind_of_map(channel_map: ChannelMap) -> str:
+    """The kind of vehicle of a map: a plane has an airspeed, a multicopter a climb."""
+    return PLANE if any(row.motion[0] == "V" for row in channel_map.outputs.values()) else COPTER
+
+
+def imported(
+    channel_map: ChannelMap, log: VehicleLog, window: Window, show: Callable[[list[Agreement]], None], *, servos: bool
+) -> Imported:
     """y, u, `commands` and the pose of a log, as the bridge would have published them.
 
     y and the pose hold the newest values at the stamps of the map's `instant` and of the first channel of the pose. u is the
     command less its median: the setpoint of the map (PX4) or of the rate controllers (ArduCopter), else the stick in MANUAL, or
     with `servos` the servo's position, scaled as the stick. Without a window the longest stretch in the air is taken, for
-    sticks in MANUAL. Raises ParameterError for a channel that the log does not have, for another vehicle, without such a
-    stretch, and for parameters of the log that differ from the map or change between the samples.
+    sticks in MANUAL. `show` gets the comparison of the log with the map before each check of the comparison. Raises
+    ParameterError for a channel that the log does not have, for another vehicle, without such a stretch, and for parameters of
+    the log that differ from the map or change between the samples.
     """
+    kind = kind_of_map(channel_map)
+    logged_kind = log.vehicle
+    log = log._replace(vehicle=logged_kind or kind)
     require(log.vehicle in {PLANE, COPTER}, "the log", f"one of a {log.vehicle}", "one of a plane or a multicopter")
+    fits = log.vehicle == kind
+    require(fits, "the log", f"one of a {log.vehicle}", f"one of a {kind} as in the map {channel_map.name}, or another --map")
     rows = channel_map.outputs
     sources = {name: _measured(log, row.motion[0], f"outputs.{name}") for name, row in rows.items()}
     stamps = log.tables[sources[channel_map.instant].message].stamp_ns
-    speed = next((log.at(sources[name], stamps) for name, row in rows.items() if row.motion[0] == "V"), None)
-    if speed is None:  # a multicopter: its thrust
-        lifts = {name: row.motion[1] for name, row in channel_map.inputs.items() if row.motion[0] == "climb"}
-        speed = next(
-            (sign * _commands(channel_map, log, name, servos, {}).commands_at(stamps) for name, sign in lifts.items()), None
-        )
+    speed = _speed(channel_map, log, sources, stamps, servos)
     has_sticks = log.format is not None and log.vehicle == PLANE
     first, last = _flight(log, stamps, speed, window, needs_manual=has_sticks and not servos)
     parameters = log.parameters_at(first)
     notes = changes(log.parameters, int(stamps[0]), first, last)
+    if speed is not None and (lost := ~np.isfinite(speed) & (stamps >= first)).any():
+        instant = seconds(int(stamps[lost.argmax()] - stamps[0]))
+        notes.append(f"no airspeed or thrust at {lost.sum()} of {len(stamps)} samples, from {instant:.1f} s of the log on")
+    sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
+    rows_compared = compared(sticks, log.parameters, parameters)
+    show([Agreement("vehicle", logged_kind, kind), *(Agreement(*row, "") for row in log.taken), *rows_compared])
     try:
         readers = {name: _commands(channel_map, log, name, servos, parameters) for name in channel_map.inputs}
-        sticks = [stick_of(channel_map, name) for name in channel_map.inputs if has_sticks]
-        notes.append(require_agreement(channel_map.name, sticks, log.parameters, parameters))
+        notes.append(require_agreement(channel_map.name, rows_compared))
     except ParameterError as error:
         raise ParameterError("; ".join([str(error), *notes])) from None
+    tape = _tape(channel_map, log, sources, readers, (first, last))
+    return Imported(tape, parameters, tuple(filter(None, notes)))
+
+
+def _speed(
+    channel_map: ChannelMap, log: VehicleLog, sources: Mapping[str, Source], stamps: Stamps, servos: bool
+) -> FloatArray | None:
+    """The airspeed, or a multicopter's thrust, as evidence of flight; None where the map has neither."""
+    for name, row in channel_map.outputs.items():
+        if row.motion[0] == "V":
+            return log.at(sources[name], stamps)
+    for name, lift in channel_map.inputs.items():
+        if lift.motion[0] == "climb":
+            return lift.motion[1] * _commands(channel_map, log, name, servos, {}).commands_at(stamps)
+    return None
+
+
+def _tape(
+    channel_map: ChannelMap,
+    log: VehicleLog,
+    sources: Mapping[str, Source],
+    readers: Mapping[str, "_Reader"],
+    ends: tuple[int, int],
+) -> Tape:
+    """The signals between two instants."""
+    first, last = ends
+    rows = channel_map.outputs
+    stamps = log.tables[sources[channel_map.instant].message].stamp_ns
     y_stamps = stamps[(stamps >= first) & (stamps <= last)]
     y = np.column_stack([row.motion[1] * log.at(sources[name], y_stamps) for name, row in rows.items()])
     y_stamps, y = _complete(y_stamps, y)
@@ -99,7 +145,7 @@ def imported(channel_map: ChannelMap, log: VehicleLog, window: Window, *, servos
     }
     if (pose := _pose(channel_map, log, first, last)) is not None:
         signals["pose"] = pose
-    return Imported(Tape(signals, int(y_stamps[0])), parameters, tuple(filter(None, notes)))
+    return Tape(signals, int(y_stamps[0]))
 
 
 def median_trims(commands: Signal) -> dict[str, float]:
@@ -110,7 +156,9 @@ def median_trims(commands: Signal) -> dict[str, float]:
 def _measured(log: VehicleLog, quantity: str, key: str) -> Source:
     source = log.source(quantity)
     if source is None:
-        raise ParameterError(f"{key}: found no {quantity} in the log, expected {_messages(log, quantity)}")
+        mask = log.parameters.get("LOG_BITMASK")
+        logged = "" if mask is None else f": LOG_BITMASK is {mask[0].value:.0f}"
+        raise ParameterError(f"{key}: found no {quantity} in the log, expected {_messages(log, quantity)}{logged}")
     return source
 
 
@@ -197,6 +245,8 @@ def _flight(
     if speed is not None and window.start is None and window.stop is None:
         require(bool(np.isfinite(speed).any()), "the log", "no airspeed or thrust at the samples of y", "a flight")
         keep &= speed > AIRBORNE * np.nanpercentile(speed, TYPICAL)
+    if log.has(FLOWN_AS):  # a VTOL flies as both
+        keep &= log.at(FLOWN_AS, stamps) == VEHICLE_TYPES[log.vehicle]
     if needs_manual:
         expected = "it, for only there the sticks are the commands, or --servos"
         mode = next((source for source in log.format.mode if log.has(source)), None) if log.format is not None else None

@@ -129,30 +129,46 @@ def servo_of(stick: Stick, name: str, values: Mapping[str, float]) -> Servo:
     return Servo(outputs[0], low, trim[0] if trim else low, high, is_reversed == 1.0)
 
 
-def require_agreement(name_of_map: str, sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]) -> str:
-    """The sentence on parameters without a value at the samples, empty where there is none: no default stands in.
+class Agreement(NamedTuple):
+    """A line of the comparison of a log with a map."""
 
-    `values` are the parameters at the samples. Raises ParameterError for parameters unlike the map's, also for values that come
-    after the samples.
+    what: str  # the parameter, or what is taken of the log
+    logged: str  # "" where the log has no record
+    mapped: str  # "" where the map has none
+    differs: bool = False
+    is_known: bool = True  # at the samples, by a record before
+
+
+def compared(sticks: Iterable[Stick], recorded: Parameters, values: Mapping[str, float]) -> list[Agreement]:
+    """The parameters of the transmitter in a log, against a map; `values` are those at the samples.
+
+    A parameter without a value at the samples is compared by the first record after the samples, without a default.
     """
-    parameters: dict[str, tuple[float, float]] = {}
-    for stick in sticks:
-        parameters |= stick.parameters()
     known = {name: records[0].value for name, records in recorded.items()} | dict(values)
-    differing = {
-        name: value
-        for name, (value, tolerance) in parameters.items()
-        if name in known and not abs(known[name] - value) <= tolerance
-    }
+    rows = []
+    for stick in sticks:
+        for name, (value, tolerance) in stick.parameters().items():
+            differs = name in known and not abs(known[name] - value) <= tolerance
+            logged = f"{known[name]:g}" if name in known else ""
+            rows.append(Agreement(name, logged, f"{value:g}", differs, name in values))
+    return rows
+
+
+def require_agreement(name_of_map: str, rows: Iterable[Agreement]) -> str:
+    """The sentence on parameters without a value at the samples, empty where there is none.
+
+    Raises ParameterError for parameters unlike the map's.
+    """
+    differing = [row for row in rows if row.differs]
     if differing:
-        logged = ", ".join(f"{name} {known[name]:g}" for name in differing)
-        expected = ", ".join(f"{name} {value:g}" for name, value in differing.items())
+        logged = ", ".join(f"{row.what} {row.logged}" for row in differing)
+        expected = ", ".join(f"{row.what} {row.mapped}" for row in differing)
         mends: dict[str, None] = {}
-        for name in differing:
-            mends |= dict.fromkeys(mend for end, mend in MENDS.items() if end in name.split("_"))
+        for row in differing:
+            mends |= dict.fromkeys(mend for end, mend in MENDS.items() if end in row.what.split("_"))
         raise ParameterError(f"the log: found {logged}, expected {expected} as in the map {name_of_map}: {'; '.join(mends)}")
-    absent = [name for name in parameters if name not in values]
-    return f"the log has no {', '.join(absent)} before the samples: compare the map with them yourself" if absent else ""
+    absent = ", ".join(row.what for row in rows if not row.is_known)
+    return f"the log has no {absent} before the samples: compare the map with them yourself" if absent else ""
 
 
 def changes(recorded: Parameters, start_ns: int, first_ns: int, last_ns: int) -> list[str]:

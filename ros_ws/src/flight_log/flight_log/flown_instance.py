@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The sensor or instance of an autopilot's log with the flight.
+
+Sources: ArduPilot, AP_Logger/LogStructure.h (ARSP: H healthy, U used, Pri primary; IMU: GH), AP_InertialSensor.cpp (INS_USE);
+PX4, vtol_att_control (instance 0 of the setpoints of torque is of the rotors, 1 of the surfaces).
+"""
+
+from collections.abc import Mapping, Set
+
+import numpy as np
+
+from flight_core.parameters import ParameterError, require
+from flight_log.log_samples import Instances
+from flight_log.vehicle_log import PLANE, Choice, Parameters, Table
+
+STILL = 0.1  # of the largest motion: an instance with less does not fly
+UNLIKE = 0.4  # of the deviation of a quantity: two sensors of one quantity differ by less
+MOST = 0.5  # of the samples, and of the airspeed of a flight
+AIRSPEEDS = frozenset({"Airspeed", "true_airspeed_m_s"})
+TYPICAL = 90.0  # percentile of an airspeed
+SURFACES = ("vehicle_torque_setpoint", "actuator_controls_0")  # of a VTOL of PX4, by the instance 1
+CORES = ("XKF1", "NKF1", "EKF1")
+
+
+def flown(
+    instances: Instances, fields: Mapping[str, Set[str]], parameters: Parameters, choice: Choice
+) -> tuple[dict[str, Table], list[tuple[str, str]]]:
+    """A table by message, and the choice among several instances with the reason.
+
+    `fields`: the fields that are read, by message; further messages give their first instance. Raises ParameterError where
+    two unlike instances remain.
+    """
+    for name in choice.instances:
+        require(name in instances, "--instance", name, f"a message of the log, as {', '.join([*instances][:8])}")
+    tables: dict[str, Table] = {}
+    taken: list[tuple[str, str]] = []
+    for name, numbered in instances.items():
+        number = choice.instances.get(name)
+        reason = "by --instance"
+        if number is not None:
+            require(number in numbered, f"--instance {name}", number, f"one of {_listed(numbered)}")
+        elif name == "ARSP":
+            tables[name], sentence = _airspeed(numbered)
+            taken += [(name, sentence)] * (len(numbered) > 1)
+            continue
+        elif len(numbered) == 1 or name not in fields or name in CORES:
+            number = min(numbered)
+            reason = "the first" if name in fields and len(numbered) > 1 else ""
+        elif name in SURFACES:
+            number, reason = (1, "the surfaces of a VTOL") if choice.vehicle == PLANE else (0, "the rotors of a VTOL")
+        else:
+            usable = _used(numbered, parameters) if name == "IMU" else set(numbered)
+            number, reason = _of_motion(name, {k: numbered[k] for k in sorted(usable)}, fields[name])
+        tables[name] = numbered[number]
+        taken += [(name, f"{number} of {_listed(numbered)}: {reason}")] * bool(reason)
+    return tables, taken
+
+
+def _of_motion(name: str, numbered: Mapping[int, Table], fields: Set[str]) -> tuple[int, str]:
+    """The moving instance; the first of several equal ones."""
+    motions = {number: _motion(table, fields) for number, table in numbered.items()}
+    moving = {number: numbered[number] for number in moved(motions, MOST if fields & AIRSPEEDS else STILL)}
+    first, *others = moving
+    if all(_agree(moving[first], moving[number], fields) for number in others):
+        return first, "the first of those that agree" if others else "it alone is used and moves"
+    ways_out = " or ".join(f"--instance {name}={number}" for number in moving)
+    raise ParameterError(f"the log: found {name} of {_listed(moving)}, which differ, expected {ways_out}")
+
+
+def moved(motions: Mapping[int, float], least: float = STILL) -> list[int]:
+    """The numbers of all motions above a part of the largest motion."""
+    return [number for number, motion in motions.items() if motion >= least * max(motions.values())]
+
+
+def _motion(table: Table, fields: Set[str]) -> float:
+    """The deviations of the fields, or the typical value of an airspeed: a dead sensor has no airspeed."""
+    for field in fields & AIRSPEEDS & table.fields.keys():
+        finite = table.fields[field][np.isfinite(table.fields[field])]
+        return float(np.percentile(finite, TYPICAL)) if len(finite) else 0.0
+    return sum(_deviation(table.fields[field]) for field in fields & table.fields.keys())
+
+
+def _deviation(values: np.ndarray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.std()) if len(finite) else 0.0
+
+
+def _agree(first: Table, second: Table, fields: Set[str]) -> bool:
+    """Whether the fields of two sensors differ by less than UNLIKE of their deviations."""
+    for field in fields & first.fields.keys() & second.fields.keys():
+        values = first.fields[field]
+        difference = values - second.at(field, first.stamp_ns)
+        known = np.isfinite(difference)
+        if known.any() and np.sqrt(np.mean(difference[known] ** 2)) > UNLIKE * _deviation(values[known]):
+            return False
+    return True
+
+
+def _used(numbered: Mapping[int, Table], parameters: Parameters) -> set[int]:
+    """The healthy gyroscopes in use, by INS_USE, INS_USE2 and INS_USE3."""
+    names = {number: f"INS_USE{number + 1 if number else ''}" for number in numbered}
+    used = {number for number, name in names.items() if name not in parameters or parameters[name][0].value}
+    healthy = {number for number in used if _share(numbered[number], "GH") >= MOST}
+    logged = ", ".join(f"{name} {parameters[name][0].value:g}" for name in names.values() if name in parameters)
+    require(bool(healthy), "the log", f"no IMU that is used and healthy ({logged})", "one, or --instance IMU=0")
+    return healthy
+
+
+def _share(table: Table, field: str) -> float:
+    """The part of the samples in which a flag is set; 1 without the flag."""
+    return float(np.mean(table.fields[field] != 0.0)) if field in table.fields else 1.0
+
+
+def _airspeed(numbered: Mapping[int, Table]) -> tuple[Table, str]:
+    """The primary airspeed sensor at every instant where healthy, else a healthy sensor in use. NaN: not healthy."""
+    tables = {number: _healthy(table) for number, table in numbered.items()}
+    live = {number: table for number, table in tables.items() if np.isfinite(table.fields["Airspeed"]).mean() >= MOST}
+    used = {number: table for number, table in live.items() if _share(table, "U") >= MOST} or live
+    primary = _primary(tables)
+    if primary is not None and np.isfinite(primary[1].fields["Airspeed"]).mean() >= MOST:
+        numbers, table = primary
+        unlike = [number for number in used if number not in numbers and not _agree(used[number], table, {"Airspeed"})]
+        if not unlike:
+            return table, f"{_listed(numbers)} of {_listed(tables)}: the primary"
+        used = {number: tables[number] for number in (*numbers, *unlike)}
+    require(bool(used), "the log", "no healthy airspeed sensor (ARSP.H is 0)", "one, or --instance ARSP=0")
+    number, _ = _of_motion("ARSP", used, {"Airspeed"})
+    return tables[number], f"{number} of {_listed(tables)}: healthy and used"
+
+
+def _healthy(table: Table) -> Table:
+    healthy = table.fields.get("H", np.ones(len(table.stamp_ns))) != 0.0
+    return table._replace(fields={**table.fields, "Airspeed": np.where(healthy, table.fields["Airspeed"], np.nan)})
+
+
+def _primary(tables: Mapping[int, Table]) -> tuple[list[int], Table] | None:
+    """The samples of the primary sensor at every instant, and the numbers of the sensors; None for a log without `Pri`."""
+    if not all("Pri" in table.fields for table in tables.values()):
+        return None
+    masks = {number: table.fields["Pri"] == number for number, table in tables.items()}
+    numbers = [number for number, mask in masks.items() if mask.any()]
+    if not numbers:
+        return None
+    stamps = np.concatenate([tables[number].stamp_ns[masks[number]] for number in numbers])
+    airspeed = np.concatenate([tables[number].fields["Airspeed"][masks[number]] for number in numbers])
+    order = np.argsort(stamps, kind="stable")
+    return numbers, Table(stamps[order], {"Airspeed": airspeed[order]})
+
+
+def _listed(numbers: Mapping[int, Table] | list[int]) -> str:
+    return " and ".join(map(str, sorted(numbers)))

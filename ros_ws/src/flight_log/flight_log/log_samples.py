@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of messages from the samples of an autopilot's log."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flight_core.rates import NANOSECONDS
+from flight_core.vectors import FloatArray
+from flight_log.vehicle_log import PARAMETER, ParameterRecord, Parameters, Table
+
+LARGEST = 2**62  # ns, of a damaged stamp
+# an autopilot that goes back by a step has started again; a link may be lost
+STEP_NS = NANOSECONDS
+LOST_NS = 60 * NANOSECONDS
+AGREEING = 5  # samples, after which another time is that of the clock
+
+Sample = tuple[tuple[str, int], int, Any]
+"""Name and instance, stamp in ns and content of a message; the content of a PARAMETER is a name and a value."""
+
+Instances = dict[str, dict[int, Table]]
+"""The tables of the messages, by name and by the number of the instance."""
+
+SETTING = (PARAMETER, 0)
+
+
+def tables_of(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> tuple[Instances, Parameters, str]:
+    """Tables of messages, parameters, and a note. A field that its first message lacks is absent.
+
+    Where the clock goes back by more than STEP_NS, as of an autopilot that started again, the longest part counts alone. A
+    stamp is damaged, and its sample is left out, where fewer than AGREEING samples in a row agree with it. A parameter belongs
+    to the part of the next sample: an autopilot that starts writes its parameters first.
+    """
+    parts = [list[Sample]()]
+    newest_ns = 0
+    apart: list[Sample] = []  # the samples before, near each other and not near those of the part
+    settings = [list[Sample]()]  # by part
+    next_settings: list[Sample] = []
+    for sample in samples:
+        if sample[0] == SETTING:
+            next_settings.append(sample)
+            continue
+        if parts[-1] and abs(sample[1] - newest_ns) <= STEP_NS:
+            parts[-1].append(sample)
+            newest_ns = max(newest_ns, sample[1])
+            apart = []
+        else:
+            apart = [*apart, sample] if apart and -STEP_NS <= sample[1] - apart[-1][1] <= LOST_NS else [sample]
+            if len(apart) < AGREEING:
+                continue
+            if parts[-1] and apart[0][1] < newest_ns:
+                parts.append([])
+                settings.append([])
+            parts[-1] += apart
+            newest_ns, apart = max(stamp_ns for _, stamp_ns, _ in apart), []
+        settings[-1] += next_settings
+        next_settings = []
+    settings[-1] += next_settings
+    note = f", the longest of {len(parts)} parts: its clock goes back" if len(parts) > 1 else ""
+    longest = max(range(len(parts)), key=lambda number: len(parts[number]))
+    return _columns(parts[longest] or apart, wanted), parameters_of(settings[longest]), note
+
+
+def parameters_of(records: Iterable[Sample]) -> Parameters:
+    """The records of each parameter, in their order."""
+    parameters: dict[str, list[ParameterRecord]] = {}
+    for _, stamp_ns, (name, value) in records:
+        parameters.setdefault(name, []).append(ParameterRecord(stamp_ns, value))
+    return {name: tuple(values) for name, values in parameters.items()}
+
+
+def _columns(samples: Iterable[Sample], wanted: Mapping[str, set[str]]) -> Instances:
+    stamps: dict[tuple[str, int], list[int]] = {}
+    columns: dict[tuple[str, int], dict[str, list[float]]] = {}
+    for place, stamp_ns, message in samples:
+        if place not in columns:
+            columns[place] = {field: [] for field in sorted(wanted[place[0]]) if is_number(getattr(message, field, None))}
+        stamps.setdefault(place, []).append(stamp_ns)
+        for field, values in columns[place].items():
+            values.append(float(getattr(message, field)))
+    tables: Instances = {}
+    for (name, number), lists in columns.items():
+        fields = {field: np.array(values) for field, values in lists.items()}
+        tables.setdefault(name, {})[number] = table_of(np.array(stamps[name, number], dtype=np.int64), fields)
+    return tables
+
+
+def is_number(value: object) -> bool:
+    """Whether a value of a message is a number."""
+    return isinstance(value, int | float)
+
+
+def near(stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which stamps are near the median of the five around them: a damaged stamp is not."""
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(stamp_ns, 2, mode="reflect"), 5) if len(stamp_ns) > 2 else None
+    if around is None:
+        return np.ones(len(stamp_ns), dtype=bool)
+    return np.abs(stamp_ns - np.median(around, axis=1)) <= STEP_NS + 2.0 * np.median(np.abs(np.diff(stamp_ns)))
+
+
+def table_of(stamp_ns: NDArray[np.int64], fields: Mapping[str, FloatArray]) -> Table:
+    """A table in the order of its stamps, without samples of a repeated stamp."""
+    stamps, places = np.unique(stamp_ns, return_index=True)
+    return Table(stamps, {name: values[places] for name, values in fields.items()})
