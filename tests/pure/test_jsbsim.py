@@ -17,10 +17,11 @@ import pytest
 from tests.builders import aircraft_parameters, truth_of
 from tests.conftest import REPOSITORY
 
-from aircraft_sim import jsbsim_trim
+from aircraft_sim import jsbsim_aircraft, jsbsim_trim
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, Gusts
 from aircraft_sim.jsbsim_aircraft import INPUTS, Command, FlightCondition, WindModel, aircraft_names
+from aircraft_sim.jsbsim_commands import engine_count
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.simulator import Simulator
@@ -136,7 +137,7 @@ def with_lost_throttle(lost_at: float) -> AircraftConfig:
 
 
 def thrusts(model: JsbsimModel) -> list[float]:
-    return [model._fdm[jsbsim_trim.thrust_property(engine)] for engine in range(jsbsim_trim.engine_count(model._fdm))]
+    return [model._fdm[jsbsim_trim.thrust_property(engine)] for engine in range(engine_count(model._fdm))]
 
 
 @pytest.mark.parametrize(
@@ -243,7 +244,7 @@ def test_condition_without_trim_refused_in_one_sentence(condition: tuple[str, fl
 def test_property_that_does_not_exist_refused_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     cessna()  # caches the trim found with the real table
     wrong = dict(INPUTS) | {"rudder": Command("fcs/ruder-cmd-norm", None, -1.0, 1.0, False, "nose left")}
-    monkeypatch.setattr(jsbsim_trim, "INPUTS", wrong)
+    monkeypatch.setattr(jsbsim_aircraft, "INPUTS", wrong)
     with pytest.raises(FlightEnded, match=r"^jsbsim:c172p cannot be flown: it has no property fcs/ruder-cmd-norm$"):
         cessna()
 

@@ -53,6 +53,79 @@ def electric(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_model(tmp_path_factory.mktemp("my planes"), "electric147kW")
 
 
+@pytest.fixture
+def external(tmp_path: Path) -> Path:
+    """A c172p whose flight control reads the elevator in rad, half of the opposite, and ailerons by two properties."""
+    declared = "".join(f'<property value="0.0">fcs/cmd{name}</property>' for name in ("Elev_ext_rad", "AilL", "AilR"))
+    text = CESSNA.replace('<flight_control name="FCS: c172">', f'<flight_control name="FCS: c172">{declared}', 1)
+    half = (
+        "<channel name='External'>"
+        + "".join(
+            f'<fcs_function name="{name}"><function>{term}</function><output>{name}</output></fcs_function>'
+            for name, term in {
+                "own/elevator": "<product><v>-2.0</v><p>fcs/cmdElev_ext_rad</p></product>",
+                "own/aileron": "<difference><p>fcs/cmdAilR</p><p>fcs/cmdAilL</p></difference>",
+            }.items()
+        )
+        + "</channel>"
+    )
+    text = text.replace('<channel name="Pitch">', f'{half}<channel name="Pitch">', 1)
+    text = text.replace("<input>fcs/elevator-cmd-norm</input>", "<input>own/elevator</input>")
+    text = text.replace("<input>fcs/aileron-cmd-norm</input>", "<input>own/aileron</input>")
+    text = text.replace("<input>fcs/pitch-trim-cmd-norm</input>", "").replace("<input>fcs/roll-trim-cmd-norm</input>", "")
+    path = tmp_path / "own.xml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_command_without_effect_is_named_with_what_the_model_reads(external: Path) -> None:
+    with pytest.raises(FlightEnded) as ended:
+        trim_solution(FlightCondition(str(external), 46.3, 1219.2, STEP_NS))
+    sentence = str(ended.value)
+    assert "cannot be flown: elevator: fcs/elevator-cmd-norm, aileron: fcs/aileron-cmd-norm moves no acceleration" in sentence
+    assert "its flight control reads fcs/cmdAilL, fcs/cmdAilR, fcs/cmdElev_ext_rad: name them in `commands`" in sentence
+    assert "rudder" not in sentence
+    assert "throttle" not in sentence
+
+
+def test_aircraft_flies_by_the_properties_that_the_user_names(external: Path) -> None:
+    """The same command as that of the c172p: -2 rad^-1 x -0.5 rad, and half of the aileron to each side."""
+    commands = {"elevator": "fcs/cmdElev_ext_rad=-0.5", "aileron": "fcs/cmdAilR=0.5 fcs/cmdAilL=-0.5"}
+    named = aircraft_parameters(**SECTION, airframe=f"{PREFIX}{external}", commands=commands).flight_condition()
+    flights = []
+    for condition in (named, FlightCondition("c172p", 46.3, 1219.2, STEP_NS)):
+        none = np.zeros(len(AXES))
+        model = JsbsimModel(condition, Actuators(), WindModel(Gusts(none, none, none + 1.0), None))
+        for k in range(100):
+            model.advance(k * STEP_NS, np.array([0.02, 0.0, 0.05, 0.0]), STEP_NS)
+        flights.append((model.trim.commands, model.y()))
+    for own, expected in zip(*flights, strict=True):
+        assert own == pytest.approx(expected, abs=0.01)
+    assert abs(flights[0][1][0]) > 0.01  # q has moved
+    assert flights[0][1][2] > 0.03  # p, to the right
+
+
+@pytest.mark.parametrize(
+    ("commands", "sentence"),
+    [
+        ({"flaps": "fcs/flap"}, "commands: found 'flaps', expected an input: elevator"),
+        ({"elevator": "simulation/write-state-file"}, "commands.elevator: found 'simulation/write-state-file', expected"),
+        ({"elevator": "fcs/a=0"}, "commands.elevator: found 'fcs/a=0', expected PROPERTY=VALUE"),
+        ({"elevator": "fcs/a=x"}, "commands.elevator: found 'fcs/a=x', expected PROPERTY=VALUE"),
+        ({"elevator": " "}, "commands.elevator: found ' ', expected a property"),
+    ],
+)
+def test_named_property_that_is_none_is_refused(commands: dict[str, str], sentence: str) -> None:
+    with pytest.raises(ParameterError, match=sentence):
+        aircraft_parameters(**SECTION, airframe=f"{PREFIX}c172p", commands=commands).flight_condition()
+
+
+def test_named_property_that_the_model_lacks_is_refused(external: Path) -> None:
+    condition = FlightCondition(str(external), 46.3, 1219.2, STEP_NS, (("elevator", (("fcs/absent", 1.0),)),))
+    with pytest.raises(FlightEnded, match="it has no property fcs/absent"):
+        trim_solution(condition)
+
+
 def throttle_step(airframe: str) -> FloatArray:
     """V, deviation from trim, m/s, every step of two seconds at 0.1 more throttle."""
     none = np.zeros(len(AXES))

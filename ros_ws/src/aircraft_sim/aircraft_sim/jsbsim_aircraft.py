@@ -7,7 +7,9 @@ STATES alone map between the two, with units and signs.
 """
 
 import difflib
+import math
 import os
+import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -37,6 +39,42 @@ class Command(NamedTuple):
     upper: float
     each_engine: bool
     positive: str  # the effect of a positive value, in models that follow JSBSim's convention
+    named: "NamedProperties" = ()  # by the user, in place of `property` and `trim_property`
+
+
+NamedProperties = tuple[tuple[str, float], ...]
+"""Properties of a model, and the value of each at the command 1."""
+
+
+PROPERTY = re.compile(r"(?!simulation/)[A-Za-z][\w-]*(\[\d+\])?(/[A-Za-z][\w-]*(\[\d+\])?)+")  # outside of JSBSim's settings
+
+
+def named_properties(commands: Mapping[str, str], key: str) -> tuple[tuple[str, NamedProperties], ...]:
+    """The user's own properties by input, of texts such as "fcs/cmdAilR_rad=0.5 fcs/cmdAilL_rad=-0.5".
+
+    The number is the property's value at the command 1, which is the default. Raises ParameterError for an unknown input, for
+    what is no property of an aircraft, and for the value 0.
+    """
+    named = []
+    for name, text in commands.items():
+        require(name in INPUTS, key, repr(name), f"an input: {', '.join(INPUTS)}")
+        paths = []
+        for word in text.split():
+            path, _, number = word.partition("=")
+            at_one = _number(number or "1")
+            fits = PROPERTY.fullmatch(path) is not None and math.isfinite(at_one) and at_one != 0.0
+            require(fits, f"{key}.{name}", repr(word), "PROPERTY=VALUE of the aircraft, as fcs/cmdElev_rad=0.5")
+            paths.append((path, at_one))
+        require(bool(paths), f"{key}.{name}", repr(text), "a property of the aircraft")
+        named.append((name, tuple(paths)))
+    return tuple(named)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 class Quantity(NamedTuple):
@@ -87,11 +125,20 @@ class FlightCondition(NamedTuple):
     speed: float  # true airspeed, m/s
     altitude: float  # above sea level, m
     step_ns: int  # of the integration
+    named: tuple[tuple[str, NamedProperties], ...] = ()  # the user's own properties, by input
 
     @property
     def title(self) -> str:
         """The aircraft's name in messages, with PREFIX."""
         return f"{PREFIX}{self.name}"
+
+    def commands(self) -> dict[str, Command]:
+        """INPUTS, with the user's own properties."""
+        named = dict(self.named)
+        return {
+            name: command._replace(trim_property=None, named=named[name]) if name in named else command
+            for name, command in INPUTS.items()
+        }
 
 
 class Trim(NamedTuple):

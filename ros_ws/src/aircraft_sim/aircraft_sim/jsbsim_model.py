@@ -11,6 +11,7 @@ from aircraft_sim import actuators, jsbsim_trim, pose, turbulence
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.disturbance import AXES, one_minus_cosine
 from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, STATES, FlightCondition, WindModel
+from aircraft_sim.jsbsim_commands import command_paths, engine_count, settle
 from aircraft_sim.params import AircraftConfig
 from aircraft_sim.plant import DIVERGENCE_LIMIT
 from aircraft_sim.vanes import ANGLES
@@ -62,13 +63,11 @@ class JsbsimModel:
     def __init__(self, condition: FlightCondition, actuator_model: Actuators, wind_model: WindModel) -> None:
         self.condition = condition
         self._fdm, self.trim = jsbsim_trim.trimmed_fdm(condition, jsbsim_trim.trim_solution(condition))
-        engines = jsbsim_trim.engine_count(self._fdm)
-        self._commands = []
-        self._trim_commands = []
-        for command in INPUTS.values():
-            nodes = [self._node(path) for path in jsbsim_trim.command_paths(command, engines)]
-            self._commands.append(nodes)
-            self._trim_commands.append([node.get_double_value() for node in nodes])
+        engines = engine_count(self._fdm)
+        self._commands = [  # of an input: the nodes, their values in trim and at the command 1
+            [(node := self._node(path), node.get_double_value(), at_one) for path, at_one in command_paths(command, engines)]
+            for command in condition.commands().values()
+        ]
         self._wind_nodes = [self._node(path) for path in jsbsim_trim.WIND]
         self._state_nodes = [(self._node(quantity.property), quantity.si) for quantity in STATES.values()]
         self._heading, self._height, self._contact = (
@@ -86,7 +85,7 @@ class JsbsimModel:
         self._z = None if wind_model.turbulence is None else turbulence.initial_state(wind_model.turbulence)
         self._position = np.zeros(len(INPUTS))
         self._apply_wind(self._wind(0))
-        jsbsim_trim.settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
+        settle(self._fdm, seconds(condition.step_ns))  # one step: the wind of t = 0 acts from t = 0 on
         self._x = self._deviations()
         self._pose_nodes = [(self._node(path), si) for path, si in POSE]
         self._position_ground = np.zeros(2)  # to the north and the east of the start
@@ -115,9 +114,9 @@ class JsbsimModel:
             position = actuators.step(self._position, u, dt, actuators.in_force(t, self._position, model))
             self._position = actuators.apply_faults(t, self._position, position, model)
             deviations = actuators.effect(t, self._position, model).tolist()
-            for nodes, values, deviation in zip(self._commands, self._trim_commands, deviations, strict=True):
-                for node, value in zip(nodes, values, strict=True):
-                    node.set_double_value(value + deviation)
+            for nodes, deviation in zip(self._commands, deviations, strict=True):
+                for node, value, at_one in nodes:
+                    node.set_double_value(value + at_one * deviation)
             self._cut_engines(model.lost_at is not None and bool(t >= model.lost_at[THROTTLE]))
             if filters is not None:
                 self._z = turbulence.step(self._z, normals[k], filters)

@@ -5,7 +5,6 @@
 import os
 import re
 import tempfile
-from collections.abc import Mapping
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -17,11 +16,22 @@ from aircraft_sim.jsbsim_aircraft import (
     INPUTS,
     RESIDUALS,
     STATES,
-    Command,
     FlightCondition,
+    NamedProperties,
     Trim,
     foreign_model,
     root,
+)
+from aircraft_sim.jsbsim_commands import (
+    FROZEN,
+    command_paths,
+    commands_and_limits,
+    engine_count,
+    residuals,
+    sentence_without_effect,
+    set_command,
+    settle,
+    without_effect,
 )
 from aircraft_sim.jsbsim_files import model_files
 from flight_core import isolated
@@ -38,15 +48,6 @@ CONTACT = "forces/fbz-gear-lbs"
 FUEL = "propulsion/total-fuel-lbs"
 
 WIND = ("atmosphere/wind-north-fps", "atmosphere/wind-east-fps", "atmosphere/wind-down-fps")
-
-FROZEN: Mapping[str, float] = {
-    "simulation/integrator/rate/rotational": 0.0,  # the integration scheme: none
-    "simulation/integrator/rate/translational": 0.0,
-    "simulation/integrator/position/rotational": 0.0,
-    "simulation/integrator/position/translational": 0.0,
-    "propulsion/fuel_freeze": 1.0,
-}
-"""Properties that freeze position, velocity, attitude and fuel. Engines and flight control systems still run."""
 
 MIXTURE = 0.9  # of piston engines: rich
 BOTH_MAGNETOS = 3.0  # ignition of piston engines: 0 off, 1 left, 2 right
@@ -120,15 +121,18 @@ def trim_solution(condition: FlightCondition) -> TrimSolution:
     return None if unknowns is None else tuple(unknowns)
 
 
-def solve_and_probe(name: str, speed: float, altitude: float, step_ns: int) -> TrimSolution:
+def solve_and_probe(
+    name: str, speed: float, altitude: float, step_ns: int, named: tuple[tuple[str, NamedProperties], ...] = ()
+) -> TrimSolution:
     """Find and apply the trim, and fly with one command after the next moved by PROBE_SIZE. Raises FlightEnded."""
-    condition = FlightCondition(name, speed, altitude, step_ns)
+    condition = FlightCondition(name, speed, altitude, step_ns, named)
     solution = _solve_trim(condition)
     fdm, _ = trimmed_fdm(condition, solution)
     try:
-        for command in INPUTS.values():
-            for path in command_paths(command, engine_count(fdm)):
-                fdm[path] += PROBE_SIZE if fdm[path] < command.upper - PROBE_SIZE else -PROBE_SIZE
+        for command in condition.commands().values():
+            for path, at_one in command_paths(command, engine_count(fdm)):
+                size = PROBE_SIZE if fdm[path] / at_one < command.upper - PROBE_SIZE else -PROBE_SIZE
+                fdm[path] += at_one * size
             for _ in range(nanoseconds(PROBE_TIME) // step_ns // len(INPUTS)):
                 fdm.run()
     except jsbsim.BaseError as error:
@@ -140,14 +144,14 @@ def trimmed_fdm(condition: FlightCondition, solution: TrimSolution) -> tuple[jsb
     """The aircraft in the trim of a solution. Raises FlightEnded where the aircraft cannot be loaded."""
     fdm = _load(condition)
     if solution is None:
-        _jsbsim_trim(fdm)
+        _jsbsim_trim(fdm, condition)
     else:
         *unknowns, spin_up, by_elevator = solution
-        _start_engines(fdm)
-        _set_unknowns(fdm, np.array(unknowns), by_elevator)
+        _start_engines(fdm, condition)
+        _set_unknowns(fdm, condition, np.array(unknowns), by_elevator)
         settle(fdm, spin_up)
     states = np.array([fdm[quantity.property] * quantity.si for quantity in STATES.values()])
-    return fdm, Trim(*_commands_and_limits(fdm), states, _residuals(fdm))
+    return fdm, Trim(*commands_and_limits(fdm, condition.commands().values()), states, residuals(fdm))
 
 
 def sideslip_zero(condition: FlightCondition) -> float:
@@ -168,30 +172,15 @@ def sideslip_zero(condition: FlightCondition) -> float:
             if name == "beta":
                 fdm[WIND[1]] -= sign * step * condition.speed / FOOT  # wind from the right
             else:
-                fdm[INPUTS[name].property] += sign * step
+                for path, at_one in command_paths(condition.commands()[name], 1):
+                    fdm[path] += at_one * (sign * step)
             settle(fdm, 0.5)  # long enough for flight control systems, too short for engines
-            ends.append(_residuals(fdm)[[1, 3, 5]])
+            ends.append(residuals(fdm)[[1, 3, 5]])
         return np.asarray((ends[0] - ends[1]) / (2.0 * step))
 
     beta = derivative("beta", 0.01)
     u = np.column_stack([derivative(name, 0.05) for name in ("aileron", "rudder")])
     return float(beta[0] - u[0] @ np.linalg.solve(u[1:], beta[1:])) / condition.speed
-
-
-def settle(fdm: jsbsim.FGFDMExec, duration: float) -> None:
-    """Run the aircraft with position, velocity, attitude and fuel frozen, for `duration` s."""
-    before = {path: fdm[path] for path in FROZEN}
-    for path, value in FROZEN.items():
-        fdm[path] = value
-    for _ in range(round(duration / fdm.get_delta_t())):
-        fdm.run()
-    for path, value in before.items():
-        fdm[path] = value
-
-
-def engine_count(fdm: jsbsim.FGFDMExec) -> int:
-    """Number of engines."""
-    return int(fdm.get_propulsion().get_num_engines())
 
 
 def structure_contacts(fdm: jsbsim.FGFDMExec) -> list[str]:
@@ -220,11 +209,6 @@ def cut_engines(fdm: jsbsim.FGFDMExec, cut: bool) -> None:
     fdm["propulsion/magneto_cmd"] = 0.0 if cut else BOTH_MAGNETOS
 
 
-def command_paths(command: Command, engines: int) -> list[str]:
-    """The properties of a command, a property per engine for a command of the engines."""
-    return [f"{command.property}[{i}]" for i in range(engines)] if command.each_engine else [command.property]
-
-
 def error_text(error: jsbsim.BaseError) -> str:
     """JSBSim's message on a line. Most often a property of a flight simulator around JSBSim is missing."""
     text = " ".join(str(error).split())
@@ -242,26 +226,38 @@ def _solve_trim(condition: FlightCondition) -> TrimSolution:
     """
     fdm = _load(condition)
     try:
-        if _jsbsim_trim(fdm):
+        if not condition.named and _jsbsim_trim(fdm, condition):
             return None
+        _require_effect(condition)
         nearest = np.inf
         residual = np.inf
         problem = ""
         for settling, spin_up, by_elevator in ATTEMPTS:
             if spin_up == SLOW_SPIN_UP and residual > NEAR:
                 continue
-            solution = (*_solve_accelerations(fdm, settling, by_elevator), spin_up, by_elevator)
+            solution = (*_solve_accelerations(fdm, condition, settling, by_elevator), spin_up, by_elevator)
             attempt, _ = trimmed_fdm(condition, solution)
-            if _is_trimmed(attempt):
+            if _is_trimmed(attempt, condition):
                 return solution
-            residual = float(np.max(np.abs(_residuals(attempt)) / TOLERANCE))
+            residual = float(np.max(np.abs(residuals(attempt)) / TOLERANCE))
             if residual < nearest or not problem:
                 nearest = residual
-                problem = _trim_failure(attempt)
+                problem = _trim_failure(attempt, condition)
             fdm = _load(condition)  # a solver far from a trim may have left it with numbers that are not finite
     except jsbsim.BaseError as error:
         problem = error_text(error)
     raise FlightEnded(f"{condition.title} does not trim at {condition.speed:g} m/s and {condition.altitude:g} m: {problem}")
+
+
+def _require_effect(condition: FlightCondition) -> None:
+    """Raise FlightEnded for an elevator or a throttle that moves nothing: no trim can be found."""
+    fdm = _load(condition)
+    commands = condition.commands()
+    _start_engines(fdm, condition)
+    still = without_effect(fdm, commands)
+    if {"elevator", "throttle"} & set(still):
+        sentence = sentence_without_effect(fdm, commands, still, foreign_model(condition.name))
+        raise FlightEnded(f"{condition.title} cannot be flown: {sentence}")
 
 
 def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
@@ -277,7 +273,7 @@ def _load(condition: FlightCondition) -> jsbsim.FGFDMExec:
     engines = engine_count(fdm)
     if not engines:
         raise FlightEnded(f"{condition.title} has no engine to control V with: no {INPUTS['throttle'].property}[0]")
-    for path in _properties(engines):  # JSBSim creates a property that it does not have
+    for path in _properties(condition, engines):  # JSBSim creates a property that it does not have
         if not manager.hasNode(path):
             raise FlightEnded(f"{condition.title} cannot be flown: it has no property {path}")
     fdm["ic/h-sl-ft"] = condition.altitude / FOOT
@@ -311,10 +307,11 @@ def _loaded(foreign: Path | None, name: str, folder: Path) -> jsbsim.FGFDMExec:
     return fdm
 
 
-def _properties(engines: int) -> list[str]:
+def _properties(condition: FlightCondition, engines: int) -> list[str]:
     """Every property for reading or writing in flight."""
-    commands = chain.from_iterable(command_paths(command, engines) for command in INPUTS.values())
-    trims = [command.trim_property for command in INPUTS.values() if command.trim_property is not None]
+    inputs = condition.commands().values()
+    commands = [path for path, _ in chain.from_iterable(command_paths(command, engines) for command in inputs)]
+    trims = [command.trim_property for command in inputs if command.trim_property is not None]
     states = [quantity.property for quantity in STATES.values()]
     residuals = [f"accelerations/{name}" for name in RESIDUALS]
     running = map(running_property, range(engines))
@@ -322,7 +319,7 @@ def _properties(engines: int) -> list[str]:
     return [*commands, *trims, *states, *WIND, HEADING, HEIGHT, CONTACT, *residuals, *running, *thrusts, *FROZEN]
 
 
-def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
+def _jsbsim_trim(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
     """Apply JSBSim's own trim; whether the trim succeeds and lasts."""
     fdm.run_ic()
     fdm["propulsion/set-running"] = -1  # all engines
@@ -331,19 +328,21 @@ def _jsbsim_trim(fdm: jsbsim.FGFDMExec) -> bool:
     except jsbsim.TrimFailureError:
         return False
     settle(fdm, SETTLE)
-    return _is_trimmed(fdm)
+    return _is_trimmed(fdm, condition)
 
 
-def _solve_accelerations(fdm: jsbsim.FGFDMExec, settling: float, by_elevator: float) -> tuple[float, ...]:
+def _solve_accelerations(
+    fdm: jsbsim.FGFDMExec, condition: FlightCondition, settling: float, by_elevator: float
+) -> tuple[float, ...]:
     """The solver's root of the accelerations after `settling` s of frozen flight: unknowns x = START + (scaled - 1) SCALE."""
     from scipy.optimize import fsolve, least_squares  # noqa: PLC0415 - a sixth of a second, which other aircraft do not need
 
     def accelerations(scaled: FloatArray) -> FloatArray:
-        _set_unknowns(fdm, scaled, by_elevator)
+        _set_unknowns(fdm, condition, scaled, by_elevator)
         settle(fdm, settling)
-        return _residuals(fdm)
+        return residuals(fdm)
 
-    _start_engines(fdm)
+    _start_engines(fdm, condition)
     if by_elevator:  # inside the stops, also where an input has no effect: a flying wing has no rudder
 
         def weighted(scaled: FloatArray) -> FloatArray:
@@ -358,58 +357,48 @@ def _solve_accelerations(fdm: jsbsim.FGFDMExec, settling: float, by_elevator: fl
     return tuple(scaled.tolist())
 
 
-def _start_engines(fdm: jsbsim.FGFDMExec) -> None:
-    _set_unknowns(fdm, np.ones(len(START)))
+def _start_engines(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> None:
+    _set_unknowns(fdm, condition, np.ones(len(START)))
     fdm["propulsion/set-running"] = -1  # all engines
     settle(fdm, SPIN_UP)
 
 
-def _set_unknowns(fdm: jsbsim.FGFDMExec, scaled: FloatArray, by_elevator: float = 0.0) -> None:
+def _set_unknowns(fdm: jsbsim.FGFDMExec, condition: FlightCondition, scaled: FloatArray, by_elevator: float = 0.0) -> None:
     alpha, throttle, pitch_trim, aileron, rudder, bank = (START + (scaled - 1.0) * SCALE).tolist()
     fdm["ic/alpha-rad"] = alpha
     fdm["ic/gamma-deg"] = 0.0
     fdm["ic/phi-rad"] = bank
     fdm["ic/beta-rad"] = 0.0  # a change of alpha in a bank leaves some
     fdm.run_ic()
-    for i in range(engine_count(fdm)):
-        fdm[f"fcs/throttle-cmd-norm[{i}]"] = throttle
-    fdm["fcs/pitch-trim-cmd-norm"] = (1.0 - by_elevator) * pitch_trim
-    fdm["fcs/elevator-cmd-norm"] = by_elevator * pitch_trim
-    fdm["fcs/aileron-cmd-norm"] = aileron
-    fdm["fcs/rudder-cmd-norm"] = rudder
+    commands = condition.commands()
+    set_command(fdm, commands["throttle"], throttle)
+    trim = commands["elevator"].trim_property
+    by_elevator = 1.0 if trim is None else by_elevator
+    if trim is not None:
+        fdm[trim] = (1.0 - by_elevator) * pitch_trim
+    set_command(fdm, commands["elevator"], by_elevator * pitch_trim)
+    set_command(fdm, commands["aileron"], aileron)
+    set_command(fdm, commands["rudder"], rudder)
 
 
-def _residuals(fdm: jsbsim.FGFDMExec) -> FloatArray:
-    return np.array([fdm[f"accelerations/{name}"] * si for name, si in RESIDUALS.items()])
-
-
-def _is_trimmed(fdm: jsbsim.FGFDMExec) -> bool:
+def _is_trimmed(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> bool:
     """Whether the accelerations are within TOLERANCE and every command is inside the stops."""
-    _, lower, upper = _commands_and_limits(fdm)
+    _, lower, upper = commands_and_limits(fdm, condition.commands().values())
     inside = bool(np.all(lower <= 0.0) and np.all(upper >= 0.0))
-    return inside and bool(np.all(np.abs(_residuals(fdm)) <= TOLERANCE))
+    return inside and bool(np.all(np.abs(residuals(fdm)) <= TOLERANCE))
 
 
-def _trim_failure(fdm: jsbsim.FGFDMExec) -> str:
+def _trim_failure(fdm: jsbsim.FGFDMExec, condition: FlightCondition) -> str:
     """Why the solver's result is no trim, as a sentence."""
     engines = range(engine_count(fdm))
-    throttle = INPUTS["throttle"].property
-    idle = [fdm[f"{throttle}[{i}]"] < IDLE for i in engines]
+    paths = command_paths(condition.commands()["throttle"], len(engines))
+    idle = [fdm[path] < IDLE * at_one for path, at_one in paths]
+    idle += idle[-1:] * (len(engines) - len(idle))  # a property of several engines
     stopped = [str(i + 1) for i in engines if not (fdm[running_property(i)] or idle[i]) and fdm[thrust_property(i)] <= 0.0]
     if stopped:
         return f"engine {', '.join(stopped)} cannot be started"
-    linear, angular = np.abs(_residuals(fdm)).reshape(2, 3).max(axis=1)
-    _, lower, upper = _commands_and_limits(fdm)
+    linear, angular = np.abs(residuals(fdm)).reshape(2, 3).max(axis=1)
+    _, lower, upper = commands_and_limits(fdm, condition.commands().values())
     stopped_inputs = [name for name, low, high in zip(INPUTS, lower, upper, strict=True) if not low <= 0.0 <= high]
     at_stops = f", with {' and '.join(stopped_inputs)} beyond the stops" if stopped_inputs else ""
     return f"accelerations of {linear:.2g} m/s^2 and {angular:.2g} rad/s^2 are left at best{at_stops}"
-
-
-def _commands_and_limits(fdm: jsbsim.FGFDMExec) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whole commands, the trim's part included, and the distances to the lower and upper stops, shapes (4,)."""
-    inputs = INPUTS.values()
-    commands = np.array([fdm[command_paths(command, 1)[0]] for command in inputs])
-    trim = np.array([0.0 if command.trim_property is None else fdm[command.trim_property] for command in inputs])
-    lower = np.array([command.lower for command in inputs])
-    upper = np.array([command.upper for command in inputs])
-    return commands + trim, lower - np.minimum(commands, commands + trim), upper - np.maximum(commands, commands + trim)

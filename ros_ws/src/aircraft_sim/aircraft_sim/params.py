@@ -15,7 +15,15 @@ from aircraft_sim.airframe import Airframe, Unit, load_airframe
 from aircraft_sim.airspeed import over_airspeed
 from aircraft_sim.disturbance import AXES, Bias, Gusts, Sines
 from aircraft_sim.dynamics import Aircraft, Coupling, EulerKinematics
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, FlightCondition, WindModel, require_aircraft
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    OUTPUTS,
+    PREFIX,
+    FlightCondition,
+    WindModel,
+    named_properties,
+    require_aircraft,
+)
 from aircraft_sim.plant import Drift, PlantParams
 from aircraft_sim.pose import every
 from aircraft_sim.sensors import Sensors
@@ -232,6 +240,9 @@ class AircraftConfig(NodeConfig):
     airframe: str = Field(description="a name of the library, the path of a file, jsbsim:NAME or jsbsim:PATH")
     speed: Positive | None = Field(default=None, description="of JSBSim: true airspeed of the trim, m/s")
     altitude: NonNegative | None = Field(default=None, description="of JSBSim: altitude of the trim above sea level, m")
+    commands: dict[str, str] = Field(
+        default={}, description="of JSBSim: by input, the model's own properties, each with its value at the command 1"
+    )
     rate: Annotated[float, Field(ge=1, le=1000)] = Field(description="the rate of y and u, Hz")
     step: Annotated[float, Field(gt=0, ge=SHORTEST_STEP, le=1)] = Field(
         description="the integration step, s; a whole fraction of 1 / rate"
@@ -318,6 +329,7 @@ class AircraftConfig(NodeConfig):
         for key in ("speed", "altitude"):
             value = getattr(self, key)
             require(value is None, key, value, f"none: the airframe {self.airframe} has a fixed trim")
+        require(not self.commands, "commands", "a value", f"none: {self.airframe} is no aircraft of JSBSim")
         airframe = load_airframe(self.airframe)
         for name in self.gusts:
             airframe.gust_direction(name)
@@ -462,7 +474,8 @@ class AircraftConfig(NodeConfig):
         """The aircraft of JSBSim and the flight condition. Raises ParameterError for a linear aircraft."""
         if self.speed is None or self.altitude is None:
             raise ParameterError(f"airframe: found {self.airframe!r}, expected {PREFIX}NAME with a speed and an altitude")
-        return FlightCondition(require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns)
+        named = named_properties(self.commands, "commands")
+        return FlightCondition(require_aircraft(self.airframe), self.speed, self.altitude, self.step_ns, named)
 
     def wind_model(self) -> WindModel:
         """The wind of an aircraft of JSBSim, on every axis."""

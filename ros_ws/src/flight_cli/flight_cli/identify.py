@@ -15,7 +15,16 @@ import typer
 from rich.console import Console
 
 from aircraft_sim.airframe import Airframe, load_airframe
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, PREFIX, RESIDUALS, STATES, require_aircraft
+from aircraft_sim.jsbsim_aircraft import (
+    INPUTS,
+    OUTPUTS,
+    PREFIX,
+    RESIDUALS,
+    STATES,
+    NamedProperties,
+    named_properties,
+    require_aircraft,
+)
 from flight_analysis.closed_loop.replay import recorded_parameters, recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
@@ -112,6 +121,14 @@ def identify(
     accept: Annotated[
         bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
     ] = False,
+    commands: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--command",
+            metavar="INPUT:PROPERTY=VALUE",
+            help="Without --log: a model's own property for an input, and its value at full command; repeat for more.",
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
@@ -133,7 +150,7 @@ def identify(
             "--margin": margin,
         }
         unused |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
-        unused |= {"--guidance": guidance or None, "--learn": learn or None}
+        unused |= {"--guidance": guidance or None, "--learn": learn or None, "--command": ", ".join(commands or []) or None}
         for name, value in (unused | {"--namespace": namespace}).items():
             require(value is None, name, f"{value}", "none beside --bridge")
         if write is None:
@@ -153,6 +170,7 @@ def identify(
         "--learn": learn or None,
         "--phase-margin": phase_margin,
         "--accept": accept or None,
+        "--command": ", ".join(commands or []) or None,
     }
     log_options = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
     log_options |= {"--refly": refly or None}
@@ -169,7 +187,11 @@ def identify(
         raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
     else:
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
-        flown = _Flown(observer_margin, guidance, learn)
+        texts: dict[str, str] = {}
+        for text in commands or []:
+            name, _, paths = text.partition(":")
+            texts[name] = f"{texts.get(name, '')} {paths}".strip()
+        flown = _Flown(observer_margin, guidance, learn, named_properties(texts, "--command"))
         _identify_by_steps(aircraft, speed, altitude, output, flown, as_json, needed, accept)
 
 
@@ -179,6 +201,7 @@ class _Flown(NamedTuple):
     observer_margin: float | None  # s; None without an observer
     guided: bool
     learns: bool
+    named: tuple[tuple[str, NamedProperties], ...]  # properties of the model by input
 
 
 def _identify_by_steps(
@@ -211,6 +234,7 @@ def _identify_by_steps(
                 guided=flown.guided,
                 learns=flown.learns,
                 needed=needed,
+                named=flown.named,
             )
     except FlightEnded as error:
         print(f"error: {error}", file=sys.stderr)

@@ -18,7 +18,7 @@ import numpy as np
 from aircraft_sim.actuators import Actuators
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.disturbance import AXES, Gusts
-from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, Trim, WindModel
+from aircraft_sim.jsbsim_aircraft import INPUTS, OUTPUTS, FlightCondition, NamedProperties, Trim, WindModel
 from aircraft_sim.jsbsim_model import JsbsimModel
 from aircraft_sim.jsbsim_trim import sideslip_zero, trim_solution
 from aircraft_sim.turbulence import HIGH, LOW, LOWEST, MODERATE_SIGMA, MODERATE_WIND
@@ -284,6 +284,7 @@ def identify(
     guided: bool = False,
     learns: bool = False,
     needed: Requirement = REQUIREMENT,
+    named: tuple[tuple[str, NamedProperties], ...] = (),
 ) -> IdentifiedAircraft:
     """Identify an aircraft of JSBSim in a flight condition and select its gains; speed in m/s, altitude in m.
 
@@ -301,7 +302,7 @@ def identify(
     Raises FlightEnded if the aircraft does not trim or does not respond, ParameterError if its outputs and inputs cannot be
     paired, or if the speed is below guidance's speed floor.
     """
-    condition = FlightCondition(name, speed, altitude, nanoseconds(STEP))
+    condition = FlightCondition(name, speed, altitude, nanoseconds(STEP), named)
     progress("trim")
     trim = _vehicle(condition).trim
     stall = slowest_trim(condition) if guided else None
@@ -508,6 +509,9 @@ SCENARIO_YAML = gain_selection.yaml_template("""\
     airframe: {{ condition.title | flow }}
     speed: {{ condition.speed | flow }}  # m/s, true airspeed in trim
     altitude: {{ condition.altitude | flow }}  # m, above sea level
+{% if named %}
+    commands: {{ named | flow }}  # the model's own properties, with their values at the command 1
+{% endif %}
     rate: {{ rate | flow }}                # Hz, y and truth
     step: {{ step | flow }}                # s, of JSBSim
 {% if learns %}
@@ -571,6 +575,7 @@ def _text(
     """The scenario file. `stall`: V_s, m/s; guided where it is not None."""
     return SCENARIO_YAML.render(
         condition=condition,
+        named={name: " ".join(f"{path}={at_one!r}" for path, at_one in paths) for name, paths in condition.named},
         trim=trim,
         inputs=list(INPUTS),
         outputs=list(OUTPUTS),
