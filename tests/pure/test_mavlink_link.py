@@ -3,6 +3,7 @@
 """The MAVLink link over UDP, against a peer that is made with pymavlink alone."""
 
 import hashlib
+import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -461,6 +462,22 @@ def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(e
     unsigned.start()
     until(lambda: unsigned.conflict, ends.peer(port, phrase="a phrase").beat)
     assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+
+
+def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphrase(ends: Ends, tmp_path: Path) -> None:
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    peer = ends.peer(port, phrase="a phrase")
+    until(lambda: queue, peer.beat)
+    signing = peer.connection.mav.signing
+    signing.timestamp -= 600 * 100_000  # of 10 us each
+    until(lambda: made._refused, peer.beat)
+    assert re.match(r"messages with the right passphrase come, signed (59|60)\d s before the last ones", made._refused)
+    assert "the autopilot has started again without the time" in made._refused
+    ends.peer(port, phrase="another").beat()
+    until(lambda: "the passphrase differs" in made._refused, ends.peer(port, phrase="another").beat)
 
 
 def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(

@@ -267,6 +267,15 @@ class Link:
         parser.signing = signing
         return parser
 
+    def _signature_fault(self, packet: bytes) -> str:
+        """Why the signature of a packet was refused: 6 bytes of a time, 10 us each, and 6 of a hash (MAVLink guide)."""
+        signing = self._connection.mav.signing
+        if hashlib.sha256(signing.secret_key + packet[:-6]).digest()[:6] != packet[-6:]:
+            return "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
+        behind = 1e-5 * (signing.timestamp - int.from_bytes(packet[-12:-6], "little"))
+        restart = "the autopilot has started again without the time, which a GPS or a ground station gives"
+        return f"messages with the right passphrase come, signed {behind:.0f} s before the last ones: {restart}"
+
     def _take(self, message: Any, address: Address, received_ns: int) -> None:
         name = message.get_type()
         now = time.monotonic()
@@ -283,7 +292,7 @@ class Link:
             self.stations.add(system)
             self._station_heard = now if system == self._config.source_system else self._station_heard
         if name == "BAD_DATA" and "signature" in str(message.reason):
-            self._refused = "messages without a valid signature come: the passphrase differs, or the autopilot does not sign"
+            self._refused = self._signature_fault(bytes(message.data))
         if (message.get_srcSystem(), message.get_srcComponent()) != (self._config.system, AUTOPILOT) or name == "BAD_DATA":
             return
         if not self._admits(message, address, now):
