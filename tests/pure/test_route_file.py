@@ -5,6 +5,7 @@
 import io
 import json
 import math
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import pytest
 from pymap3d.vincenty import vdist
 
 from flight_core.parameters import ParameterError
+from flight_guidance import route_formats
 from flight_guidance.route_file import (
     MAX_DISTANCE,
     SEMI_MAJOR,
@@ -309,6 +311,46 @@ def test_waypoints_at_one_place_are_one(tmp_path: Path) -> None:
     path.write_text("route:\n- {north: 0, east: 0, altitude: 0, turns: -1}\n", encoding="utf-8")
     with pytest.raises(ParameterError, match=r"route\[0\].turns: found -1, expected at least 0"):
         read_route(path)
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        (179, "not flown: DO_SET_HOME (item 2)"),
+        (179, "heights above the home stay above the first home, and not above that of DO_SET_HOME"),
+        (601, "DO_JUMP_TAG repeats items, which are flown once here"),
+        (30, "not flown: NAV_CONTINUE_AND_CHANGE_ALT (30) (item 2)"),
+        (42702, "not flown: NAV_SCRIPT_TIME (42702) (item 2)"),
+        (65000, "not flown: MAV_CMD 65000 (item 2)"),
+    ],
+)
+def test_command_that_is_not_flown_is_named(command: int, sentence: str) -> None:
+    items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0) for k in range(3)]
+    items[1] |= {"command": command}
+    assert sentence in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+
+
+def test_command_has_its_number_where_pymavlink_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pymavlink.dialects.v20", None)
+    items = [mission_item(47.4 + 0.01 * k, 8.52, 50.0) for k in range(3)]
+    items[1] |= {"command": 42702}
+    assert "not flown: MAV_CMD 42702 (item 2)" in route_formats.read(json.dumps(plan(items)).encode(), "r.plan", ".plan").notes
+
+
+def test_numbers_with_decimal_commas_are_named(tmp_path: Path) -> None:
+    text = wpl((3, 16, 47.41, 8.5, 50.0), (3, 16, 47.42, 8.5, 50.0)).replace("47.41", "47,41")
+    with pytest.raises(ParameterError, match=r"line 3: found .*, expected 12 numbers, .* with a point and no comma: 47,41$"):
+        route_formats.read(text.encode(), "r.waypoints", ".waypoints")
+
+
+@pytest.mark.parametrize("place", ["fence", "top"])
+def test_fence_of_version_1_is_named(place: str) -> None:
+    first = {"polygon": [[47.39, 8.49], [47.42, 8.49], [47.42, 8.53]], "breachReturn": [47.4, 8.5]}
+    tree = plan([mission_item(47.41, 8.52, 50.0)], **({"geoFence": first} if place == "fence" else first))
+    content = json.dumps(tree).encode()
+    assert any("not read: the fence of version 1" in note for note in route_formats.read(content, "r.plan", ".plan").notes)
+    with pytest.raises(ParameterError, match=r"found the fence of version 1 .*, expected one of version 2"):
+        route_formats.read_fence(content, "r.plan", ".plan")
 
 
 CENTRE = {"center": [47.41, 8.51], "radius": 200.0}

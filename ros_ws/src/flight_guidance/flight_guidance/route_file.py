@@ -19,7 +19,9 @@ from flight_core.files import parse_yaml, read_file
 from flight_core.parameters import ParameterError, require
 from flight_guidance import route_formats
 from flight_guidance.path import Point
-from flight_guidance.route_formats import FORMATS, Above, Home, Place
+from flight_guidance.route_formats import FORMATS
+from flight_guidance.route_json import read_lines
+from flight_guidance.route_places import Above, Home, Place
 
 SEMI_MAJOR = 6378137.0
 FLATTENING = 1.0 / 298.257223563
@@ -249,7 +251,7 @@ def placed_lines(content: bytes, key: str, origin: Origin) -> list[list[Point]]:
 
     Raises ParameterError for unreadable content, no position, a coordinate system other than WGS84 and a position out of range.
     """
-    lines = [line for line in route_formats.read_lines(content, key) if line]
+    lines = [line for line in read_lines(content, key) if line]
     require(bool(lines), key, "no position", "lines, polygons or points")
     _require_order([*chain.from_iterable(lines)], origin)
     placed: list[list[Point]] = []

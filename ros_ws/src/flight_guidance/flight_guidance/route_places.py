@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Positions of a route file, not validated yet, and the one route of several lines or points."""
+
+from collections import Counter
+from collections.abc import Sequence
+from enum import Enum
+from itertools import chain
+from typing import Any, NamedTuple
+
+from flight_core.fields import short_repr
+from flight_core.parameters import ParameterError, require
+
+A_ROUTE = "a route file"
+
+
+class Above(Enum):
+    """The zero of an altitude."""
+
+    AS_POSE = 0  # as `pose` counts: the number stands
+    SEA = 1
+    HOME = 2
+    GROUND = 3
+
+
+class Place(NamedTuple):
+    """A position of a file, not validated yet."""
+
+    key: str  # "route[0]"
+    latitude: Any  # deg
+    longitude: Any  # deg
+    altitude: Any  # m; None without an altitude
+    speed: Any = None  # m/s
+    above: Above = Above.AS_POSE
+    altitude_text: str = ""  # what the file has in place of an altitude, for a sentence
+    turns: Any = 0.0  # round the place, 1
+    wait: Any = 0.0  # round the place, s
+    climbs: bool = False  # whether the altitude is reached round the place, and not on the way to the place
+
+
+class Home(NamedTuple):
+    """The home of a mission."""
+
+    latitude: float  # deg
+    longitude: float  # deg
+    altitude: float | None  # m above the sea
+
+
+class Places(NamedTuple):
+    """The route of a file."""
+
+    places: list[Place]
+    notes: tuple[str, ...] = ()  # what is not flown
+    home: Home | None = None
+
+
+class Geometry(NamedTuple):
+    """A line or points of a file."""
+
+    kind: str  # by the name in the format
+    places: list[Place]
+    name: str = ""  # by the user
+
+
+def one_route(key: str, geometries: Sequence[Geometry], others: Sequence[str] = (), line: str | None = None) -> Places:
+    """The only line, or that of `line`; the points where there is no line. Raises ParameterError that names what is there."""
+    joined_lines = _joined([geometry for geometry in geometries if geometry.kind not in POINTS])
+    lines = [geometry for geometry in joined_lines if geometry.places]
+    points = [geometry for geometry in geometries if geometry.kind in POINTS]
+    ignored = _counted([point.kind for point in points])
+    if (lines and others) or (lines and line is None and len(lines) > 1):
+        kinds = _counted([*(geometry.kind for geometry in lines), *others])
+        raise ParameterError(f"{key}: found {kinds}, expected one, or {'Points alone' if others else _choice(lines)}")
+    if line is not None:
+        chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
+        mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
+        require(len(chosen) == 1, "--line", mismatch, _choice(lines) if lines else "a file with several lines")
+        if len(lines) > 1:
+            ignored = " and ".join([f"{len(lines) - 1} further lines", *[ignored] * bool(points)])
+        lines = chosen
+    if lines:
+        return Places(lines[0].places, (f"{ignored} beside the {lines[0].kind}: no part of the route",) if ignored else ())
+    has = f", but {_counted(others)}" if others else ""
+    require(bool(points) and not others, key, f"no LineString and no Point{has}", "a route")
+    mixture = f"{_counted([geometry.kind for geometry in joined_lines])} without a position, and {ignored}"
+    require(not joined_lines, key, mixture, "a line, or Points alone")
+    return Places([*chain.from_iterable(point.places for point in points)])
+
+
+def _choice(lines: Sequence[Geometry]) -> str:
+    """What `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
+    names = [f"{k} ({geometry.name})" if geometry.name else f"{k}" for k, geometry in enumerate(lines[:SHOWN], start=1)]
+    return f"--line {', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
+
+
+SHOWN = 5
+"""Lines of a file that a refusal names."""
+
+POINTS = ("Point", "MultiPoint", "wpt")
+GPX = ("rte", "trk", "wpt")  # names of elements, without a plural
+
+
+def _counted(kinds: Sequence[str]) -> str:
+    """Kinds with their numbers: "2 LineStrings and 1 Polygon"."""
+    counts = []
+    for kind, count in Counter(kinds).items():
+        noun, *suffix = kind.split(" ", 1)
+        counts.append(" ".join([f"{count} {noun}{'s' * (count > 1 and noun not in GPX)}", *suffix]))
+    return " and ".join(counts)
+
+
+def _joined(lines: Sequence[Geometry]) -> list[Geometry]:
+    """The lines, with parts that were cut at the antimeridian as one line (RFC 7946, section 3.1.9)."""
+    joined: list[Geometry] = []
+    for line in lines:
+        cut = bool(joined and joined[-1].places and line.places)
+        end, begin = (joined[-1].places[-1], line.places[0]) if cut else (None, None)
+        if end is not None and begin is not None and _meets(end, begin):
+            joined[-1] = joined[-1]._replace(places=[*joined[-1].places[:-1], *line.places[1:]])
+        else:
+            joined.append(line)
+    return joined
+
+
+def _meets(end: Place, begin: Place) -> bool:
+    """Whether both are one position on the antimeridian."""
+    try:
+        return bool(abs(end.longitude) == 180.0 and (end.longitude, end.latitude) == (-begin.longitude, begin.latitude))
+    except TypeError:
+        return False
+
+
+def number_of(text: str | None) -> float | str | None:
+    """The number of a text; any other text as is."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        return text
+
+
+def lon_lat(position: Any, speed: Any = None, above: Above = Above.AS_POSE, altitude_text: str = "") -> Place:
+    """A position of GeoJSON or KML: longitude, latitude and perhaps altitude."""
+    fits = isinstance(position, list) and 2 <= len(position) <= 3
+    require(fits, "route", short_repr(position), "longitude, latitude, altitude")
+    longitude, latitude, *altitude = position
+    return Place(
+        "route", latitude, longitude, altitude[0] if altitude else None, speed, above, altitude_text or short_repr(position)
+    )
