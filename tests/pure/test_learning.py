@@ -27,7 +27,8 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_design.identification.model_identification import Part, Prediction
+from flight_design.identification.model_identification import Part
+from flight_design.identification.model_quality import Prediction
 from flight_design.learning import learner as design_learner
 from flight_design.learning.change_test import Change
 from flight_design.learning.learner import Known, Learner

@@ -25,9 +25,10 @@ from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import FloatArray
-from flight_design.identification import innovation_filters, model_identification
+from flight_design.identification import innovation_filters
 from flight_design.identification.innovation_filters import Actuation, Recording
-from flight_design.identification.model_identification import Identification, identify, whiteness
+from flight_design.identification.model_identification import Identification, identify, model_yaml
+from flight_design.identification.model_quality import correlation, whiteness
 from flight_log.bag import LogAttachments
 from flight_log.tape_writer import write_run
 
@@ -150,7 +151,7 @@ def test_coupled_parts_are_identified_together(tmp_path: Path) -> None:
     for name, value in coupled.items():
         assert abs(entries[name].value - value) < 3.0 * abs(entries[name].unit) * entries[name].deviation, name
     assert found.airframe.matrix_b()[row, elevator] == pytest.approx(coupled["B[p, elevator]"], rel=0.2)
-    assert "#   B[p, elevator]: " in model_identification.model_yaml(found, "a flight")
+    assert "#   B[p, elevator]: " in model_yaml(found, "a flight")
 
 
 def test_lost_samples_are_predicted_over() -> None:
@@ -246,10 +247,10 @@ def test_correlation_is_one_for_independent_noises_and_that_of_what_follows_late
     generator, used = np.random.default_rng(1), np.ones(20_000, dtype=bool)
     before, noise = generator.standard_normal((2, 20_000, 20))
     # the mean of 400 figures with a deviation of 0.32 each
-    assert model_identification.correlation(noise, before, used).mean() == pytest.approx(1.0, abs=0.05)
+    assert correlation(noise, before, used).mean() == pytest.approx(1.0, abs=0.05)
     # n rho^2 with rho = 0.1 at one of 20 lags
     following = np.vstack([np.zeros((7, 20)), 0.1 * before[:-7]]) + np.sqrt(0.99) * noise
-    found = np.diag(model_identification.correlation(following, before, used))
+    found = np.diag(correlation(following, before, used))
     assert found.mean() == pytest.approx(1.0 + 20_000 * 0.01 / 20, rel=0.1)
 
 

@@ -20,7 +20,7 @@ from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.vectors import StampedVector
 from flight_design.gains.gain_design import observed
-from flight_design.identification.model_identification import best_known
+from flight_design.identification.model_quality import best_known
 from flight_design.learning.learner import Learner
 from rise_di_controller.control_law import Measurements
 from rise_di_controller.controller import Controller

@@ -13,7 +13,7 @@ from aircraft_sim.uncertainty import KINEMATIC
 from flight_core.parameters import require
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_design.identification.model_identification import Unknown
+from flight_design.identification.likelihood import Unknown
 from rise_di_controller.params import ControllerConfig
 
 STATES = {

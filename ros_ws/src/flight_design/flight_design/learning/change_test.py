@@ -12,7 +12,9 @@ from aircraft_sim.airframe import Airframe
 from control_laws.nominal_model import NominalModel
 from flight_core.vectors import FloatArray
 from flight_design.identification.innovation_filters import Actuation, Block, Recording, blocks, filter_model
-from flight_design.identification.model_identification import CLOSE, MAX_DEVIATION, PROGRESS, STARTS, STEPS, Search, Unknown
+from flight_design.identification.likelihood import Unknown
+from flight_design.identification.likelihood_search import CLOSE, PROGRESS, STARTS, STEPS, Search
+from flight_design.identification.model_quality import MAX_DEVIATION
 
 RECORD = 10.0  # s, of the flight that is tested
 LOSS = 2.0 * MAX_DEVIATION  # 1, of the effect of an input: up to two deviations of an accepted model are no change

@@ -22,21 +22,9 @@ from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
 from flight_design.gains.gain_selection import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
-from flight_design.identification.model_identification import (
-    HELD_OUT,
-    KNOWN,
-    MAX_DELAY_ERROR,
-    MAX_DEVIATION,
-    MAX_WHITENESS,
-    PRIOR,
-    Identification,
-    Part,
-    Unknown,
-    another_airframe,
-    best_known,
-    identify,
-    with_entries,
-)
+from flight_design.identification.likelihood import HELD_OUT, KNOWN, MAX_DELAY_ERROR, PRIOR, Unknown
+from flight_design.identification.model_identification import Identification, Part, identify, with_entries
+from flight_design.identification.model_quality import MAX_DEVIATION, MAX_WHITENESS, another_airframe, best_known
 from flight_design.learning.change_test import ANGLE, MAX_GAIN, RECORD, Change, change_test
 from rise_di_controller import divergence
 from rise_di_controller.proposals import outputs_without, with_channels_of, without_models

@@ -17,7 +17,7 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Tape
 from flight_design.gains.gain_design import observed
-from flight_design.identification.model_identification import KNOWN
+from flight_design.identification.likelihood import KNOWN
 from flight_design.identification.sketch import ROUGH, sketched
 from flight_design.learning.learner import Learner
 from rise_di_controller.internals import GIVEN_UP
