@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from aircraft_sim.airframe import Airframe
 from aircraft_sim.uncertainty import AIR_RELATIVE, as_yaml, wind_factors
+from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.files import comment
 from flight_core.parameters import require
@@ -84,6 +85,39 @@ class Identification(NamedTuple):
         return "; ".join(part.refusal for part in self.parts if part.refusal)
 
 
+class _Study(NamedTuple):
+    """What the searches of all parts share."""
+
+    recorded: Recording
+    airframe: Airframe
+    delay: float  # s, of u
+    unknown: Unknown
+    validating: NDArray[np.bool_]  # (T,)
+    channels: ChannelPairing
+    at_bound: int
+
+    def search(self, model: NominalModel, block: Block, *, coupled: bool = False) -> Search:
+        """The search of a block."""
+        return Search(self.recorded, model, block, self.airframe, self.delay, self.unknown, coupled=coupled)
+
+    def part(self, search: Search, fit: Fit) -> Part:
+        """The model of a block, with the reason why the model must not be used."""
+        outputs = search.names.outputs
+        entries = search.entries(fit)
+        predictions = prediction(fit.before, self.validating), prediction(fit.after, self.validating)
+        sentences = (
+            another_airframe(entries, self.airframe.name, self.at_bound),
+            too_little_excitation(entries, outputs),
+            other_signs(self.airframe, with_entries(self.airframe, entries), self.channels),
+            no_better(*predictions),
+        )
+        refusal = next(filter(None, sentences), "")
+        delay = self.recorded.period * search.delay(fit)
+        gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
+        delay_deviation = self.unknown.delay * float(fit.deviation[-1])
+        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
+
+
 def identify(
     recorded: Recording,
     airframe: Airframe,
@@ -111,42 +145,24 @@ def identify(
     starts = len(STARTS) + (flown is not None)
     total = len(every) * (starts * START_STEPS + REFINED * STEPS) + (len(every) > 1) * (START_STEPS + STEPS)
     paired = channels or ChannelPairing(airframe.outputs, tuple(airframe.inputs))
-
-    def search_of(block: Block, *, coupled: bool = False) -> Search:
-        return Search(recorded, model, block, airframe, actuation.delay, unknown, coupled=coupled)
+    study = _Study(recorded, airframe, actuation.delay, unknown, validating, paired, at_bound)
 
     def step() -> None:
         progress(completed=next(step_count), total=total)
 
-    def part_of(search: Search, fit: Fit) -> Part:
-        outputs = search.names.outputs
-        entries = search.entries(fit)
-        predictions = prediction(fit.before, validating), prediction(fit.after, validating)
-        sentences = (
-            another_airframe(entries, airframe.name, at_bound),
-            too_little_excitation(entries, outputs),
-            other_signs(airframe, with_entries(airframe, entries), paired),
-            no_better(*predictions),
-        )
-        refusal = next(filter(None, sentences), "")
-        delay = recorded.period * search.delay(fit)
-        gusts = bool(np.mean(LEVELS[fit.levels, 1] > 0.0) >= FEW)
-        delay_deviation = unknown.delay * float(fit.deviation[-1])
-        return Part(search.names.inputs, outputs, tuple(entries), *predictions, refusal, delay, gusts, delay_deviation)
-
     fits = []
-    for search in map(search_of, every):
+    for search in (study.search(model, block) for block in every):
         also = None if flown is None else search.model_errors(flown)
         fits.append((search, search.fit(known & ~validating, step, flown=also)))
-    parts = [part_of(*each) for each in fits]
+    parts = [study.part(*each) for each in fits]
     first = joined([fit.before for _, fit in fits], every)
     last = joined([fit.after for _, fit in fits], every)
     others = [np.delete(recorded.u, block.inputs, axis=1) for block in every]
     follows = [correlation(fit.after.normalised, u, known) for (_, fit), u in zip(fits, others, strict=True)]
     if len(every) > 1 and max(map(np.max, follows)) > FOLLOWS:
-        search = search_of(whole_aircraft(model), coupled=True)
+        search = study.search(model, whole_aircraft(model), coupled=True)
         fit = search.fit(known & ~validating, step, begin=search.joined(fits))
-        part = part_of(search, fit)
+        part = study.part(search, fit)
         gain = part.after.log_likelihood - prediction(last, validating).log_likelihood
         white = part.after.whiteness.max() <= MAX_WHITENESS
         if white and not part.refusal and gain * validating.sum() > COUPLED_GAIN:
