@@ -469,6 +469,12 @@ def test_two_systems_that_flew_are_refused_but_for_the_one_that_the_user_names(f
     assert "--system: found 3, expected one of 7 and 1" in str(imported(path, tmp_path / "bag", "--system", "3").exception)
     assert imported(path, tmp_path / "bag", "--system", "1").exit_code == 0
     assert "found RC2_REVERSED 1" in str(imported(path, tmp_path / "other", "--system", "7").exception)
+    other = dataflash(tmp_path / "flight.bin", flight)
+    assert "--system: found 1, expected none" in str(imported(other, tmp_path / "no", "--system", "1").exception)
+    assert "--instance: found 'IMU', expected" in str(imported(other, tmp_path / "no", "--instance", "IMU").exception)
+    assert "--instance IMU: found 3, expected one of 0" in str(
+        imported(other, tmp_path / "no", "--instance", "IMU=3").exception
+    )
 
 
 def arrivals(path: Path, arrival: Callable[[int], int], *, copies: Callable[[int], int] | None = None) -> Path:

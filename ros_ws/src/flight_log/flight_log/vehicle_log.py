@@ -226,6 +226,8 @@ def read_vehicle_log(path: Path, choice: Choice = ANY) -> VehicleLog:
     read = next((reader for word, reader in READERS.items() if f" {word} " in f"{kind} "), None)
     if read is None:
         raise ParameterError(f"{path}: found {kind}, expected {EXPECTED}")
+    only = "none: the log is of one autopilot"
+    require(choice.system is None or " tlog " in f"{kind} ", "--system", choice.system, only)
     try:
         with _silent():
             log = read(path, kind, choice)
