@@ -2,16 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clock of the stamps of a topic, followed in the order of the recording: steps, damaged stamps, equal stamps."""
 
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flight_core.rates import NANOSECONDS, seconds
-from flight_core.tape import Recording
+from flight_core.tape import Recording, Signal
 
 STEP_NS = NANOSECONDS // 10  # back: late samples are less late
-LEAP_NS = NANOSECONDS // 2  # forth, beside the time of the recording
+LEAP_NS = NANOSECONDS // 4  # forth, beside the time of the recording
 STRAY_NS = NANOSECONDS  # back: fewer messages than CONFIRMED that are so much older have a damaged stamp
 CONFIRMED = 10  # successive messages after a step; fewer are those of a further publisher, or have a damaged stamp
 CONFIRMED_AT_END = 3
@@ -19,7 +22,10 @@ SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of 
 
 
 class StampClock:
-    """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a damaged stamp is left out."""
+    """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a damaged stamp is left out.
+
+    The samples after a step forth stay: `without_leaps` decides on these samples, for it knows all topics.
+    """
 
     def __init__(self) -> None:
         self._found = self._unset = self._repeated = self._left_out = 0
@@ -29,16 +35,24 @@ class StampClock:
         self._offset_ns = -(2**62)  # the largest lead of a stamp over the time of the recording
 
     def usable(
-        self, stamp_ns: NDArray[np.int64], log_ns: NDArray[np.int64], *, more: bool, end: bool = False
+        self,
+        stamp_ns: NDArray[np.int64],
+        log_ns: NDArray[np.int64],
+        steps: NDArray[np.int64] | None = None,
+        *,
+        more: bool,
+        end: bool = False,
     ) -> tuple[NDArray[np.bool_], int]:
         """Mask of the usable messages of the next K messages, shape (K,), and K.
 
         With `more` messages to come at once, K is less than the number of messages where the last messages confirm no step.
-        `end`: the messages are the last messages of the topic.
+        `end`: the messages are the last messages of the topic. `steps`: of the publisher's number before each message, (K,). A
+        number that falls together with both times is of a part of the log that is out of order. A jump forth beside lost
+        messages is a gap.
         """
         unset = (stamp_ns == 0) & ((self._last_ns or 0) > STEP_NS)
         if self._step_ns:
-            return self._taken(stamp_ns, np.zeros(len(stamp_ns), dtype=bool), len(stamp_ns))
+            return self._taken(stamp_ns, self._after_step(stamp_ns), len(stamp_ns), 0)
         known = np.flatnonzero(~unset)
         stamps = stamp_ns[known]
         offsets = stamp_ns[known] - log_ns[known]
@@ -46,8 +60,11 @@ class StampClock:
         before = stamps[:1] if self._last_ns is None else self._last_ns
         offset_before = offsets[:1] if self._last_ns is None else self._last_offset_ns
         jumps = np.diff(stamps, prepend=before)
-        leads = np.diff(offsets, prepend=offset_before) > STEP_NS
-        starts = np.flatnonzero((jumps < -STEP_NS) | ((jumps > STEP_NS) & (leads | ~timed)))  # of messages with one clock
+        leads = np.diff(offsets, prepend=offset_before)
+        numbers = np.ones(len(stamps), dtype=np.int64) if steps is None else steps[known]
+        back = (jumps < -STEP_NS) & ((numbers >= 0) | (np.abs(leads) > STEP_NS))
+        forth = (jumps > STEP_NS) & ((leads > STEP_NS) | ~timed) & (numbers <= 1)
+        starts = np.flatnonzero(back | forth)  # of messages with one clock
         edges = [0, *starts[starts > 0].tolist(), len(stamps)]
         keep = ~unset
         for first, after in pairwise(edges if len(stamps) else []):
@@ -59,11 +76,12 @@ class StampClock:
                 if jump_ns < -STRAY_NS or is_ahead:
                     keep[known[first:after]] = False
                 continue
-            if jump_ns < -STEP_NS or is_ahead:
+            if (jump_ns < -STEP_NS and back[first]) or is_ahead:
                 self._step_ns = jump_ns
                 self._step_at_ns = self._last_ns or 0
-                keep[known[first] :] = False
-                break
+                after_step = int(known[first])
+                keep[after_step:] = self._after_step(stamp_ns[after_step:])
+                return self._taken(stamp_ns, keep, len(stamp_ns), after_step)
             if self._last_ns is None:  # the messages before are too few to be the begin of the clock
                 away_ns = stamps[first] - stamps[:first]
                 lead_ns = offsets[first] - offsets[:first]
@@ -76,19 +94,23 @@ class StampClock:
 
     def _jump_to(self, stamp_ns: int, offset_ns: int, *, has_time: bool) -> tuple[int, bool]:
         """From the usable part to a stamp, ns, 0 without one; and whether the stamp is ahead of the clock."""
-        if self._last_ns is None:
+        if not self._last_ns:  # none, or a stamp that was not set
             return 0, False
         jump_ns = stamp_ns - self._last_ns
         return jump_ns, jump_ns > LEAP_NS and has_time and offset_ns > self._offset_ns + LEAP_NS
 
-    def _taken(self, stamp_ns: NDArray[np.int64], keep: NDArray[np.bool_], count: int) -> tuple[NDArray[np.bool_], int]:
-        counted_ns = stamp_ns[:count]
+    def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Mask of the samples that stay after the step: behind a step forth those that are later than the step."""
+        return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
+
+    def _taken(
+        self, stamp_ns: NDArray[np.int64], keep: NDArray[np.bool_], count: int, after_step: int | None = None
+    ) -> tuple[NDArray[np.bool_], int]:
+        before = count if after_step is None else after_step
         self._found += count
-        self._repeated += int(np.count_nonzero(np.diff(counted_ns) == 0))
-        if self._step_ns:
-            self._left_out += int(np.count_nonzero(~keep))
-        else:
-            self._unset += int(np.count_nonzero(~keep))
+        self._repeated += int(np.count_nonzero(np.diff(stamp_ns[:count]) == 0))
+        self._unset += int(np.count_nonzero(~keep[:before]))
+        self._left_out += count - before
         return keep, count
 
     def recording(self, unset: int = 0) -> Recording:
@@ -107,3 +129,77 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str:
         step = f"the clock of its stamps steps {way} by {abs(seconds(recording.step_ns)):.3f} s at t = {t:.3f} s"
         parts.append(f"{step}: the {recording.left_out} samples after the step are left out")
     return f"{name}: {'; '.join(parts)}" if parts else ""
+
+
+class Leap(NamedTuple):
+    """A leap of the clock that all topics have at one instant."""
+
+    at_ns: int  # the last stamp before the leap
+    by_ns: int
+
+    def undone(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The stamps by the clock before the leap."""
+        return stamp_ns - np.where(stamp_ns > self.at_ns + STEP_NS, self.by_ns, 0)
+
+
+LOOP = ("y", "y_m", "u", "internals", "truth")  # topics that all have a leap of the clock
+LEAPS = "the clock of all stamps leaps forth by "  # in a note
+
+
+def without_leaps(
+    signals: Mapping[str, Signal], recording: Mapping[str, Recording]
+) -> tuple[dict[str, Signal], dict[str, Recording], list[Leap]]:
+    """The signals by the clock before each leap, with the leaps.
+
+    A step forth of a single topic is no leap: the samples after such a step are left out.
+    """
+    mended = dict(signals)
+    clocks = dict(recording)
+    leaps: list[Leap] = []
+    for leap in _candidates(signals, recording):
+        earlier = Leap(leap.at_ns - sum(before.by_ns for before in leaps), leap.by_ns)
+        leaping = [name for name, signal in mended.items() if _has_gap(signal, earlier)]
+        loop = [name for name in LOOP if name in mended and mended[name].stamp_ns[-1] > earlier.at_ns + STEP_NS]
+        if len(loop) < 2 or not {*loop} <= {*leaping}:  # a single topic has a clock of its own
+            continue
+        leaps.append(earlier)
+        for name in leaping:
+            mended[name] = replace(mended[name], stamp_ns=earlier.undone(mended[name].stamp_ns))
+            if name in clocks and clocks[name].step_ns > 0:
+                clocks[name] = clocks[name]._replace(step_ns=0, step_at_ns=0, left_out=0)
+    for name, clock in clocks.items():
+        if clock.step_ns > 0 and name in mended:
+            mended[name] = mended[name].until(clock.step_at_ns)
+    return mended, clocks, leaps
+
+
+def _candidates(signals: Mapping[str, Signal], recording: Mapping[str, Recording]) -> Iterator[Leap]:
+    """Leaps of the stamps: beside the flight times of `truth`, or without these beside numbers of messages without a gap."""
+    name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
+    if not name:
+        return
+    stamp_ns = signals[name].stamp_ns
+    elapsed_ns = np.diff(stamp_ns)
+    if "t" in signals[name].names:
+        flown_ns = np.diff(np.round(signals[name]["t"] * NANOSECONDS))
+    elif len(elapsed_ns) and all(recording[topic].lost == 0 for topic in LOOP if topic in recording):
+        flown_ns = np.full(len(elapsed_ns), np.median(elapsed_ns))
+    else:
+        return
+    lead_ns = elapsed_ns - flown_ns
+    for k in np.flatnonzero((lead_ns > LEAP_NS) & (lead_ns < 2**62)):
+        yield Leap(int(stamp_ns[k]), int(lead_ns[k]))
+
+
+def _has_gap(signal: Signal, leap: Leap) -> bool:
+    """Whether no sample of a topic lies within a leap."""
+    after = int(np.searchsorted(signal.stamp_ns, leap.at_ns + STEP_NS, side="right"))
+    if not 0 < after < len(signal.stamp_ns):
+        return False
+    return bool(signal.stamp_ns[after] - signal.stamp_ns[after - 1] >= leap.by_ns)
+
+
+def leap_note(leap: Leap, start_ns: int) -> str:
+    """The sentence on a leap of the clock."""
+    times = f"{seconds(leap.by_ns):.3f} s at t = {seconds(leap.at_ns - start_ns):.3f} s"
+    return f"{LEAPS}{times}: later times are by the clock before the leap"

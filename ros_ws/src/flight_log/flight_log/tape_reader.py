@@ -25,7 +25,7 @@ from flight_core.tape import Recording, Signal, Tape, refusal_note
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
 from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES, stack_topic
-from flight_log.clock import SINCE_EPOCH_NS, StampClock, recording_note
+from flight_log.clock import SINCE_EPOCH_NS, StampClock, leap_note, recording_note, without_leaps
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
 from flight_log.flight_processes import INSTANCE, LOG, READY, ROSOUT, UNNAMED, Span, flight_processes, ready_times
@@ -44,7 +44,7 @@ from flight_log.named_vectors import (
     full_name,
     stamps_of,
 )
-from flight_log.open_log import A_RUN, NAMED, log_files, missing_parts, open_scan, plain_batches
+from flight_log.open_log import A_RUN, NAMED, ROSBAG2, log_files, missing_parts, open_scan, plain_batches
 from flight_log.rosbag2_metadata import METADATA, bag_files, read_bag_metadata
 from flight_log.scan import MessageBatch
 
@@ -142,16 +142,17 @@ def read_run(
     aircraft = chosen_namespace(filled, namespace, str(run))
     names = names_within(aircraft, filled)
     require(bool(names), str(run), f"topics that begin with no slash: {', '.join(filled)}", "a recorded flight")
-    signals = {printable(name): filled[topic] for topic, name in names.items()}
-    start_ns = _start_ns(signals)
     stamped = names_within(aircraft, log.topics).items()
-    recording = {printable(name): clock for topic, name in stamped if (clock := log.topics[topic].recording()).found}
+    clocks = {printable(name): clock for topic, name in stamped if (clock := log.topics[topic].recording()).found}
+    stored_signals = {printable(name): filled[topic] for topic, name in names.items()}
+    signals, recording, leaps = without_leaps(stored_signals, clocks)
+    start_ns = _start_ns(signals)
     end = seconds(max(int(signal.stamp_ns[-1]) for signal in signals.values()) - start_ns)
     refused = {printable(name): count for topic, name in stamped if (count := log.topics[topic].refused())}
     sentences = [refusal_note(name, count) for name, count in refused.items()]
     sentences += [recording_note(name, clock, start_ns) for name, clock in recording.items()]
     sentences += [log.topics[topic].conflict(name) for topic, name in names.items() if name in AIRCRAFT_TOPICS]
-    notes = [*log.notes_at(end), *filter(None, sentences)]
+    notes = [*log.notes_at(end), *(leap_note(leap, start_ns) for leap in leaps), *filter(None, sentences)]
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
     spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
     processes = flight_processes(spans, ready_times(log.lines), aircraft)
@@ -217,7 +218,7 @@ class _TopicSamples:
     def __init__(self, decode: Decoder, expected: int) -> None:
         self._decode = decode
         self._expected = expected
-        self._batch: list[tuple[Table, NDArray[np.int64]]] = []  # of one length, and their log times
+        self._batch: list[tuple[Table, NDArray[np.int64], NDArray[np.int64]]] = []  # of one length; log times, steps of numbers
         self._batched = 0  # messages
         self._clock = StampClock()
         self._number: int | None = None  # of the last message, by the publisher
@@ -238,19 +239,19 @@ class _TopicSamples:
         fits = not self._batch or self._batch[0][0].shape[1] == table.shape[1]
         if self._batched >= BATCH or not fits:
             self._decode_batch(more=fits)
-        self._batch.append((table, log_ns))
+        self._batch.append((table, log_ns, steps))
         self._batched += len(table)
 
     def _decode_batch(self, *, more: bool = False, end: bool = False) -> None:
         if not self._batch:
             return
-        table, log_ns = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
+        table, log_ns, steps = (np.concatenate(arrays) for arrays in zip(*self._batch, strict=True))
         self._batch = []
         self._batched = 0
         if table.shape[1] >= STAMP.stop:
-            keep, count = self._clock.usable(stamps_of(table), log_ns, more=more, end=end)
+            keep, count = self._clock.usable(stamps_of(table), log_ns, steps, more=more, end=end)
             if count < len(table):
-                self._batch = [(table[count:], log_ns[count:])]
+                self._batch = [(table[count:], log_ns[count:], steps[count:])]
                 self._batched = len(table) - count
             table = table[:count] if keep.all() else table[:count][keep]
         if not len(table):
@@ -304,7 +305,11 @@ class _TopicSamples:
                 return None
         if np.any(signal.stamp_ns[1:] < signal.stamp_ns[:-1]):
             order = np.argsort(signal.stamp_ns, kind="stable")
-            signal = Signal(signal.stamp_ns[order], signal.names, signal.values[order])
+            stamps = signal.stamp_ns[order]
+            values = signal.values[order]
+            again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)  # of a part that is there twice
+            keep = np.append(True, ~again) if name not in RESTING else np.ones(len(stamps), dtype=bool)
+            signal = Signal(stamps[keep], signal.names, values[keep])
         return signal
 
     def _names(self) -> tuple[str, ...]:
@@ -446,11 +451,14 @@ def _add_metadata(folder: Path, log: _Log) -> None:
 def _read_file(file: Path, log: _Log) -> None:
     channels: dict[int, Callable[[MessageBatch], None]] = {}
     schemas: dict[int, str] = {}
+    before_ns = log.last_ns
+    first_ns = 2**63
     try:
         with open_scan(file) as scan:
             for record in scan.batches():
                 if isinstance(record, MessageBatch):
                     log.last_ns = max(log.last_ns, int(record.log_ns.max()))
+                    first_ns = min(first_ns, int(record.log_ns.min()))
                     if (take := channels.get(record.channel_id)) is not None:
                         for batch in plain_batches(record):
                             take(batch)
@@ -468,6 +476,8 @@ def _read_file(file: Path, log: _Log) -> None:
                     log.add(record)
     except OSError as error:
         raise ParameterError(f"{file}: cannot be read ({error.strerror}), expected {A_RUN}") from None
+    if first_ns < before_ns - NANOSECONDS and file.parent.name != ROSBAG2:
+        log.notes.append(f"{file.name} begins before the end of the part before: the parts are out of order, or there twice")
     if not scan.complete:
         log.truncated.append(file.name)
     if scan.damaged:
