@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
+from flight_analysis.metrics import controller_starts
 from flight_core.arguments import FilePath
 from flight_core.arithmetic import ARITHMETIC
 from flight_core.fields import short_repr
 from flight_core.modes import Mode
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
-from flight_core.tape import Signal, Tape
+from flight_core.tape import Process, Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
 from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
@@ -292,6 +293,10 @@ class _Ticks:
         # Sort by the instants of the ticks. Stamps may decrease: a late y is older than a failsafe tick before it.
         now_ns = signal.stamp_ns + np.round(signal["age"] * NANOSECONDS).astype(np.int64)
         order = np.argsort(now_ns, kind="stable")
+        number = signal["number"]
+        self.starts = controller_starts(number[order])
+        # Ticks of one controller are in the order of their numbers, whichever was stored first.
+        order = np.concatenate([part[np.argsort(number[part], kind="stable")] for part in np.split(order, self.starts)])
         self.stamp_ns = signal.stamp_ns[order]
         self.now_ns = now_ns[order]
         self.t = tape.time("internals")[order]
@@ -300,6 +305,7 @@ class _Ticks:
         self.parameters = signal["parameters"].astype(np.int64)
         self.flies = signal["mode"] == Mode.ENGAGED
         self.begins = self.number == 1
+        self.processes = tape.processes
         self.gap = np.diff(self.number, prepend=0) != 1
         self._signal = signal
         self._active = signal["mode"] != Mode.INACTIVE
@@ -390,9 +396,10 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
     """Notes on what the log does not hold, and what was therefore not checked."""
     if len(ticks.number) and not ticks.begins[0]:
         yield f"the log begins with sample {ticks.number[0]} of internals: earlier ones are missing"
+    for start in ticks.starts:
+        name = _controller_at(ticks.processes, int(ticks.stamp_ns[start]))
+        yield f"another controller{name} begins at t = {ticks.t[start]:.2f} s"
     steps = np.diff(ticks.number)
-    for k in np.flatnonzero(steps <= 0):
-        yield f"another controller begins at t = {ticks.t[k + 1]:.2f} s"
     gaps = np.flatnonzero(steps > 1)
     if len(gaps):
         more = f" and {len(gaps) - 1} more" if len(gaps) > 1 else ""
@@ -404,6 +411,16 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
         yield f"{unmatched} ticks have no sample on the topic y: y taken from internals"
     if unmatched := int((~ticks.u_found).sum()):
         yield f"{unmatched} ticks have no sample on the topic u: what was sent is not compared"
+
+
+def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
+    """The name of the controller that had begun last at an instant, after a comma; empty where the log names none."""
+    known = [
+        (process.first_ns, name)
+        for name, process in processes.items()
+        if "/controller#" in name and process.first_ns is not None and process.first_ns <= stamp_ns
+    ]
+    return f", {max(known)[1]}," if known else ""
 
 
 def _bits(values: FloatArray) -> NDArray[np.int64]:

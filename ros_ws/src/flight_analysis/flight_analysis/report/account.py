@@ -12,21 +12,23 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.metrics import controller_starts
 from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, INCOMPLETE, LANDED, MISSED, NEVER_FLEW, NOT_FLOWN, OUTSIDE, UNKNOWN, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
-from flight_log.clock import SINCE_EPOCH_NS
+from flight_log.clock import LEAPS, SINCE_EPOCH_NS
 
 WHOLE = 0.99  # least share of the samples of a topic without a remark, unless a single one is missing
+LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
 SILENCE = 1.0  # s: a longer gap is named, also where the share is large
 REPEATS = 0.01  # largest share of equal stamps of a topic whose stamps are all different
 LATE_TICK_NS = NANOSECONDS // 10  # the last u of a whole flight may be so much older than its end
 GUIDED = ("guidance", "u_m")  # topics of guidance
 STEADY = ("y", "y_m", "truth", "pose")  # topics that no mode of the flight interrupts
-PARTS = (" and missing", " is truncated: ")  # in notes of a log on its parts
-RESTART = 10  # a number of a tick that is less by more
+PARTS = (" and missing", LEAPS, " is truncated: ")  # in notes of a log on its parts and its clock
+AIRCRAFT = re.compile(r"/aircraft(#\d+)?$")  # of a process that is the simulated aircraft of the stack
 OF_AIRCRAFT = ("truth", "pose")  # topics of the aircraft beside y, with its stamps
 TICKS = ("u", "internals")  # topics of the controller: their stamps rest during a failsafe
 SHORTFALL = re.compile(
@@ -108,7 +110,7 @@ class Account(NamedTuple):
 
     def notes(self) -> tuple[str, ...]:
         """Sentences for the user of a log."""
-        lacks = [lack for lack in self.lacks if not lack.endswith(PARTS[0]) and PARTS[1] not in lack]  # which notes tell of
+        lacks = [lack for lack in self.lacks if not any(part in lack for part in PARTS)]  # which notes tell of
         return (*([self.busy] if self.busy else []), *(f"the log lacks {lack}" for lack in lacks))
 
     def as_json(self) -> dict[str, Any]:
@@ -196,7 +198,7 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
 
     The expected number of samples is rate times time, from t = 0 to the planned end where the log knows both, else from the
     first sample of the topic to the last sample of any. Ticks of the controller count from the first, without the ticks
-    that a busy host left out. `simulated`: the aircraft of the scenario flew, no autopilot.
+    that a busy host left out, up to a tenth of the ticks. `simulated`: the aircraft of the scenario flew, no autopilot.
     """
     lasts = [int(signal.stamp_ns.max()) for name, signal in tape.signals.items() if name in RATED and len(signal.stamp_ns)]
     planned_ns = _planned_ns(tape)
@@ -209,9 +211,13 @@ def account(tape: Tape, scenario: Scenario | None, outcome: str = COMPLETED, *, 
     begin_ns = tape.start_ns if from_start else None
     topics = {name: _topic(tape, name, expected.get(name), begin_ns, end_ns) for name in names}
     late = {} if scenario is None else _latest(scenario)
-    if scenario is not None and tape.start_ns > SINCE_EPOCH_NS:  # in real time
+    has_clock = tape.start_ns > SINCE_EPOCH_NS and not any(clock.step_ns for clock in tape.recording.values())
+    if scenario is not None and has_clock:  # in real time
         for name, step_ns in _periods(tape, scenario, simulated=simulated).items():
-            topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)))
+            if ends_last(tape, name):
+                continue
+            refused = tape.refused.get(name, 0)
+            topics[name] = _with_unsent(topics[name], step_ns, tape.recording.get(name, Recording(0)), refused)
             if unsent_at_end := _unsent_rest(tape, name, step_ns, end_ns):
                 topics[name] = topics[name]._replace(unsent=topics[name].unsent + unsent_at_end)
                 late[name] = seconds(end_ns)
@@ -263,10 +269,10 @@ def _too_busy(parts: Sequence[str]) -> str:
 
 
 def _lost_parts(notes: Iterable[str], *, planned: bool) -> list[str]:
-    """Parts of a bag that are missing. A truncated end counts where no planned end does."""
-    kinds = PARTS if not planned else PARTS[:1]
+    """Parts of a bag that are missing, and leaps of the clock. A truncated end counts where no planned end does."""
+    kinds = PARTS if not planned else PARTS[:2]
     missing = re.compile("|".join(map(re.escape, kinds)))
-    return [note.partition(";")[0] for note in notes if missing.search(note)]
+    return [note.partition(";")[0].partition(": later times")[0] for note in notes if missing.search(note)]
 
 
 def _absent(tape: Tape, scenario: Scenario | None) -> list[str]:
@@ -311,28 +317,66 @@ def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, 
 
 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
-    """Periods of the topics with a sample at each instant of a rate, ns. Another aircraft may have no truth and no pose."""
+    """Periods of the topics with a sample at each instant of a rate, ns.
+
+    Another aircraft has its own rates, and may have no truth and no pose.
+    """
     periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
-    if simulated:
-        y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
-        aircraft_periods = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
-        periods |= {name: step for name, step in aircraft_periods.items() if name in {"y", *tape.signals, *tape.recording}}
+    if not simulated:
+        return periods
+    y_ns = period_ns(scenario.aircraft.rate, "aircraft.rate")
+    aircraft_periods = {"y": y_ns, "truth": y_ns, "pose": scenario.aircraft.pose_every() * y_ns}
+    is_of_stack = _is_of_stack(tape)
+    recorded = {"y", *tape.signals, *tape.recording, *(["truth"] if is_of_stack else [])}
+    for name, step_ns in aircraft_periods.items():
+        if name in recorded:
+            periods[name] = step_ns if is_of_stack else _period_in_log(tape, name, step_ns)
     return periods
 
 
-def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording) -> TopicAccount:
-    """The account of a topic with the instants between the first and the last sample that the publisher left out."""
+def _is_of_stack(tape: Tape) -> bool:
+    """Whether the simulated aircraft of the stack flew, by the names of the processes; in one process no process has one."""
+    if tape.processes:
+        return any(AIRCRAFT.search(name) for name in tape.processes)
+    return tape.duration is not None or "truth" in tape.recording
+
+
+def _period_in_log(tape: Tape, name: str, otherwise: int) -> int:
+    """The median interval of the samples of a topic, by the numbers of the messages without the lost messages, ns."""
+    intervals_ns = np.diff(tape[name].stamp_ns) if name in tape else np.zeros(0)
+    if not np.any(intervals_ns > 0):
+        return otherwise
+    lost = tape.recording.get(name, Recording(0)).lost or 0
+    share = (len(intervals_ns) + 1) / (len(intervals_ns) + 1 + lost)
+    median_ns = float(np.median(intervals_ns[intervals_ns > 0]))
+    return max(round(median_ns * share) if share < LEAST else round(median_ns), 1)
+
+
+def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording, refused: int) -> TopicAccount:
+    """The account of a topic with the instants between the first and the last sample that the publisher left out.
+
+    The numbers of the messages prove it: no number is missing beside those of lost messages and of samples left out.
+    """
     if topic.first is None or topic.last is None or recording.lost is None or topic.expected is None:
         return topic
     instants = round((topic.last - topic.first) * NANOSECONDS / step_ns) + 1
-    return topic._replace(unsent=max(instants - topic.found - recording.lost, 0))
+    return topic._replace(unsent=max(instants - topic.found - recording.lost - recording.unset - refused, 0))
+
+
+def ends_last(tape: Tape, name: str) -> bool:
+    """Whether a topic ends later than every further topic of the flight: a leap of its clock may be its gap."""
+    ends = {
+        topic: int(signal.stamp_ns[-1]) for topic, signal in tape.signals.items() if topic in RATED and len(signal.stamp_ns)
+    }
+    further = [end_ns for topic, end_ns in ends.items() if topic != name]
+    return bool(further) and ends.get(name, 0) > max(further) + LATE_TICK_NS
 
 
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     """The number of instants from the last sample of a topic to the end, where the publisher left them out.
 
-    The numbers of the messages tell: the next sample comes after the end, or the aircraft sent no y at these instants. 0: a
-    sample may be missing in the log.
+    The numbers of the messages prove it: the next sample comes after the end, or the aircraft sent y, but none at these
+    instants. A log that ends with the topic proves nothing.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:
@@ -341,12 +385,13 @@ def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     if not len(held_ns):
         return 0
     last_ns = int(held_ns[-1])
-    unsent = max((end_ns - last_ns) // step_ns, 0)
-    goes_on = len(signal.stamp_ns) > len(held_ns)
-    if not goes_on and name in OF_AIRCRAFT and "y" in tape and tape.recording.get("y", Recording(0)).lost == 0:
-        later_ns = tape["y"].until(end_ns).stamp_ns - last_ns
-        goes_on = not np.any((later_ns > 0) & (later_ns % step_ns == 0))
-    return unsent if goes_on else 0
+    if len(signal.stamp_ns) > len(held_ns):
+        return max((end_ns - last_ns) // step_ns, 0)
+    if name not in OF_AIRCRAFT or "y" not in tape or tape.recording.get("y", Recording(0)).lost != 0:
+        return 0
+    later_ns = tape["y"].until(end_ns).stamp_ns - last_ns
+    was_sent = bool(np.any((later_ns > 0) & (later_ns % step_ns == 0)))
+    return 0 if was_sent else max(int(later_ns[-1]) // step_ns, 0)
 
 
 def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
@@ -361,14 +406,14 @@ def _ticks(tape: Tape, step_ns: int, end_ns: int) -> tuple[int, float]:
     log = tape["internals"].until(end_ns)
     if not len(log.stamp_ns):
         return count, float(count)
-    # Stamps order two ticks of one instant either way. A much smaller number is that of another controller.
-    by_controller = np.split(log["number"], np.flatnonzero(np.diff(log["number"]) < -RESTART) + 1)
+    by_controller = np.split(log["number"], controller_starts(log["number"]))
     missing = sum(float(np.ptp(numbers)) + 1.0 - len(numbers) for numbers in by_controller)
     before = float(by_controller[0].min()) - 1.0
     last_ns = int(log.stamp_ns[-1]) + round(float(log["age"][-1]) * NANOSECONDS)
     goes_on = int(tape["internals"].stamp_ns[-1]) > end_ns
     after = 0 if goes_on else max((end_ns - last_ns) // step_ns, 0)
     ticks = int(len(log.stamp_ns) + max(missing, 0.0) + before + after)
+    ticks = count if ticks < LEAST * count else ticks
     return ticks, float(ticks * np.mean(log["mode"] == Mode.ENGAGED))
 
 
@@ -421,7 +466,7 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: floa
         facts.append(f"{topic.unset} samples without a usable stamp")
     elif topic.repeated > REPEATS * topic.found:
         facts.append(f"{topic.repeated} samples with the stamp of the sample before")
-    missing = not topic.holds(topic.found + topic.unsent)
+    missing = not topic.holds(topic.found + topic.unsent) or (topic.share is not None and topic.share < LEAST)
     if missing or name in STEADY:
         tail = 0.0 if topic.last is None or topic.expected is None else end - topic.last
         if tail > min((1.0 - WHOLE) * end, SILENCE) + late:
@@ -430,6 +475,8 @@ def _lack(name: str, topic: TopicAccount, end: float, late: float, first_u: floa
             facts.append(f"no sample from t = {topic.gap_at:.3f} to {topic.gap_at + topic.gap:.3f} s")
     if not (facts or missing):
         return ""
+    if missing and topic.unsent:
+        facts.append(f"{topic.unsent} were never sent")
     if topic.expected is None:
         return f"{name}: {', '.join(facts)}"
     return ", ".join([f"{name} {topic.found} of {topic.expected} samples", *facts])

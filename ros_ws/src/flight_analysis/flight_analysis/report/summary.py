@@ -32,7 +32,7 @@ from flight_analysis.metrics import (
     sign_switches,
     tick_metrics,
 )
-from flight_analysis.report.account import WHOLE, Account, Commands, account, account_of_json, final_outcome
+from flight_analysis.report.account import WHOLE, Account, Commands, account, account_of_json, ends_last, final_outcome
 from flight_analysis.report.guided import UNITS, guidance_notices, guidance_summary
 from flight_core.modes import Mode
 from flight_core.outcome import IMPORT
@@ -155,7 +155,7 @@ def summarise(
     ticks = tick_metrics(tape, period_ns(scenario.controller.rate, "controller.rate")) if "internals" in tape else None
     latency = latency_metrics(tape)
     age = age_metrics(tape)
-    if tape.start_ns > SINCE_EPOCH_NS:  # in real time
+    if tape.start_ns > SINCE_EPOCH_NS and not ends_last(tape, "internals"):  # in real time
         flight_account = _with_late_ticks(flight_account, ticks, scenario)
     notes = [flight_account.busy] if flight_account.busy else []
     summary = empty_summary(scenario, final_outcome(outcome, flight_account)) | {
@@ -256,7 +256,10 @@ def _with_late_ticks(flight_account: Account, ticks: TickMetrics | None, scenari
         and not flight_account.lacks
         and not scenario.aircraft.sensors.dropout
     )
-    rated = "y" in flight_account.topics and flight_account.topics["y"].expected is not None
+    y = flight_account.topics.get("y")
+    rated = (
+        y is not None and y.expected is not None and y.expected >= (1.0 - BUSY) * flight_account.end * scenario.controller.rate
+    )
     if ticks is None or not log_complete or not rated or ticks.without_new_y <= BUSY * ticks.ticks:
         return flight_account
     late = f"{ticks.without_new_y} ticks without a new y"
