@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cause that an account names has its evidence in the log: no damage of a log is told as a busy host."""
 
+import json
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,6 +24,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import controller_starts
 from flight_analysis.report.account import account
 from flight_analysis.report.run_folder import read_flight
+from flight_bringup.fly import fly_and_report
 from flight_core.outcome import exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
@@ -66,14 +68,14 @@ def read_messages(log: Path) -> Messages:
     return Messages(sorted(messages, key=lambda sent: sent.log_ns))
 
 
-def write_messages(log: Path, copy: Path, messages: Sequence[Sent]) -> Path:
+def write_messages(log: Path, copy: Path, messages: Sequence[Sent], *, attached: bool = True) -> Path:
     """Write messages with the schemas and the attachments of a log, in small chunks."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     with log.open("rb") as source, copy.open("wb") as target:
         reader = make_reader(source)
         writer = Writer(target, chunk_size=30_000)
         writer.start(profile="ros2", library="damaged")
-        for stored in reader.iter_attachments():
+        for stored in reader.iter_attachments() if attached else ():
             writer.add_attachment(stored.log_time, stored.create_time, stored.name, stored.media_type, stored.data)
         summary = reader.get_summary()
         assert summary is not None
@@ -302,3 +304,24 @@ def test_note_on_another_controller_names_the_process(recorded: Path) -> None:
     tape = Tape({**run.tape.signals, "internals": ticks}, run.tape.start_ns, processes=processes)
     notes = replay(run._replace(tape=tape)).notes
     assert "another controller, /controller#9, begins at t = 1.00 s" in notes
+
+
+def test_outcome_in_the_log_is_before_that_of_a_summary_beside(osprey_gust: Scenario, tmp_path: Path) -> None:
+    run = fly_and_report(osprey_gust.vary(flight={"duration": 0.5}), tmp_path).mcap.parent
+    (run / "summary.json").write_text(json.dumps({"outcome": "ended early: another flight"}), encoding="utf-8")
+    assert read_run(run).tape.outcome == "completed"
+    assert read_flight(run).summary["outcome"] == "completed"
+
+
+def test_scenario_beside_a_log_without_attachments_is_that_of_the_flight(run: Path) -> None:
+    """The scenario and the parameters of the flight lie in the folder of the run."""
+    path = run / "run_0.mcap"
+    intact = read_flight(run).summary
+    attached = read_run(run).scenario_file()
+    (run / attached.name).write_bytes(attached.content)
+    with path.open("rb") as stream:
+        messages = [(channel.topic, message) for _, channel, message in make_reader(stream).iter_messages()]
+    sent = [Sent(topic, message.log_time, message.sequence, message.data) for topic, message in messages]
+    write_messages(path, run / "bare", sent, attached=False).replace(path)
+    assert read_run(run).scenario == attached
+    assert figures(read_flight(run).summary) == figures(intact)

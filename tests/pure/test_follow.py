@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Metadata
+from mcap.reader import make_reader
+from mcap.records import Attachment, Message, Metadata
 from mcap.writer import MCAP0_MAGIC, IndexType, Writer
 from numpy.typing import NDArray
 from rosbags.rosbag2 import StoragePlugin
@@ -23,7 +24,7 @@ from flight_log.bag import BagChannel, BagWriter
 from flight_log.disk import is_locked, try_lock
 from flight_log.follow import Follower, Messages
 from flight_log.named_vectors import decoder, tables
-from flight_log.scan import RECORD
+from flight_log.scan import RECORD, Scan
 
 pytestmark = pytest.mark.package("flight_log")
 
@@ -161,6 +162,28 @@ def test_index_that_points_outside_messages_counts_as_damage(recorded: Path, tmp
     follower = Follower(path, all_of)
     assert len(list(follower.read())) > 10
     assert (follower.complete, follower.damaged) == (True, 1)  # the rest of that chunk is left out
+
+
+@pytest.mark.parametrize("size", [1, 200, 20_000])
+@pytest.mark.parametrize("offset", [0, 100])
+def test_follower_reads_past_damage_what_a_scan_of_the_file_reads(offset: int, size: int, run: Path) -> None:
+    """Bytes inverted in the head and in the content of a chunk, beside an intact index of the file."""
+    path = run / "run_0.mcap"
+    content = path.read_bytes()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    chunks = [index.chunk_start_offset for index in summary.chunk_indexes]
+    first = chunks[len(chunks) // 2] + offset
+    damaged = bytes(byte ^ 0x55 for byte in content[first : first + size])
+    path.write_bytes(content[:first] + damaged + content[first + size :])
+    scan = Scan(path)
+    count = sum(isinstance(record, Message) for record in scan.records())
+    follower = Follower(run, all_of)
+    sent = sum(len(record.data) for record in follower.read() if isinstance(record, Messages))
+    assert (follower.complete, follower.fault) == (True, "")
+    assert sent == count
+    assert count > 0
 
 
 @pytest.mark.parametrize("part", [0.4, 1.0])

@@ -571,8 +571,7 @@ RESTART = 10  # a number of a tick that is less by more is of another controller
 def controller_starts(number: FloatArray) -> list[int]:
     """The places where another controller begins in the numbers of ticks, shape (N,), in order of the time.
 
-    Two ticks of one instant may be stored in either order: a number that is a little less, and that no earlier tick of the
-    controller had, begins no controller.
+    Two ticks of one instant may be stored in either order: a number a little less, new to the controller, begins no controller.
     """
     starts = []
     first = 0

@@ -202,9 +202,12 @@ def _timing(summary: Mapping[str, Any]) -> list[str]:
         )
     if (latency := summary["latency"]) is not None:
         median, p99, largest = (f"{value * 1e3:.3f}" for value in latency.values())
-        lines.append(f"y sent to u sent: median {median} ms, p99 {p99}, max {largest}")
+        lines.append(f"y sent to u sent{taken_over(summary, 'latency')}: median {median} ms, p99 {p99}, max {largest}")
     if (age := summary["age_of_u"]) is not None:
-        lines.append(f"age of u at the aircraft: mean {1e3 * age['mean']:.1f} ms, max {1e3 * age['max']:.1f}")
+        lines.append(
+            f"age of u at the aircraft{taken_over(summary, 'age_of_u')}:"
+            f" mean {1e3 * age['mean']:.1f} ms, max {1e3 * age['max']:.1f}"
+        )
     return lines
 
 

@@ -24,7 +24,7 @@ SINCE_EPOCH_NS = 10**15  # larger stamps count from 1970, not from the start of 
 class StampClock:
     """Follows the stamps of a topic. A step of the clock ends the usable part of the topic; a damaged stamp is left out.
 
-    The samples after a step forth stay: `without_leaps` decides on these samples, for it knows all topics.
+    The samples after a step forth stay: `without_leaps` knows all topics and decides on the samples.
     """
 
     def __init__(self) -> None:
@@ -47,7 +47,7 @@ class StampClock:
 
         With `more` messages to come at once, K is less than the number of messages where the last messages confirm no step.
         `end`: the messages are the last messages of the topic. `steps`: of the publisher's number before each message, (K,). A
-        number that falls together with both times is of a part of the log that is out of order. A jump forth beside lost
+        number falls together with both times in a part of the log out of order. A jump forth beside lost
         messages is a gap.
         """
         unset = (stamp_ns == 0) & ((self._last_ns or 0) > STEP_NS)
@@ -100,7 +100,7 @@ class StampClock:
         return jump_ns, jump_ns > LEAP_NS and has_time and offset_ns > self._offset_ns + LEAP_NS
 
     def _after_step(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Mask of the samples that stay after the step: behind a step forth those that are later than the step."""
+        """Mask of the samples that stay after the step: behind a step forth those later than the step."""
         return (stamp_ns > self._step_at_ns) & (self._step_ns > 0)
 
     def _taken(
@@ -132,7 +132,7 @@ def recording_note(name: str, recording: Recording, start_ns: int) -> str:
 
 
 class Leap(NamedTuple):
-    """A leap of the clock that all topics have at one instant."""
+    """A leap of the clock of all topics at one instant."""
 
     at_ns: int  # the last stamp before the leap
     by_ns: int
@@ -174,7 +174,7 @@ def without_leaps(
 
 
 def _candidates(signals: Mapping[str, Signal], recording: Mapping[str, Recording]) -> Iterator[Leap]:
-    """Leaps of the stamps: beside the flight times of `truth`, or without these beside numbers of messages without a gap."""
+    """Leaps of the stamps: beside the flight times of `truth`, else beside numbers of messages without a gap."""
     name = next((name for name in ("truth", "y_m", "y") if name in signals), "")
     if not name:
         return

@@ -29,7 +29,19 @@ from flight_log.file_kinds import BEGUN, EMPTY, MCAP, PACKED, SQLITE, file_kind
 from flight_log.named_vectors import full_name, stamp_of
 from flight_log.open_log import ROSBAG2, open_scan, plain_message
 from flight_log.rosbag2_metadata import bag_files
-from flight_log.scan import DECODE_ERRORS, MAX_CHUNK_BYTES, MESSAGE_INDEX, RECORD, decode, decompress, split
+from flight_log.scan import (
+    DAMAGED,
+    DECODE_ERRORS,
+    ENDS,
+    MAX_CHUNK_BYTES,
+    MESSAGE_INDEX,
+    RECORD,
+    decode,
+    decompress,
+    frames,
+    known_places,
+    split,
+)
 
 HEAD = struct.Struct("<BQ6xQQ")  # of RECORD and MESSAGE: opcode, length, log time, publish time
 # As plain numbers: of a log of one hour 400,000 records are compared.
@@ -38,7 +50,6 @@ MESSAGE = int(Opcode.MESSAGE)
 INDEX = int(Opcode.MESSAGE_INDEX)
 SCHEMA = int(Opcode.SCHEMA)
 CHANNEL = int(Opcode.CHANNEL)
-ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
 READ_BYTES = 1 << 20  # read from the file at once
 
 
@@ -171,16 +182,20 @@ class Follower:
         if self._position == 0 and size >= len(MCAP0_MAGIC):
             self.complete = False
             self._position = len(MCAP0_MAGIC)
+        if self._position == 0:
+            return
+        for opcode, end, content in frames(stream, self._position, known_places(stream, size)):
+            self._position = end
+            if opcode == DAMAGED:
+                self._leave_chunk()
+            else:
+                yield opcode, content
+            if opcode in ENDS:
+                return
         stream.seek(self._position)
-        while 0 < self._position <= size - RECORD.size:
-            opcode, length = RECORD.unpack(stream.read(RECORD.size))
-            if length > 2 * MAX_CHUNK_BYTES:
-                self.fault = f"a record of {length} bytes at byte {self._position}"
-                return
-            if self._position + RECORD.size + length > size:
-                return
-            self._position += RECORD.size + length
-            yield opcode, stream.read(length)
+        head = stream.read(RECORD.size)
+        if len(head) == RECORD.size and (length := RECORD.unpack(head)[1]) > 2 * MAX_CHUNK_BYTES:
+            self.fault = f"a record of {length} bytes at byte {self._position}"
 
     def _take(self, opcode: int, content: bytes) -> None:
         """Add what a record holds to the pending records."""
@@ -189,6 +204,7 @@ class Follower:
                 self._take_indexed(content)
                 return
             self._take_unindexed()
+            self._chunk = b""  # an index behind a record that is no chunk is of a damaged chunk
             if opcode == CHUNK:
                 self._unread.append((self._position - len(content), len(content)))
                 self._chunk = decompress(content)
@@ -197,9 +213,13 @@ class Follower:
             for record in decode(opcode, content):
                 self._take_whole(record)
         except DECODE_ERRORS:
-            self.damaged += 1
-            self._chunk = b""
-            self._indexed = True
+            self._leave_chunk()
+
+    def _leave_chunk(self) -> None:
+        """Count a damaged part, and leave the last chunk out."""
+        self.damaged += 1
+        self._chunk = b""
+        self._indexed = True
 
     def _take_indexed(self, content: bytes) -> None:
         """The messages of a channel in the last chunk. Raises DECODE_ERRORS."""

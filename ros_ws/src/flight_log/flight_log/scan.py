@@ -56,6 +56,9 @@ LENGTH = struct.Struct("<Q")  # before the records of a chunk
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, offsets of the summary and of its offsets, checksum
 CRC = struct.Struct("<I")
 
+ENDS = (int(Opcode.DATA_END), int(Opcode.FOOTER))
+DAMAGED = 0  # in place of the opcode, which is larger
+
 JOINED_BYTES = 1 << 20
 """Bytes of the records in chunks that are decoded together: about a second of a flight."""
 
@@ -194,36 +197,64 @@ class Scan:
 
     def _frames(self, stream: IO[bytes], size: int, index: Sequence[McapRecord]) -> Iterator[tuple[int, bytes]]:
         """Opcode and content of every record up to the index. After a damaged record the next record of the index follows."""
-        starts = (
-            record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
-            for record in index
-            if isinstance(record, ChunkIndex | AttachmentIndex | MetadataIndex)
-        )
-        known = [*sorted(start for start in starts if start < size), size]
         stream.seek(0)
         position = len(MCAP0_MAGIC)
         if stream.read(position) != MCAP0_MAGIC:
             self.complete = False
             return
-        while position + RECORD.size <= size:  # a file that is being written may grow during the scan
-            opcode, length = RECORD.unpack(stream.read(RECORD.size))
-            next_known = known[bisect_right(known, position)]
-            position += RECORD.size + length
-            ends = opcode in (Opcode.DATA_END, Opcode.FOOTER)
-            if ends and position <= next_known == size:
+        for opcode, end, content in frames(stream, position, _known_places(index, size)):
+            position = end
+            if opcode in ENDS:
                 return
-            if position <= next_known and not ends:
-                yield opcode, stream.read(length)
-            elif next_known < size:
-                self.damaged += 1
-                position = next_known
-                stream.seek(position)
-            else:
-                start = stream.read(TIMES.size)
-                if opcode == Opcode.CHUNK and len(start) == TIMES.size:
-                    self.known_end_ns = max(self.known_end_ns, TIMES.unpack(start)[1])
-                break
+            self.damaged += opcode == DAMAGED
+            if opcode != DAMAGED:
+                yield opcode, content
+        stream.seek(position)  # of a record that is not whole
+        head = stream.read(RECORD.size + TIMES.size)
+        if len(head) == RECORD.size + TIMES.size and head[0] == Opcode.CHUNK:
+            self.known_end_ns = max(self.known_end_ns, TIMES.unpack_from(head, RECORD.size)[1])
         self.complete = False
+
+
+def known_places(stream: IO[bytes], size: int) -> list[int]:
+    """As `_known_places`, of a finished file; the size of a growing file."""
+    return _known_places(Scan(Path())._index(stream, size), size)
+
+
+def _known_places(index: Sequence[McapRecord], size: int) -> list[int]:
+    """The places of the records in the index, in order, and the size of the file."""
+    starts = (
+        record.chunk_start_offset if isinstance(record, ChunkIndex) else record.offset
+        for record in index
+        if isinstance(record, ChunkIndex | AttachmentIndex | MetadataIndex)
+    )
+    return [*sorted(start for start in starts if start < size), size]
+
+
+def frames(stream: IO[bytes], position: int, known: Sequence[int]) -> Iterator[tuple[int, int, bytes]]:
+    """Opcode, place behind the record, and content of every whole record from a place up to the end of the data.
+
+    After a damaged record, with the opcode DAMAGED, the next record of the index follows. The last record is in ENDS, or the
+    file is truncated, or grows.
+    """
+    stream.seek(position)
+    size = known[-1]
+    while position + RECORD.size <= size:
+        opcode, length = RECORD.unpack(stream.read(RECORD.size))
+        next_known = known[bisect_right(known, position)]
+        end = position + RECORD.size + length
+        is_end = opcode in ENDS
+        if end <= next_known and (not is_end or next_known == size):
+            position = end
+            yield opcode, position, stream.read(length)
+            if is_end:
+                return
+        elif next_known < size:
+            position = next_known
+            stream.seek(position)
+            yield DAMAGED, position, b""
+        else:
+            return
 
 
 def _with_message_indexes(frames: Iterator[tuple[int, bytes]]) -> Iterator[Part]:

@@ -156,14 +156,16 @@ def read_run(
     outcome = printable(str(log.metadata.get(OUTCOME, {}).get("outcome", UNKNOWN)))
     spans = _spans((name, log.topics[topic].spans) for topic, name in names.items())
     processes = flight_processes(spans, ready_times(log.lines), aircraft)
+    beside = [] if log.scenario else files_beside(run)
+    duration = _duration([*log.attachments, *beside])
     tape = Tape(
-        signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, _duration(log.attachments),
+        signals, start_ns, tuple(map(printable, notes)), outcome, None, recording, duration,
         processes={printable(name): process for name, process in processes.items()},
         refused=refused,
     )  # fmt: skip
     engaged = engagements(log.reports.get(f"{aircraft}{ENGAGEMENT}", []))
     delays = latency({topic: sent for topic, sent in log.sent.items() if names.get(topic) in TIMED_TOPICS})
-    stored = replacement or log.scenario
+    stored = replacement or log.scenario or next((file for file in beside if file.name != PARAMETERS), None)
     ages = age_of_u(log.diagnostics, aircraft)
     return RecordedRun(tape, stored, log.metadata, tuple(log.attachments), delays, engaged, aircraft, run, log.kinds, ages)
 
@@ -181,6 +183,19 @@ def _spans(topics: Iterable[tuple[str, Mapping[str, Span]]]) -> dict[str, Span]:
 def stored_scenario(path: Path) -> StoredFile:
     """A scenario file as a file inside a log. Raises ParameterError for a file that cannot be read."""
     return StoredFile(path.name, read_file(path, str(path), A_SCENARIO))
+
+
+def files_beside(run: Path) -> list[StoredFile]:
+    """The scenario and the parameters that lie beside a log without attachments: a single scenario by its content."""
+    folder = run if is_folder(run) else run.parent
+    files = []
+    for path in sorted(folder.glob("*.yaml")):
+        with suppress(ParameterError, OSError):
+            stored = stored_scenario(path)
+            if path.name == PARAMETERS or all(section in stored.content for section in (b"/aircraft:", b"/controller:")):
+                files.append(stored)
+    scenarios = [stored for stored in files if stored.name != PARAMETERS]
+    return files if len(scenarios) < 2 else [stored for stored in files if stored.name == PARAMETERS]
 
 
 def aircraft_namespaces(topics: Collection[str]) -> list[str]:
@@ -308,7 +323,7 @@ class _TopicSamples:
             stamps = signal.stamp_ns[order]
             values = signal.values[order]
             again = (np.diff(stamps) == 0) & (np.diff(values, axis=0) == 0.0).all(axis=1)  # of a part that is there twice
-            keep = np.append(True, ~again) if name not in RESTING else np.ones(len(stamps), dtype=bool)
+            keep = np.append(True, ~again)
             signal = Signal(stamps[keep], signal.names, values[keep])
         return signal
 

@@ -355,7 +355,7 @@ def _period_in_log(tape: Tape, name: str, otherwise: int) -> int:
 def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording, refused: int) -> TopicAccount:
     """The account of a topic with the instants between the first and the last sample that the publisher left out.
 
-    The numbers of the messages prove it: no number is missing beside those of lost messages and of samples left out.
+    The numbers of the messages are the proof: no number is missing beside lost messages and samples left out.
     """
     if topic.first is None or topic.last is None or recording.lost is None or topic.expected is None:
         return topic
@@ -375,8 +375,8 @@ def ends_last(tape: Tape, name: str) -> bool:
 def _unsent_rest(tape: Tape, name: str, step_ns: int, end_ns: int) -> int:
     """The number of instants from the last sample of a topic to the end, where the publisher left them out.
 
-    The numbers of the messages prove it: the next sample comes after the end, or the aircraft sent y, but none at these
-    instants. A log that ends with the topic proves nothing.
+    The numbers of the messages are the proof: the next sample comes after the end, or the aircraft sent y at further
+    instants alone. A log that ends with the topic proves nothing.
     """
     signal = tape.signals.get(name)
     if signal is None or tape.recording.get(name, Recording(0)).lost != 0:

@@ -236,17 +236,17 @@ def _folder(run: Path) -> Path:
 
 
 def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
-    """The outcome in the summary of a run, else in the log, else that which a launch left for a recorder that took none.
+    """The outcome in the log, else in the summary of the run, else that which a launch left for a recorder that took none.
 
-    Of nodes that were started one by one it is that of the samples in the log.
+    The outcome of nodes that were started one by one is that of the samples in the log.
     """
+    if tape.outcome != UNKNOWN:
+        return tape.outcome
     if folder is not None:
         with suppress(OSError, ValueError, TypeError, KeyError):
             before = printable(str(json.loads((folder / SUMMARY).read_text(encoding="utf-8"))["outcome"]))
             if not before.startswith(UNKNOWN):  # as of an earlier version
                 return before
-    if tape.outcome != UNKNOWN:
-        return tape.outcome
     if folder is not None:
         with suppress(ParameterError):
             if outcome := read_file(folder / OUTCOME_FILE, OUTCOME_FILE, "a text").decode(errors="replace"):

@@ -236,7 +236,7 @@ def command_results(summary: Mapping[str, Any]) -> str:
     if flight_account is None or flight_account.commands is None:
         return ""
     planned, flown, targets, steps_taken = flight_account.commands
-    parts = [f"{flown} of {planned} commands flown"] if flown < planned else []
+    parts = [f"{flown} of {planned} commands flown{taken_over(summary, 'commands')}"] if flown < planned else []
     if targets:
         parts.append(f"{targets} targets and routes given, guidance took commands in {steps_taken} steps")
     return "; ".join(parts)
@@ -279,8 +279,11 @@ FIGURES = {
     "inputs": ("u", "internals", "u_m", "guidance"),
     "ticks": ("internals",),
     "guidance": ("guidance",),
+    "commands": ("y", "u"),
+    "latency": ("y", "u"),
+    "age_of_u": ("u",),
 }
-"""Topics of the tables of figures beside the error: the values, and the parts of the flight."""
+"""Topics of the tables and lines of figures beside the error: the values, and the parts of the flight."""
 
 
 def taken_over(summary: Mapping[str, Any], table: str) -> str:
