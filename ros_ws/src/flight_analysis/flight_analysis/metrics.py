@@ -569,7 +569,7 @@ RESTART = 10  # a number of a tick that is less by more is of another controller
 
 
 def controller_starts(number: FloatArray) -> list[int]:
-    """The places where another controller begins in the numbers of ticks, shape (N,), in order of the time.
+    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the time.
 
     Two ticks of one instant may be stored in either order: a number a little less, new to the controller, begins no controller.
     """

@@ -4,7 +4,7 @@
 
 A log of another storage, or a packed log, is finished: `open_log` reads it.
 
-A record is read once the record is whole, so a chunk in progress is never read. The message index behind a chunk gives the
+A record is read once the record is whole: a chunk in progress is never read. The message index behind a chunk gives the
 places of the messages: messages of unwanted topics cost nothing.
 """
 

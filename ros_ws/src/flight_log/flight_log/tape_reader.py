@@ -186,7 +186,7 @@ def stored_scenario(path: Path) -> StoredFile:
 
 
 def files_beside(run: Path) -> list[StoredFile]:
-    """The scenario and the parameters that lie beside a log without attachments: a single scenario by its content."""
+    """The scenario and the parameters beside a log without attachments: a single scenario by the content."""
     folder = run if is_folder(run) else run.parent
     files = []
     for path in sorted(folder.glob("*.yaml")):

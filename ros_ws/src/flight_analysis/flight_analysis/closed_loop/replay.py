@@ -414,7 +414,7 @@ def _coverage_notes(ticks: _Ticks, checked: NDArray[np.bool_]) -> Iterator[str]:
 
 
 def _controller_at(processes: Mapping[str, Process], stamp_ns: int) -> str:
-    """The name of the controller that had begun last at an instant, after a comma; empty where the log names none."""
+    """The name of the last controller to begin before an instant, after a comma; empty where the log has no name."""
     known = [
         (process.first_ns, name)
         for name, process in processes.items()

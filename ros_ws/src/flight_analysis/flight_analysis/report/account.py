@@ -319,7 +319,7 @@ def _expected(tape: Tape, scenario: Scenario, end_ns: int, *, from_start: bool, 
 def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, int]:
     """Periods of the topics with a sample at each instant of a rate, ns.
 
-    Another aircraft has its own rates, and may have no truth and no pose.
+    A foreign aircraft has the rates of the log, and may have no truth and no pose.
     """
     periods = {"y_m": period_ns(scenario.reference_model.rate, "reference_model.rate")}
     if not simulated:
@@ -335,7 +335,7 @@ def _periods(tape: Tape, scenario: Scenario, *, simulated: bool) -> dict[str, in
 
 
 def _is_of_stack(tape: Tape) -> bool:
-    """Whether the simulated aircraft of the stack flew, by the names of the processes; in one process no process has one."""
+    """Whether the simulated aircraft of the stack flew, by the names of the processes; a flight in one process has no names."""
     if tape.processes:
         return any(AIRCRAFT.search(name) for name in tape.processes)
     return tape.duration is not None or "truth" in tape.recording
@@ -364,7 +364,7 @@ def _with_unsent(topic: TopicAccount, step_ns: int, recording: Recording, refuse
 
 
 def ends_last(tape: Tape, name: str) -> bool:
-    """Whether a topic ends later than every further topic of the flight: a leap of its clock may be its gap."""
+    """Whether a topic ends later than every further topic of the flight: a leap of the clock may be the gap."""
     ends = {
         topic: int(signal.stamp_ns[-1]) for topic, signal in tape.signals.items() if topic in RATED and len(signal.stamp_ns)
     }

@@ -236,9 +236,9 @@ def _folder(run: Path) -> Path:
 
 
 def _previous_outcome(folder: Path | None, tape: Tape, scenario: Scenario, *, simulated: bool) -> str:
-    """The outcome in the log, else in the summary of the run, else that which a launch left for a recorder that took none.
+    """The outcome in the log, else in the summary of the run, else the outcome that a launch left beside the log.
 
-    The outcome of nodes that were started one by one is that of the samples in the log.
+    The samples in the log tell the outcome of nodes started by hand.
     """
     if tape.outcome != UNKNOWN:
         return tape.outcome
