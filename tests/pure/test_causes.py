@@ -21,7 +21,6 @@ from tests.recordings import EPOCH
 
 from flight_analysis.closed_loop.replay import replay
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import controller_starts
 from flight_analysis.report.account import account
 from flight_analysis.report.run_folder import read_flight
 from flight_bringup.fly import fly_and_report
@@ -29,6 +28,7 @@ from flight_core.outcome import exit_status
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS, nanoseconds
 from flight_core.tape import Process, Recording, Tape
+from flight_log.flight_processes import controller_starts
 from flight_log.named_vectors import stamp_of
 from flight_log.tape_reader import read_run
 

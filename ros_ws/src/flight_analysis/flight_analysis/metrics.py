@@ -563,20 +563,3 @@ def age_metrics(tape: Tape) -> AgeMetrics | None:
     if "age_of_u" not in tape or len(tape["age_of_u"].stamp_ns) == 0:
         return None
     return AgeMetrics(float(tape["age_of_u"]["mean"].mean()), float(tape["age_of_u"]["max"].max()))
-
-
-RESTART = 10  # a number of a tick that is less by more is of another controller
-
-
-def controller_starts(number: FloatArray) -> list[int]:
-    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the time.
-
-    Two ticks of one instant may be stored in either order: a number a little less, new to the controller, begins no controller.
-    """
-    starts = []
-    first = 0
-    for place in (np.flatnonzero(np.diff(number) < 0.0) + 1).tolist():
-        if number[place] < number[place - 1] - RESTART or number[place] in number[first:place]:
-            starts.append(place)
-            first = place
-    return starts

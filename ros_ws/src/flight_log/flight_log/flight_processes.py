@@ -6,10 +6,12 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
 from rosbags.serde.errors import SerdeError
 
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Process
+from flight_core.vectors import FloatArray
 from flight_log.named_vectors import typestore
 
 ROSOUT = "/rosout"
@@ -65,3 +67,20 @@ def flight_processes(spans: Mapping[str, Span], ready: Iterable[tuple[str, int]]
         elif has_stack:
             processes[name or UNNAMED] = Process(None, first_ns, last_ns, samples)
     return processes | {node: Process(times[-1], None, None) for node, times in waiting.items() if times}
+
+
+RESTART = 10  # a number of a tick that is less by more is of another controller
+
+
+def controller_starts(number: FloatArray) -> list[int]:
+    """The places where a new controller begins in the numbers of ticks, shape (N,), in order of the time.
+
+    Two ticks of one instant may be stored in either order: a number a little less, new to the controller, begins no controller.
+    """
+    starts = []
+    first = 0
+    for place in (np.flatnonzero(np.diff(number) < 0.0) + 1).tolist():
+        if number[place] < number[place - 1] - RESTART or number[place] in number[first:place]:
+            starts.append(place)
+            first = place
+    return starts

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flight_analysis.closed_loop.scenario import Scenario, parse_scenario, parse_scenario_sections
-from flight_analysis.metrics import controller_starts
 from flight_core.arguments import FilePath
 from flight_core.arithmetic import ARITHMETIC
 from flight_core.fields import short_repr
@@ -19,6 +18,7 @@ from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Process, Signal, Tape
 from flight_core.vectors import FloatArray, StampedVector
+from flight_log.flight_processes import controller_starts
 from flight_log.provenance import recorded_arithmetic
 from flight_log.stored_messages import parameter_changes
 from flight_log.tape_reader import RecordedRun, StoredFile, read_run

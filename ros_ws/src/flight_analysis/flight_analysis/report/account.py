@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.metrics import controller_starts
 from flight_analysis.report.guided import FlownLeg, Outside, flown_legs, time_outside, unflown_legs
 from flight_core.modes import Mode
 from flight_core.outcome import COMPLETED, INCOMPLETE, LANDED, MISSED, NEVER_FLEW, NOT_FLOWN, OUTSIDE, UNKNOWN, ended_early
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.tape import Recording, Signal, Tape
 from flight_log.clock import LEAPS, SINCE_EPOCH_NS
+from flight_log.flight_processes import controller_starts
 
 WHOLE = 0.99  # least share of the samples of a topic without a remark, unless a single one is missing
 LEAST = 0.9  # a smaller share of a topic is a lack of the log, whatever the cause
