@@ -36,12 +36,11 @@ HEAD = """\
 # Evidence
 
 For you if you want to check a figure. A program writes this page from `docs/evidence/`. Each link leads to the figures of a
-measurement, with their goals, the command, the host and the date; `docs/evidence/tables/` has tables of other pages.
+measurement, with goals, command, revision, host and date; `docs/evidence/tables/` has tables of other pages.
 `make evidence ARGS="--again NAME"` measures again: NAME is that of the file. The programs of learning, guidance and real
 autopilots write their files themselves. Limits of all measurements: one host, the loopback interface, simulated aircraft. In
-turbulence a figure is the worst of the seeds. A baseline is the least program that does the same on this host: the ratio
-carries over to other hosts. Flights of real autopilots before 2026-11-23 take the times of their commands some seconds
-early: their rms is to be measured again.
+turbulence a figure is the worst of the seeds. A baseline is the least program that does the same on this host. Flights of real
+autopilots before 2026-11-23 take the times of their commands some seconds early: their rms is to be measured again.
 """
 
 
@@ -135,14 +134,14 @@ def write_page() -> None:
     """Write the page from the files."""
     lines = [HEAD]
     for section, titles in SECTIONS.items():
-        lines += [f"## {section}", "", "| measurement | goals met | missed | revision |", "|" + " --- |" * 4]
+        lines += [f"## {section}", "", "| measurement | goals met, and missed | date |", "|---|---|---|"]
         lines += [_line(FOLDER / f"{name}.csv", title) for name, title in titles.items()] + [""]
     PAGE.write_text("\n".join(lines), encoding="utf-8")
 
 
 def _line(path: Path, title: str) -> str:
     if not path.exists():
-        return f"| {title} | - | not measured | - |"
+        return f"| {title} | not measured | - |"
     with path.open(encoding="utf-8", newline="") as stream:
         lines = list(csv.reader(stream))[1:]
     figures = {line[0]: Row(*line[:5]) for line in lines}
@@ -155,9 +154,9 @@ def _line(path: Path, title: str) -> str:
         text = figure.value if math.isnan(value) else f"{value:.3g}{'' if figure.baseline else ' ' + figure.unit}".strip()
         missed.setdefault(figure.name.rpartition(": ")[2] + figure.goal, f"{figure.name} **{text}** ({figure.goal})")
     passed = f"{met} of {len(judged)}" if judged else "-"
+    goals = "; ".join([passed, *missed.values()])
     busy = ", busy host" if BUSY in origin.host else ""
-    measured = f"{origin.revision or 'not recorded'}, {origin.date[:10]}{busy}"
-    return f"| [{title}](evidence/{path.name}) | {passed} | {'; '.join(missed.values()) or '-'} | {measured} |"
+    return f"| [{title}](evidence/{path.name}) | {goals} | {origin.date[:10]}{busy} |"
 
 
 def origin(command: str) -> Origin:

@@ -82,12 +82,12 @@ SECTIONS = {
     },
     "Speed": {
         "speed-law": "one step of the law",
-        "speed-receiver": "a message that a receiver refuses compared with a right one",
+        "speed-receiver": "a refused message compared with a right one",
         "speed-node": "the controller's tick compared with an echo's callback",
         "speed-latency": "from y sent to u received, over DDS",
         "speed-ticks": "lateness of ticks",
-        "speed-flight": "CPU and memory of each process of a flight in real time",
-        "speed-start": "from the start of a process to its first u",
+        "speed-flight": "CPU and memory of each process of a flight",
+        "speed-start": "from start to first u",
         "speed-import": "processor time of `import rise_di` and of `rise-di --help`",
         "speed-lockstep": "lockstep flights",
         "speed-recorder": "the recorder at 1 kHz on six topics",
@@ -95,7 +95,7 @@ SECTIONS = {
     "Security": {
         "security": "who can receive y and command u",
         "fuzz": "external input, fuzzed by hypothesis",
-        "fuzz-coverage": "readers of files and messages, coverage-guided fuzzing",
+        "fuzz-coverage": "readers, coverage-guided fuzzing",
         "long-fuzz": "the same readers, ten minutes each",
     },
     "Long flights and replay": {
@@ -110,28 +110,28 @@ SECTIONS = {
         "campaign-missions": "uncertain aircraft on a route",
         "cluster": "a campaign on a cluster of dask with faults",
         "compare": "other laws on the same aircraft and course",
-        "compare-self_tuner": "the indirect self-tuner on the same aircraft and course",
+        "compare-self_tuner": "the self-tuner on the same course",
         "margins": "the cost of a phase margin under five laws",
         "effectors": "each effector lost at a random time",
     },
-    "Learning in the air": {"learning": "uncertain aircraft that learn in flight, in every air and with damage"},
-    "Live view": {"view": "the page beside a flight, and a log of one hour on it"},
+    "Learning in the air": {"learning": "uncertain aircraft that learn, in every air and with damage"},
+    "Live view": {"view": "the page beside a flight, and with a log of one hour"},
     "Guidance": {f"guidance-{name}": f"holds and paths, {name}" for name in ("osprey_servo", "c172p", "737", "f16")}
     | {"guidance-route": "another route, other aircraft"}
     | {f"guidance-grid-{name}": f"off the design point, {name}" for name in ("c172p", "737", "f16")}
-    | {"guidance-rates": "errors of the rates with guidance over those without"}
-    | {f"guidance-routes-{name}": f"routes hard to begin, in wind, steep, {name}" for name in ROUTE_AIRCRAFT}
-    | {f"guidance-fence-{name}": f"five fences in four winds, {name}" for name in ("osprey", "c172p", "f16", "737")},
+    | {"guidance-rates": "errors of rates with guidance over those without"}
+    | {f"guidance-routes-{name}": f"hard routes, {name}" for name in ROUTE_AIRCRAFT}
+    | {f"guidance-fence-{name}": f"fences in wind, {name}" for name in ("osprey", "c172p", "f16", "737")},
     "Real autopilots": {
-        "autopilots-arduplane": "ArduPlane, servos of 0.03 s, gains by `identify --bridge`",
-        "autopilots-slow_servos": "ArduPlane, its default servos of 0.14 s, gains by `identify --bridge`",
-        "autopilots-px4": "PX4's airplane, gains by `identify --bridge`",
+        "autopilots-arduplane": "ArduPlane, servos of 0.03 s, identified gains",
+        "autopilots-slow_servos": "the same with default servos of 0.14 s",
+        "autopilots-px4": "PX4's airplane, identified gains",
         "autopilots-guided": "ArduPlane under guidance",
-        "autopilots-observer": "ArduPlane with an observer of the identified Omega and lags, in turbulence",
+        "autopilots-observer": "ArduPlane with an identified observer, in turbulence",
         "autopilots-engagements": "engagements without a jump",
-        "autopilots-signs": "signs, in short experiments in wind of 5 m/s",
+        "autopilots-signs": "signs, in wind of 5 m/s",
         "autopilots-pose": "rates and pose over the autopilot's own log",
-        "autopilots-own_log": "ArduPlane 15 % faster, over DDS and MAVLink, calm and in wind, by its own logs",
+        "autopilots-own_log": "ArduPlane 15 % faster, over DDS and MAVLink, by its own logs",
         "autopilots-releases": "tests, and the times of a release",
     },
 }
