@@ -62,7 +62,7 @@ ENGAGEMENTS, LARGEST_STEP = 20, 0.02  # of the range of a setpoint
 WINDOW = (-0.3, 1.0)  # s around an engagement, in which steps of the setpoints count
 PERIODS = {"elevator": 12.0, "thrust": 4.0, "aileron": 1.5, "rudder": 1.5}
 """s, of the multisines of the experiments on signs. With 4 s of the elevator 2 of 12 were unsure of it at SIM_WIND_TURB 0.5."""
-STRONGER_ELEVATOR = 2.0  # `check-signs` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
+STRONGER_ELEVATOR = 2.0  # `rise-di check` asked for 1.7 times the amplitude at SIM_WIND_TURB 1
 TURBULENCE = (0.25, 0.5, 0.25, 0.5, 1.0)  # SIM_WIND_TURB of the experiments on signs; 2 moves q by 0.4 rad/s
 EXCITED = 35.0  # s, of an experiment on signs at least
 EXPERIMENT = 80.0  # s, of one on signs at most: 39 s engaged, and back to level flight
@@ -166,7 +166,7 @@ def identified(
         with flying() as autopilot:
             autopilot.patient_map(map_name)
             autopilot.experiment(*command)
-    read = _on_the_ground(*command, "--log", str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
+    read = _on_the_ground(*command, str((log or REPOSITORY / "runs" / "latest").resolve()), "--json")
     if read.returncode:
         return {"refused": read.stderr}
     result = json.loads(read.stdout)
@@ -245,7 +245,7 @@ def imported_beside(command: Sequence[str], log: Path, run: Path, place: Path) -
         return {"refused": done.stderr}
     omega: dict[str, dict[str, float]] = {}
     for name, source in (("stack", run), ("imported", bag)):
-        read = _on_the_ground(*command, "--log", str(source), "--write", str(place / f"of_{name}"), "--accept", "--json")
+        read = _on_the_ground(*command, str(source), "--write", str(place / f"of_{name}"), "--set", "accept", "--json")
         if read.returncode:
             return {"refused": f"{name}: {read.stderr}"}
         result = json.loads(read.stdout)
@@ -339,7 +339,7 @@ def step(sent: Signal, ranges: dict[str, float], engaged_ns: int) -> float:
 
 
 def signs(experiments: int = 25) -> dict[str, Any]:
-    """Short experiments, open loop, each in other turbulence, and what `check-signs` says of each; earlier ones are kept.
+    """Short experiments, open loop, each in other turbulence, and what `rise-di check` says of each; earlier ones are kept.
 
     The simulator draws its turbulence from one stream of random numbers without a seed: each experiment has another part of it.
     """
@@ -383,7 +383,7 @@ def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], flo
     """The stored experiments on signs, and those of logs; `wind_of` is the turbulence of an engagement.
 
     An engagement shorter than EXCITED was ended by the bridge or with the flight: it is counted, not judged. Those of a run in
-    strong turbulence are also judged together, as `check-signs` judges a log with several.
+    strong turbulence are also judged together, as `rise-di check` judges a log with several.
     """
     earlier, channel_map = stored("signs"), load_map("ardupilot")
     found, ended, together = (earlier.get(key, []) for key in ("experiments", "ended", "together"))
@@ -406,7 +406,7 @@ def signs_of_logs(runs: Sequence[Path], wind_of: Callable[[int, Engagement], flo
 
 
 def judged(channel_map: ChannelMap, tape: Tape, engagements: Sequence[Engagement]) -> dict[str, Any]:
-    """What `check-signs` says of every sign, and of each one flipped alone: its column of the recorded u has the other sign."""
+    """What `rise-di check` says of every sign, and of each flipped alone: its column of the recorded u has the other sign."""
     pairing, expected = channel_pairs(channel_map)
     columns = [list(channel_map.inputs).index(name) for name in pairing.inputs]
     rows = [list(channel_map.outputs).index(name) for name in pairing.outputs]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What benchmarks/evidence.py measures: the command and the goals of each measurement, and the sections of the page."""
 
-CAMPAIGN = "rise-di campaign --uncertainty 0.3 --seed 7 --runs FOLDER --json"
+CAMPAIGN = "rise-di campaign --uncertainty 0.3 --seed 7 --set runs=FOLDER --json"
 COMPARE = "rise-di compare osprey_servo --tuning gust,gust_turbulence,delay --json FILE --aircraft 200"
 RANDOM_FAULTS = "python -m benchmarks.random_faults --json FILE --count"
 LONG_FLIGHT = "python -m benchmarks.long_flight --json FILE"

@@ -55,7 +55,7 @@ IN_VIEW = """(() => {
   const found = all.filter(one => place(one).top < innerHeight && place(one).bottom > 0);
   return found.length > 0 && found.every(one => one.drawn);
 })()"""  # goes to the first figure; whether all figures in view are drawn
-MODES = {"in lockstep": ["--lockstep"], "in lockstep in one process": ["--one-process"], "in real time": []}
+MODES = {"in lockstep": ["--lockstep"], "in lockstep in one process": ["--lockstep", "--set", "composed"], "in real time": []}
 
 
 def triangle(minutes: float, *, observer: bool, rate: float | None = None) -> Scenario:
@@ -82,7 +82,7 @@ def fly(scenario: Path, runs: Path, mode: str) -> tuple[dict[str, list[int]], in
     The second result is the most memory of `rise-di fly` after that, while it writes the report, bytes.
     """
     within = real_time() if mode == "in real time" else ()
-    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--runs", str(runs)]
+    command = [*within, RISE_DI, "fly", str(scenario), *MODES[mode], "--set", f"runs={runs}"]
     memory: dict[str, list[int]] = {}
     with ExitStack() as stack:
         flight = stack.enter_context(psutil.Popen(command, stdout=subprocess.DEVNULL))

@@ -26,7 +26,7 @@ def main() -> None:
     results = {}
     for name in scenarios():
         with tempfile.TemporaryDirectory() as runs:
-            flight = _run("fly", name, "--one-process", "--runs", runs)
+            flight = _run("fly", name, "--lockstep", "--set", "composed", "--set", f"runs={runs}")
             replayed = {"differing": 0} | _run("replay", f"{runs}/latest")
         results[name] = replayed | {"completed": flight.get("outcome") == "completed"}
     print(json.dumps(results, indent=1))

@@ -180,7 +180,7 @@ class Client(threading.Thread):
 @contextmanager
 def flying(runs: Path, seconds: float) -> Iterator[tuple["subprocess.Popen[str]", Path]]:
     """A flight in real time, and the folder of its run."""
-    command = [RISE_DI, "fly", SCENARIO, "--duration", f"{seconds:g}", "--runs", str(runs), "--json"]
+    command = [RISE_DI, "fly", SCENARIO, "--duration", f"{seconds:g}", "--set", f"runs={runs}", "--json"]
     known = set(runs.iterdir())
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as flight:  # noqa: S603
         while not (new := set(runs.iterdir()) - known):

@@ -78,7 +78,7 @@ RUNS = [*ODD, *FOLDERS, "other/other.db3", "text/text_0.mcap", "/dev/null", "a\x
 
 @pytest.mark.parametrize("run", RUNS, ids=range(len(RUNS)))
 @pytest.mark.parametrize(
-    "command", [["report"], ["replay"], ["repair"], ["play"], ["check-signs", "px4", "--bag"]], ids=lambda c: c[0]
+    "command", [["report"], ["replay"], ["report", "--repair"], ["play"], ["check", "px4", "--run"]], ids=str
 )
 def test_an_invalid_run_is_rejected(command: list[str], run: str, garbage: Path) -> None:
     require_rejection(rise_di(*command, run))
@@ -90,7 +90,7 @@ FILES = [*ODD, *FILE_NAMES, "../../x", "x" * 5000 + ".yaml", "\x1b[2J"]
 
 @pytest.mark.parametrize("name", FILES, ids=range(len(FILES)))
 @pytest.mark.parametrize(
-    "command", [["fly", "--in-process"], ["fly"], ["gains"], ["check-signs"], ["gains", "osprey", "--scenario"]], ids=str
+    "command", [["fly", "--in-process"], ["fly"], ["gains"], ["check"], ["gains", "osprey", "--scenario"]], ids=str
 )
 def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Path) -> None:
     require_rejection(rise_di(*command, name))
@@ -98,14 +98,14 @@ def test_an_invalid_file_is_rejected(command: list[str], name: str, garbage: Pat
 
 OPTIONS = {
     "fly osprey_gust --in-process --duration": ["nan", "inf", "0", "x", "1e7"],
-    "gains osprey --samples 0 --rate": ["nan", "1e9", "333.3"],
+    "gains osprey --set samples=0 --set rate=": ["nan", "1e9", "333.3"],
     "gains osprey --uncertainty": ["nan", "2"],
     "gains osprey --delay": ["inf", "-1"],
-    "gains osprey --gamma-2": ["nan"],
+    "gains osprey --set gamma_2=": ["nan"],
     "gains osprey --lag": ["nan", "1,2", ","],
-    "gains osprey --samples 0 --inputs": ["rudder,x"],
-    "gains osprey --samples": ["-1", "1000000000"],
-    "gains osprey --seed": ["x"],
+    "gains osprey --set samples=0 --set inputs=": ["rudder,x"],
+    "gains osprey --set samples=": ["-1", "1000000000"],
+    "gains osprey --set seed=": ["x"],
     "play cut --rate": ["nan", "0", "1e9"],
     "play cut --start": ["inf", "-1"],
     "play cut --topics": ["nothing", "\x1b"],
@@ -114,20 +114,21 @@ OPTIONS = {
     "replay cut --set": ["=", "controller.k_g", "controller.k_g=[", "controller.k_g=&a [*a]"],
     "report cut --png": ["/dev/null/x.png", "nowhere/x.png"],
     "report cut --csv": ["nowhere/x.csv"],
-    "report cut --html": ["nowhere/x.html"],
-    "check-signs px4 --airframe": ["absent", "text.yaml"],
-    "check-signs px4 --scenario": ["absent"],
+    "report cut --set html=": ["nowhere/x.html"],
+    "check px4 --airframe": ["absent", "text.yaml"],
+    "check px4 --scenario": ["absent"],
 }
 
 
 @pytest.mark.parametrize("command", OPTIONS)
 def test_an_invalid_value_is_rejected(command: str, garbage: Path) -> None:
     for value in OPTIONS[command]:
-        require_rejection(rise_di(*command.split(), value))
+        *words, last = command.split()
+        require_rejection(rise_di(*words, *([last + value] if last.endswith("=") else [last, value])))
 
 
-COMMANDS = ["fly", "report", "replay", "repair", "play", "gains", "check-signs", "airframes", "layouts", "identify"]
-OTHERS = ["--json", "--set", "--in-process", "--duration", "--bag", "--", "-", "--help", "--topics", "--rate", "--check"]
+COMMANDS = ["fly", "report", "replay", "play", "gains", "check", "airframes", "layouts", "identify"]
+OTHERS = ["--json", "--set", "--in-process", "--duration", "--run", "--", "-", "--help", "--topics", "--rate", "--check"]
 VALUES = ["osprey", "px4", "cut", "text", "absent", "nan", "0", "y"]
 WORDS = st.sampled_from(COMMANDS + OTHERS + VALUES) | st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=5)
 

@@ -542,9 +542,9 @@ def test_signs_of_map_compared_with_those_of_controller(sign: int, tmp_path: Pat
         "sign": sign * content["inputs"]["elevator"].get("sign", 1)
     }
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    check = CliRunner().invoke(app, ["check-signs", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)])
+    check = CliRunner().invoke(app, ["check", str(tmp_path / "map.yaml"), "--scenario", str(SCENARIO)])
     assert (check.exit_code == 0) is (sign > 0), check.output
-    words = ("fly", str(SCENARIO), "--bridge", str(tmp_path / "map.yaml"), "--send", "--runs", str(tmp_path / "runs"))
+    words = ("fly", str(SCENARIO), "--bridge", str(tmp_path / "map.yaml"), "--send", "--set", f"runs={tmp_path / 'runs'}")
     if sign < 0:
         refused = CliRunner().invoke(app, words)
         assert "D of q and elevator is -1, the controller has +1" in str(refused.exception)

@@ -18,7 +18,7 @@ from aircraft_sim.airframe import Airframe, load_airframe
 from aircraft_sim.airframe_import import import_airframe
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_cli.airframe import airframe as command
+from flight_cli.cli import application
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from rise_di.own_airframe import new_airframe
@@ -302,17 +302,20 @@ def test_command_writes_airframe_and_scenario(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     scipy.io.savemat("navion.mat", {"A": A, "B": B})
     arguments = [
-        "new",
+        "airframes",
         "navion.mat",
-        "--speed",
-        NAMES["speed"],
+        "--write",
+        ".",
+        "--set",
+        f"speed={NAMES['speed']}",
         "--states",
         NAMES["states"],
         "--inputs",
         NAMES["inputs"],
-        "--thrust",
+        "--set",
+        "thrust",
     ]
-    result = CliRunner().invoke(command, arguments, catch_exceptions=False)
+    result = CliRunner().invoke(application(["airframes"]), arguments, catch_exceptions=False)
     assert result.exit_code == 0
     assert "elevator (rad, positive: nose down)" in result.stdout
     read: Airframe = load_airframe("navion.yaml")

@@ -145,7 +145,7 @@ def test_truncated_file_read_up_to_last_complete_chunk(fraction: float, tape: Ta
     assert (back["y"].values == tape["y"].values[: len(back["y"].stamp_ns)]).all()
     end = max(back.time(name)[-1] for name in back.signals)
     assert f"run_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s" in back.notes[0]
-    assert back.notes[1] == f"metadata.yaml is missing: rise-di repair {run}"
+    assert back.notes[1] == f"metadata.yaml is missing: rise-di report --repair {run}"
 
 
 @pytest.mark.parametrize("opcode", [None, Opcode.DATA_END, Opcode.FOOTER], ids=["content", "opcode of an end", "of a footer"])

@@ -393,13 +393,13 @@ def refusal(*words: str) -> str:
 def test_damaged_chunk_or_chunk_of_another_campaign_named(flown: Campaign, content: bytes) -> None:
     path = flown.folder / CHUNKS / "0-000000.parquet"
     path.write_bytes(content)
-    assert refusal("--resume", str(flown.folder)).startswith(
+    assert refusal(str(flown.folder)).startswith(
         f"{path}: found {'9' if content == made_up(np.ones(9)) else 'none'}, expected the figures"
     )
 
 
 def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campaign) -> None:
-    words = ["campaign", "--resume", str(flown.folder)]
+    words = ["campaign", str(flown.folder)]
     shown = CliRunner().invoke(application(["campaign"]), words).stdout
     assert "B[p,aileron]" in shown
     ranked = json.loads((flown.folder / SUMMARY).read_text(encoding="utf-8"))["cases"][0]["influence"]
@@ -424,16 +424,16 @@ def test_results_name_entry_that_decides_score_and_its_worst_corner(flown: Campa
 
 def test_command_writes_rows_in_one_file(flown: Campaign, tmp_path: Path) -> None:
     path = tmp_path / "rows.parquet"
-    words = ["campaign", "--resume", str(flown.folder), "--rows", str(path), "--json"]
+    words = ["campaign", str(flown.folder), "--rows", str(path), "--json"]
     assert CliRunner().invoke(application(["campaign"]), words).exit_code == 0
     assert pl.read_parquet(path).equals(CampaignResult(flown.folder, flown.folder / REPORT, {}).rows())
-    sentence = refusal("--resume", str(flown.folder), "--rows", str(tmp_path / "none" / "rows.parquet"))
+    sentence = refusal(str(flown.folder), "--rows", str(tmp_path / "none" / "rows.parquet"))
     assert sentence.startswith("--rows: found ")
 
 
 def test_campaign_is_not_continued_with_another_definition(flown: Campaign) -> None:
-    sentence = refusal("--resume", str(flown.folder), "--aircraft", "1000")
-    assert sentence == "--aircraft: found it beside --resume, expected none: the folder of a campaign holds its definition"
+    sentence = refusal(str(flown.folder), "--aircraft", "1000")
+    assert sentence == "--aircraft: found it beside a folder, expected none: the folder of a campaign holds its definition"
 
 
 def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
@@ -442,7 +442,7 @@ def command(*arguments: str, cwd: Path) -> "subprocess.Popen[str]":
 
 
 def new(aircraft: int, *more: str) -> tuple[str, ...]:
-    return ("osprey_servo", "--duration", "5", "--aircraft", str(aircraft), "--chunk", "20", "--seed", "7", *more)
+    return ("osprey_servo", "--duration", "5", "--aircraft", str(aircraft), "--set", "chunk=20", "--seed", "7", *more)
 
 
 def figures(process: "subprocess.Popen[str]") -> list[object]:
@@ -469,22 +469,22 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> list[object]:
 
 
 def test_killed_campaign_resumes_to_figures_of_uninterrupted_one(whole: list[object], tmp_path: Path) -> None:
-    stopped = command(*new(200, "--runs", "part", "--workers", "1"), cwd=tmp_path)
+    stopped = command(*new(200, "--set", "runs=part", "--set", "workers=1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 2, stopped)
     stopped.send_signal(signal.SIGKILL)
     stopped.communicate()
     assert 2 <= len(list((folder / CHUNKS).glob("*.parquet"))) < 10, "the campaign ended before the kill"
-    assert figures(command("--resume", str(folder), cwd=tmp_path)) == whole
+    assert figures(command(str(folder), cwd=tmp_path)) == whole
 
 
 def test_ctrl_c_prints_the_command_to_resume(tmp_path: Path) -> None:
-    stopped = command(*new(4000, "--runs", "part", "--workers", "1"), cwd=tmp_path)
+    stopped = command(*new(4000, "--set", "runs=part", "--set", "workers=1"), cwd=tmp_path)
     folder = wait_for_chunks(tmp_path / "part", 1, stopped)
     stopped.send_signal(signal.SIGINT)
     output, errors = stopped.communicate()
     assert stopped.returncode == 130, errors
     assert "Traceback" not in errors
-    assert f"continue with: rise-di campaign --resume {folder.relative_to(tmp_path)}" in output + errors
+    assert f"continue with: rise-di campaign {folder.relative_to(tmp_path)}" in output + errors
 
 
 def square(job: engines.Job) -> int:
@@ -510,12 +510,12 @@ def test_campaign_goes_on_with_scheduler_that_is_back() -> None:
 def test_chunk_beyond_memory_is_one_sentence(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second is the text of an error of JAX."""
     monkeypatch.setattr("flight_campaign.campaign.fly_chunk_figures", Mock(side_effect=error))
-    with pytest.raises(ParameterError, match=r"--chunk: found 20 aircraft at once, which need more memory .* expected fewer"):
+    with pytest.raises(ParameterError, match=r"chunk: found 20 aircraft at once, which need more memory .* expected fewer"):
         fly_chunk(definition().model_dump_json(), (0, 0))
 
 
 def test_two_dask_workers_give_same_figures_and_killed_one_repeats_only_chunks(whole: list[object], tmp_path: Path) -> None:
-    spread = command(*new(200, "--runs", "spread", "--engine", "dask", "--workers", "2"), cwd=tmp_path)
+    spread = command(*new(200, "--set", "runs=spread", "--engine", "dask", "--set", "workers=2"), cwd=tmp_path)
     wait_for_chunks(tmp_path / "spread", 2, spread)
     workers = [process for process in psutil.Process(spread.pid).children(recursive=True) if process.cpu_times().user > 0.5]
     assert workers, "no worker of dask found"

@@ -168,7 +168,7 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
                 lines += [f"{of} {field}" for field, of in fields.items() if (release, field) != ("2", "true_airspeed_m_s")]
                 (messages / f"{name}.msg").write_text("\n".join(lines), encoding="utf-8")
     options = [word for release in versions for word in ("--definitions", str(tmp_path / release))]
-    result = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", *options, "--json"])
+    result = CliRunner().invoke(application(["check"]), ["check", "px4", *options, "--json"])
     assert result.exit_code == 1
     status = "/fmu/out/vehicle_status_v1: version 4, whose topic is /fmu/out/vehicle_status_v4"
     found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
@@ -177,16 +177,16 @@ def test_check_map_tells_which_rows_hold_for_each_release(tmp_path: Path) -> Non
         "conditions.armed": ["", status],
         "conditions.offboard": ["", status],
     }
-    alone = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", *options[:2]])
+    alone = CliRunner().invoke(application(["check"]), ["check", "px4", *options[:2]])
     assert alone.exit_code == 0
     assert "1: 24 of 24 rows hold" in alone.output
-    refused = CliRunner().invoke(application(["check-map"]), ["check-map", "px4", "--definitions", str(tmp_path / "1" / "msg")])
+    refused = CliRunner().invoke(application(["check"]), ["check", "px4", "--definitions", str(tmp_path / "1" / "msg")])
     assert "expected a folder with the sources of a message package" in str(refused.exception)
 
 
 def test_check_map_of_mavlink_without_pymavlink_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(installation, "find_spec", lambda name: None)
-    result = CliRunner().invoke(application(["check-map"]), ["check-map", "ardupilot_mavlink"])
+    result = CliRunner().invoke(application(["check"]), ["check", "ardupilot_mavlink", "--definitions", "installed"])
     assert str(result.exception) == "found no Python package pymavlink, expected it: make autopilot"
 
 
@@ -202,7 +202,9 @@ def test_check_map_finds_field_that_row_cannot_use(key: str, change: dict[str, s
     content = yaml.safe_load(MAP_FILES["odometry"].read_text(encoding="utf-8"))
     content["pose"][key] |= change
     (tmp_path / "changed.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
-    result = CliRunner().invoke(application(["check-map"]), ["check-map", str(tmp_path / "changed.yaml"), "--json"])
+    result = CliRunner().invoke(
+        application(["check"]), ["check", str(tmp_path / "changed.yaml"), "--definitions", "installed", "--json"]
+    )
     found = {row["key"]: row["faults"] for row in json.loads(result.output)["rows"] if any(row["faults"])}
     assert found == {f"pose.{key}": [fault]}
 

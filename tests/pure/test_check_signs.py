@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check-signs`: a map with a wrong sign is refused before anything is sent."""
+"""`rise-di check`: a map with a wrong sign is refused before anything is sent."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ def changed(original: ChannelMap, kind: str, channel: str, **values: Any) -> Cha
 
 @pytest.mark.parametrize("name", MAPS)
 def test_shipped_maps_fit_controller_of_osprey(name: str) -> None:
-    result = CliRunner().invoke(app, ["check-signs", str(MAP_FILES[name]), "--json"])
+    result = CliRunner().invoke(app, ["check", str(MAP_FILES[name]), "--json"])
     assert result.exit_code == 0
     channels = [(channel["output"], channel["input"], channel["D"]) for channel in json.loads(result.stdout)["channels"]]
     assert channels == [("q", "elevator", 1), ("p", "aileron", 1), ("r", "rudder", 1), ("V", "thrust", 1)]
@@ -89,7 +89,7 @@ def test_command_refuses_flipped_map_with_sentence(tmp_path: Path) -> None:
     path, flipped = tmp_path / "ardupilot.yaml", changed(load_map("ardupilot"), "inputs", "elevator", sign=-1)
     content = json.loads(json.dumps(flipped.model_dump(exclude_none=True)))  # lists in place of tuples, for YAML
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    result = CliRunner().invoke(app, ["check-signs", str(path)])
+    result = CliRunner().invoke(app, ["check", str(path)])
     assert result.exit_code == 1
     sentence = "error: with the map ardupilot D of q and elevator is -1, the controller has +1: a positive elevator means nose"
     assert sentence in result.stderr

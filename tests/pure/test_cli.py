@@ -3,18 +3,22 @@
 """The command line: exit status, sentences, files."""
 
 import json
+import re
 import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.replay import recorded_scenario
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.cli import COMMANDS, application
+from flight_cli.words import GONE
+from flight_core.parameters import ParameterError
 
 pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
 
@@ -105,7 +109,7 @@ def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
 
 def test_help_names_every_option() -> None:
     shown = CliRunner().invoke(application(["fly"]), ["fly", "--help"])
-    for option in ("--duration", "--in-process", "--runs", "--json"):
+    for option in ("--duration", "--in-process", "--set", "--json"):
         assert option in shown.stdout
 
 
@@ -131,6 +135,45 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
 
 def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
     assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
+
+
+def options_of(name: str) -> set[str]:
+    """The options of a command; its settings are one, --set."""
+    command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
+    return {each.opts[0].split()[0] for each in command.params if each.param_type_name == "option"}
+
+
+def test_commands_and_options_are_few() -> None:
+    assert len(COMMANDS) <= 20
+    assert {name: found for name in COMMANDS if len(found := options_of(name)) > 10} == {}
+
+
+@pytest.mark.parametrize("words", GONE)
+def test_name_that_is_gone_is_one_sentence_with_the_new_one(words: str) -> None:
+    name = words.partition(" ")[0]
+    result = CliRunner().invoke(application(COMMANDS), words.split())
+    assert str(result.exception).endswith(f"expected {GONE[words]}")
+    assert isinstance(result.exception, ParameterError)
+    new = next((word for word in GONE[words].split() if word in COMMANDS), name)
+    assert set(re.findall(r"--[a-z-]+", GONE[words])) <= options_of(new)
+
+
+def test_option_that_became_a_setting_names_it() -> None:
+    result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--y-rate", "50"])
+    assert str(result.exception) == "--y-rate: found an option that is gone, expected --set y_rate"
+    unknown = CliRunner().invoke(application(["export"]), ["export", "osprey_servo", "--set", "rate=50"])
+    assert str(unknown.exception) == "--set: found 'rate=50', expected one of no settings"
+
+
+def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
+    listed = json.loads(CliRunner().invoke(application(["scenarios"]), ["scenarios", "--json"]).output)
+    assert [row["name"] for row in listed] == sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+    (servo,) = (row for row in listed if row["name"] == "osprey_servo")
+    assert (servo["aircraft"], servo["law"]) == ("osprey", "rise_di")
+    assert servo["flies"].startswith("Commands on every channel and two gusts")
+    shown = CliRunner().invoke(application(["scenarios"]), ["scenarios", "osprey_gust"])
+    assert "osprey_gust" in shown.output
+    assert "osprey_route" not in shown.output
 
 
 def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:

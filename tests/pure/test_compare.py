@@ -140,7 +140,7 @@ def test_shipped_gains_are_those_of_the_catalogue(name: str) -> None:
     [
         (["--laws", "rise,magic"], "'magic'"),
         (["--uncertainty", "0.3,1"], "0 and below 1"),
-        (["--gains", "nowhere.yaml", "--laws", "pi"], "--tune"),
+        (["--set", "gains=nowhere.yaml", "--laws", "pi"], "--tune"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments: list[str], words: str) -> None:
@@ -169,8 +169,19 @@ def brief_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_command_writes_what_it_shows(gains_file: Path, brief_file: Path, tmp_path: Path) -> None:
     path = tmp_path / "compared.json"
-    arguments = ["--laws", "rise,l1", "--aircraft", "2", "--uncertainty", "0.3", "--tuning", "gust", "--gains", str(gains_file)]
-    arguments += ["--wind", "published"]
+    arguments = [
+        "--laws",
+        "rise,l1",
+        "--aircraft",
+        "2",
+        "--uncertainty",
+        "0.3",
+        "--tuning",
+        "gust",
+        "--set",
+        f"gains={gains_file}",
+    ]
+    arguments += ["--set", "wind=published"]
     result = CliRunner().invoke(app, ["compare", str(brief_file), *arguments, "--json", str(path)])
     assert result.exit_code == 0, result.output
     found = json.loads(path.read_text(encoding="utf-8"))
@@ -220,7 +231,7 @@ def test_interrupted_tuning_resumes_with_missing_laws(
         return initial(names[law.title], short)
 
     monkeypatch.setattr(tuning, "tune", tune)
-    arguments = ["compare", str(brief_file), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--gains", str(path)]
+    arguments = ["compare", str(brief_file), "--laws", "rise,pi,l1", "--aircraft", "1", "--tune", "--set", f"gains={path}"]
     CliRunner().invoke(app, arguments)
     assert list(tuned_gains.load(path)) == ["rise"]
     result = CliRunner().invoke(app, arguments)

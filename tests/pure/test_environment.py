@@ -23,7 +23,7 @@ BAD_INPUT = 2
 RISE_DI = [sys.executable, "-m", "flight_cli.cli"]
 STARTS = {
     "fly": [*RISE_DI, "fly", "--duration", "1"],
-    "target": [*RISE_DI, "target", "heading=90"],
+    "guide": [*RISE_DI, "guide", "heading=90"],
     "engage": [*RISE_DI, "engage"],
     "node": [sys.executable, "-m", "rise_di_controller.main"],
 }

@@ -71,15 +71,15 @@ def without_ros(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
 
 
 @pytest.mark.package("flight_cli")
-@pytest.mark.parametrize("words", [["fleet"], ["fly", "osprey_gust", "--in-process"]])
+@pytest.mark.parametrize("words", [["fly"], ["fly", "osprey_gust", "--in-process"]])
 def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def interrupted(*runs: Path, **options: Any) -> NoReturn:
         assert all(run.is_dir() for run in runs)
         raise KeyboardInterrupt
 
     without_ros.setattr("flight_cli.watch.watched", interrupted)
-    file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fleet"] else []
-    arguments = [*words, *file, "--watch", "--runs", str(tmp_path / "runs")]
+    file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fly"] else []
+    arguments = [*words, *file, "--watch", "--set", f"runs={tmp_path / 'runs'}"]
     assert CliRunner().invoke(application([words[0]]), arguments).exit_code == 130
     assert list((tmp_path / "runs").iterdir()) == []
 
@@ -94,8 +94,8 @@ def test_interrupt_of_reports_shows_what_was_flown(without_ros: pytest.MonkeyPat
 
     without_ros.setattr(fleet, "fly_fleet", flown)
     without_ros.setattr(fleet, "write_report", reported)
-    arguments = ["fleet", str(fleet_file(tmp_path, FLEET_OF_TWO)), "--runs", str(tmp_path / "runs"), "--json"]
-    result = CliRunner().invoke(application(["fleet"]), arguments)
+    arguments = ["fly", str(fleet_file(tmp_path, FLEET_OF_TWO)), "--set", f"runs={tmp_path / 'runs'}", "--json"]
+    result = CliRunner().invoke(application(["fly"]), arguments)
     assert result.exit_code == 130
     outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}
     assert outcomes["one"] == "never flew: no sample"

@@ -196,7 +196,7 @@ def test_replaced_file_is_not_read_on(part: float, run: Path) -> None:
     fresh.write_bytes(content[: int(part * len(content))])
     fresh.replace(path)
     assert list(follower.read()) == []
-    assert follower.fault == f"{path} was replaced by another file, as rise-di repair does"
+    assert follower.fault == f"{path} was replaced by another file, as rise-di report --repair does"
 
 
 def test_file_locked_as_long_as_recorder_holds_it(tmp_path: Path) -> None:

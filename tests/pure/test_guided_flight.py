@@ -412,9 +412,12 @@ def test_route_file_flown_and_stays_with_flight(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["target", "bank=3"], "target: found 'bank=3', expected NAME=VALUE with one of phi, heading"),
-        (["target", "V=30", "V=31"], "target: found a command twice, expected each once"),
-        (["fly", "--in-process", "--origin", "47.4,8.5"], "--origin: found no --route, expected the file of a route"),
+        (["guide", "bank=3"], "guide: found 'bank=3', expected NAME=VALUE with one of phi, heading"),
+        (["guide", "V=30", "V=31"], "guide: found a command twice, or two, expected each once"),
+        (
+            ["fly", "--in-process", "--set", "route.origin=47.4,8.5"],
+            "--set route.origin: found no --route, expected the file of a route",
+        ),
     ],
 )
 def test_bad_words_of_command_line_are_one_sentence(words: list[str], sentence: str) -> None:

@@ -171,7 +171,7 @@ def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
     file = tmp_path / "fleet.yaml"
     file.write_text("{composed: true, aircraft: {uav1: {}}}", encoding="utf-8")
     (fleet,), context = started("fleet", fleet=file, duration="3.0", watch="true")
-    assert [str(word) for word in fleet.cmd[1:]] == ["fleet", str(file), "--runs", "runs", "--duration", "3.0", "--watch"]
+    assert [str(word) for word in fleet.cmd[1:]] == ["fly", str(file), "--set", "runs=runs", "--duration", "3.0", "--watch"]
     assert ends(fleet.on_exit(ProcessExited("fleet", 0), context))
     with pytest.raises(RuntimeError, match="the fleet ended with status 3"):
         fleet.on_exit(ProcessExited("fleet", 3), context)

@@ -138,9 +138,9 @@ def test_models_that_do_not_fit_are_refused(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--model", "osprey"], "error: --model: found osprey, expected observer beside it"),
+        (["--set", "model=osprey"], "error: --set model: found osprey, expected observer beside it"),
         (["--observer", "--check"], "error: --observer: found it beside --check"),
-        (["--observer", "--margin", "0.9"], "error: --margin: found 0.9, expected 0 to 0.5 s"),
+        (["--observer", "--set", "margin=0.9"], "error: --set margin: found 0.9, expected 0 to 0.5 s"),
     ],
 )
 def test_command_refuses_options_that_contradict_each_other(arguments: list[str], sentence: str) -> None:

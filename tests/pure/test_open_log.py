@@ -90,16 +90,16 @@ COMMANDS = {
     "replay": ["replay"],
     "watch": ["watch", "--text"],
     "play": ["play"],
-    "repair": ["repair"],
-    "identify": ["identify", "--airframe", "osprey", "--log"],
-    "check-signs": ["check-signs", "ardupilot", "--bag"],
+    "repair": ["report", "--repair"],
+    "identify": ["identify", "--airframe", "osprey"],
+    "check": ["check", "ardupilot", "--run"],
 }
 
 
 def refusal(command: str, *words: str) -> str:
     """The sentence of a command that refuses."""
     line = [*COMMANDS[command], *words]
-    result = CliRunner().invoke(application([command]), line)
+    result = CliRunner().invoke(application(line[:1]), line)
     assert isinstance(result.exception, ParameterError), (result.output, result.exception)
     return str(result.exception)
 
@@ -170,10 +170,11 @@ def test_two_aircraft_are_shown_one_at_time(messages: list[Recorded], osprey_gus
     bag, shorter = tmp_path / "bag", [message for message in messages if message.log_ns < EPOCH + 1000 * MS]
     both = [*in_namespace("/uav1", messages), *in_namespace("/uav2", shorter)]
     write_mcap(bag, sorted(both, key=lambda message: message.log_ns))
-    for command in ("report", "replay", "check-signs", "identify"):
-        given = ["--scenario", "osprey_gust"]
+    for command in ("report", "replay", "check", "identify"):
+        given = ["--set", "scenario=osprey_gust"] if command == "identify" else ["--scenario", "osprey_gust"]
         assert "aircraft in the namespaces /uav1, /uav2" in refusal(command, str(bag), *given)
-        assert "expected one in 'uav3'" in refusal(command, str(bag), *given, "--namespace", "uav3")
+        name = ["--set", "namespace=uav3"] if command == "identify" else ["--namespace", "uav3"]
+        assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *name)
     assert "expected one in 'uav3'" in refusal("watch", str(bag), "--namespace", "uav3")
     assert "expected one in 'uav3'" in refusal("play", str(bag), "--namespace", "uav3")
     for name, duration in (("uav1", 2.0), ("uav2", 0.99)):  # by the last u

@@ -169,7 +169,7 @@ def test_link_in_folder_is_not_followed(run: Path, tmp_path: Path) -> None:
 
 def test_command_prints_kept_messages_and_missing_time(run: Path) -> None:
     def command() -> str:
-        words = [sys.executable, "-m", "flight_cli.cli", "repair", "run"]
+        words = [sys.executable, "-m", "flight_cli.cli", "report", "--repair", "run"]
         return subprocess.run(words, cwd=run.parent, capture_output=True, text=True, check=True).stdout
 
     assert command() == "run is intact: nothing to repair\n"

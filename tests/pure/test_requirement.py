@@ -180,7 +180,7 @@ def rise_di(*arguments: str) -> Result:
 def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
     path = tmp_path / "gains.yaml"
     page = tmp_path / "loop.html"
-    result = rise_di("osprey", "--samples", "2", "--phase-margin", "50", "--write", str(path), "--page", str(page))
+    result = rise_di("osprey", "--set", "samples=2", "--set", "phase-margin=50", "--write", str(path), "--page", str(page))
     assert result.exit_code == 0, result.output
     assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(
         re.findall(r">([^<>]+)<", page.read_text())

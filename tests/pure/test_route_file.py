@@ -213,7 +213,7 @@ def test_mission_counts_from_sea_where_pose_does(tmp_path: Path) -> None:
     assert read_route(path)[0].point == pytest.approx(PLACES[1], abs=1e-6)
     # The altitude of the home as the aircraft counts, where nothing else of the flight is known.
     assert [waypoint.altitude for waypoint in read_route_file(path, ZURICH, 7.0, above_sea=None).waypoints] == [57.0, 107.0]
-    with pytest.raises(ParameterError, match=r"found an altitude above the home, expected --altitude"):
+    with pytest.raises(ParameterError, match=r"found an altitude above the home, expected --set route.altitude"):
         read_route_file(path, ZURICH, above_sea=None)
     with pytest.raises(ParameterError, match="expected an origin"):
         read_route_file(path, None, 7.0, above_sea=None)
@@ -404,13 +404,15 @@ def test_line_of_a_file_with_several_is_chosen(line: str, tmp_path: Path) -> Non
     north = pymap3d.geodetic2enu(47.45, 8.5, 0.0, *ZURICH, 0.0)[1]
     assert [waypoint.north for waypoint in route.waypoints] == pytest.approx([north, north + 1112.0], abs=1.0)
     assert route.notes == ("1 further lines and 3 wpt beside the trk: no part of the route",)
-    with pytest.raises(ParameterError, match=r"found 2 trk, expected one, or --line 1 \(morning\), 2 \(evening\)"):
+    with pytest.raises(ParameterError, match=r"found 2 trk, expected one, or --set route.line=1 \(morning\), 2 \(evening\)"):
         read_route_file(path, ZURICH)
-    with pytest.raises(ParameterError, match=r"--line: found '3', which names 0 lines, expected --line 1 \(morning\)"):
+    with pytest.raises(
+        ParameterError, match=r"route.line: found '3', which names 0 lines, expected --set route.line=1 \(morning\)"
+    ):
         read_route_file(path, ZURICH, line="3")
     path = tmp_path / "r.plan"
     path.write_text(json.dumps(plan([])), encoding="utf-8")
-    with pytest.raises(ParameterError, match="--line: found a mission"):
+    with pytest.raises(ParameterError, match=r"route\.line: found a mission"):
         read_route_file(path, line=line)
 
 
@@ -553,7 +555,7 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
             r"route\[0\]: found a position on the other half of the Earth, expected one near",
         ),
         ("r.geojson", line([[47.4, 8.5, 500.0]]), "found latitude and longitude exchanged, by the origin"),
-        ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or --line 1, 2"),
+        ("r.geojson", {"features": [line(), line()]}, "found 2 LineStrings, expected one, or --set route.line=1, 2"),
         (
             "r.geojson",
             {"type": "Curve", "coordinates": SQUARE},
@@ -562,7 +564,11 @@ ENTITY = '<!DOCTYPE kml [<!ENTITY a "8.5,47.4,500">]>'
         ("r.geojson", line() | {"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::2056"}}}, "the coordinate system 'urn:"),
         ("r.kml", kml("<NetworkLink/>"), "found no LineString and no Point, but 1 NetworkLink"),
         ("r.gpx", gpx(SEGMENTS.format(47.43)), r"found a gap of 3\.3 km between two trkseg, expected at most 1 km"),
-        ("r.gpx", gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'), r"route\[0\]: found a rtept without ele, .* --altitude"),
+        (
+            "r.gpx",
+            gpx('<rte><rtept lat="47.4" lon="8.5"/></rte>'),
+            r"route\[0\]: found a rtept without ele, .* --set route.altitude",
+        ),
         ("r.plan", {"fileType": "Plan"}, "found no mission with items"),
         (
             "r.plan",

@@ -305,7 +305,7 @@ def test_parameters_of_the_samples_count_and_not_the_last_ones(
     sentence = "SERVO2_REVERSED changes from 1 to 0 at 70.0 s of the log, after the samples: signs and effects are those of 1"
     assert f"warning: {sentence}" in result.stderr
     assert yaml.safe_load((bag / "vehicle_parameters.yaml").read_text(encoding="utf-8"))["SERVO2_REVERSED"] == 1.0
-    warn_of_lacks_in(bag, None)  # of check-signs and identify
+    warn_of_lacks_in(bag, None)  # of check and identify
     assert sentence in capsys.readouterr().err
 
 
@@ -336,12 +336,12 @@ def test_imported_log_is_read_with_the_map_of_its_import_alone(flight: Flight, t
     content = named_map("ardupilot").model_dump(mode="json", exclude_unset=True)
     content["inputs"]["elevator"]["trim"] = 0.01  # measured at each engagement
     require_map_of_import(ChannelMap.validate_mapping(content, "map"), read_run(bag))
-    identify = ["--log", str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
+    identify = [str(bag), "--speed", "25", "--write", str(tmp_path / "found")]
     for key, value in (("sign", -1), ("scale", 0.4), ("positive", "nose down")):
         path, inputs = tmp_path / f"{key}.yaml", content["inputs"]
         inputs_by_another = inputs | {"elevator": inputs["elevator"] | {key: value}}
         path.write_text(yaml.safe_dump(content | {"inputs": inputs_by_another}, sort_keys=False), encoding="utf-8")
-        for arguments in (["check-signs", str(path), "--bag", str(bag)], ["identify", "--bridge", str(path), *identify]):
+        for arguments in (["check", str(path), "--run", str(bag)], ["identify", "--bridge", str(path), *identify]):
             refused = str(CliRunner().invoke(app, arguments).exception)
             assert f"found inputs.elevator.{key} " in refused
             assert refused.endswith(f"expected {value}, that of the map ardupilot: import the log again, with --map")

@@ -195,7 +195,7 @@ def test_gains_of_bridge_that_sends_need_further_option(recorded: Path, osprey_g
         state = await desk.ask("state")
         assert state["bridge"] == {"map": "plane", "sends": True}
         status, sentence = await desk.refused("gains", digest=state["digest"], values={"k_g": [1.0]})
-        assert (status, sentence) == (403, "the bridge sends to an autopilot: gains need rise-di watch --control-real")
+        assert (status, sentence) == (403, "the bridge sends to an autopilot: gains need rise-di watch --control --set real")
 
     async def allowed(desk: Desk) -> None:
         state = await desk.ask("state")

@@ -244,7 +244,7 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup,
     del content["pose"], content["topics"]["/ap/airspeed"], content["topics"]["/ap/pose/filtered"]
     Path(setup.map).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     setup.autopilot()
-    options = ("--speed", "25", "--amplitude", "0.3", "--write", "found", "--json")
+    options = ("--speed", "25", "--set", "amplitude=0.3", "--write", "found", "--json")
     # 0.3 in place of 0.2: on a busy host, whose messages are late, it found Omega within 25 % and refused it.
     identify = start("flight_cli.cli", "identify", "--bridge", setup.map, *options)
     setup.peer.until(lambda: setup.peer.received["bridge/would_send"], "a u through the bridge")
@@ -263,5 +263,5 @@ def test_identify_excites_autopilot_and_writes_what_flies_it(setup: BridgeSetup,
     # with a phase margin of 54 degrees bears a factor of 2.
     assert abs(gain) == pytest.approx(abs(true), rel=0.4)
     (folder,) = tmp_path.rglob("found")
-    check = CliRunner().invoke(app, ["check-signs", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")])
+    check = CliRunner().invoke(app, ["check", str(folder / "map.yaml"), "--scenario", str(folder / "scenario.yaml")])
     assert check.exit_code == 0, check.output

@@ -41,13 +41,13 @@ def test_lockstep_fleet_flies_as_each_aircraft_alone(tmp_path: Path) -> None:
 
 def test_killed_aircraft_leaves_other_untouched_and_interrupt_ends_all(start: Start, tmp_path: Path) -> None:
     (tmp_path / "fleet.yaml").write_text("{composed: true, aircraft: {one: {}, two: {}}}", encoding="utf-8")
-    fleet = start("flight_cli.cli", "fleet", "fleet.yaml")
+    fleet = start("flight_cli.cli", "fly", "fleet.yaml")
 
     def engaged(name: str) -> bool:
         return any("OFF -> ENGAGED" in log.read_text() for log in tmp_path.glob(f"runs/*-{name}-*/log/one_process.log"))
 
     fleet.until(lambda: engaged("one") and engaged("two"), "both aircraft engaged")
-    target = [sys.executable, "-m", "flight_cli.cli", "target", "heading=90"]
+    target = [sys.executable, "-m", "flight_cli.cli", "guide", "heading=90"]
     missing = subprocess.Popen(target, stderr=subprocess.PIPE, text=True)
     nodes = fleet.children()
     next(node for node in nodes if "__ns:=/one" in node.cmdline()).kill()

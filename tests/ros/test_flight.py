@@ -41,7 +41,7 @@ def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start
     """The first by one interrupt, the one beside it by three: the further ones do not interrupt its shutdown."""
     flight, nodes = engaged
     assert len(nodes) == 4
-    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
     flight.interrupt()
@@ -101,7 +101,7 @@ def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command
     start: Start, engaged: Engaged, tmp_path: Path
 ) -> None:
     flight, nodes = engaged
-    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--runs", "beside/runs")
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
     beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
     nodes_beside = beside.children()
     refused = start("flight_cli.cli", "fly", "osprey_gust")

@@ -32,8 +32,8 @@ def test_pose_of_flight_reaches_flightgear(start: Start, peer_node: Peer) -> Non
             except BlockingIOError:
                 return
 
-        words = ("--origin", "47.38,8.54", "--altitude", "400", "--to", f"127.0.0.1:{viewer.getsockname()[1]}")
-        command = start("flight_cli.cli", "flightgear", "--namespace", "uav1", *words)
+        words = ("--set", "origin=47.38,8.54", "--set", "altitude=400", f"--flightgear=127.0.0.1:{viewer.getsockname()[1]}")
+        command = start("flight_cli.cli", "watch", "--namespace", "uav1", *words)
         peer_node.until(lambda: bool(received), "a packet for FlightGear", each=send)
     assert [fields(raw)["altitude"] for raw in received] == [450.0]  # m above sea level
     command.interrupt()

@@ -87,9 +87,11 @@ def tools_read(run: Path, logged: Signal) -> None:
 
 
 def test_lockstep_flight_takes_target_and_ends_with_name_of_lost_guidance(start: Start, tmp_path: Path) -> None:
-    command = start("flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--runs", "runs")
+    command = start(
+        "flight_cli.cli", "fly", str(scenario_file(tmp_path, 1e5, "osprey_route")), "--lockstep", "--set", "runs=runs"
+    )
     command.wait_for_log(tmp_path / "runs", FIRST_CHUNKS)
-    assert "in force: altitude=60" in start("flight_cli.cli", "target", "altitude=60").succeed().output
+    assert "in force: altitude=60" in start("flight_cli.cli", "guide", "altitude=60").succeed().output
     command.child("flight_guidance.main").kill()
     assert command.end() == 3
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
@@ -145,14 +147,14 @@ def flight(start: Start, peer_node: Peer, calm: Path) -> Flight:
 def test_command_and_page_say_what_guidance_took_and_refused(start: Start, peer_node: Peer, calm: Path) -> None:
     flight = Flight(start, peer_node, calm)
     flight.until(lambda: peer_node.received["u_m"], "a u_m")
-    good = start("flight_cli.cli", "target", "heading=90", "altitude=60")
+    good = start("flight_cli.cli", "guide", "heading=90", "altitude=60")
     flight.until(lambda: good.popen.poll() is not None, "the end of the command")
     assert "in force: heading=90, altitude=60" in good.succeed().output
     flight.until(
         lambda: (flight.last("target.heading"), flight.last("target.altitude")) == (math.pi / 2.0, 60.0),
         "both targets in force",
     )
-    rejected = start("flight_cli.cli", "target", "phi=80")  # degrees
+    rejected = start("flight_cli.cli", "guide", "phi=80")  # degrees
     flight.until(lambda: rejected.popen.poll() is not None, "the end of the command")
     assert rejected.end() == 1
     assert "error: not in force: target.phi: found 80, expected -30 to 30 deg" in rejected.output

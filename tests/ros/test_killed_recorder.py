@@ -79,7 +79,7 @@ def test_8_killed_recorders_lose_at_most_three_tenths_of_second(recorder: Record
         tape = read_run(folder).tape
         end = max(tape.time(name)[-1] for name in tape.signals)
         assert tape.notes[0] == f"run{k}_0.mcap is truncated: read up to its last complete chunk, t = {end:.3f} s"
-        assert tape.notes[1] == f"metadata.yaml is missing: rise-di repair {folder}"
+        assert tape.notes[1] == f"metadata.yaml is missing: rise-di report --repair {folder}"
     print([round(duration, 3) for duration in missing])
     assert max(missing) < 0.3, missing
 
@@ -102,7 +102,7 @@ def test_log_of_killed_recorder_reported_and_repairable(start: Start, osprey_gus
     report = start("flight_cli.cli", "report", str(run)).succeed()
     assert "is truncated: read up to its last complete chunk, t = " in " ".join(report.output.split())
     assert (run / "report.html").stat().st_size > 10_000
-    repair = start("flight_cli.cli", "repair", str(run)).succeed()
+    repair = start("flight_cli.cli", "report", "--repair", str(run)).succeed()
     assert "of the 30 s of the scenario" in repair.output
     assert count_messages(run)["/y"] == len(before.tape["y"].stamp_ns)
     after = read_run(run)

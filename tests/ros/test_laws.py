@@ -26,7 +26,7 @@ from rise_di_controller import laws
 
 pytestmark = pytest.mark.package("control_laws")
 
-OPTIONS = ["--lockstep", "--one-process"]
+OPTIONS = {"lockstep": ["--lockstep"], "composed": ["--lockstep", "--set", "composed"]}
 PULSES = {"q": {"start": [0.2], "stop": [1.0], "value": [0.1]}, "p": {"start": [0.4], "stop": [1.4], "value": [0.4]}}
 
 
@@ -69,9 +69,9 @@ def test_law_of_another_package_flies_in_lockstep_as_without_ros_and_replayed(st
     """In four processes and in one. tests/nodes/test_lockstep.py flies the other laws."""
     scenario = scenario_file(tmp_path / "pid.yaml", SECTIONS["pid"])
     runs = []
-    for option in OPTIONS:
-        start("flight_cli.cli", "fly", str(scenario), option, "--runs", option.strip("-")).succeed()
-        runs.append(tmp_path / option.strip("-") / "latest")
+    for folder, options in OPTIONS.items():
+        start("flight_cli.cli", "fly", str(scenario), *options, "--set", f"runs={folder}").succeed()
+        runs.append(tmp_path / folder / "latest")
     first = payloads(runs[0])
     for payload in map(payloads, runs[1:]):
         for topic in TOPICS:

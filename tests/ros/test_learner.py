@@ -64,7 +64,7 @@ def test_lockstep_with_a_learner_is_equal_to_the_byte_to_one_process_and_replays
 
 def test_law_flies_on_without_its_learner_and_takes_another(start: Start, tmp_path: Path) -> None:
     chosen = scenario(tmp_path, updates=[1.0, 2.5])
-    command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--runs", "runs")
+    command = start("flight_cli.cli", "fly", str(chosen.path), "--duration", "60", "--set", "runs=runs")
     command.wait_for("no model: record: found")
     learning = command.child("flight_design.main")
     learning.suspend()

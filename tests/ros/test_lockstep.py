@@ -48,7 +48,7 @@ def scenario_file(folder: Path, duration: float, name: str = "osprey_servo", **s
 
 def fly(start: Start, scenario: Path, runs: str, *options: str, status: int = 0) -> Path:
     """Fly to the end; return the folder of the run."""
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", runs, *options)
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", f"runs={runs}", *options)
     assert command.end() == status, command.output
     return scenario.parent / runs / "latest"
 
@@ -86,7 +86,7 @@ def test_runs_repeat_to_byte_on_busy_host_in_one_process_and_without_ros_and_are
     with both_cores_busy():
         busy = tmp_path / "busy"  # without the command, in the process of its caller
         assert fly_over_topics(load_scenario(scenario), busy, lambda t, shown: None, lockstep=True) == "completed"
-    runs = [busy, fly(start, scenario, "idle"), fly(start, scenario, "together", "--one-process")]
+    runs = [busy, fly(start, scenario, "idle"), fly(start, scenario, "together", "--set", "composed")]
     first, *others = map(payloads, runs)
     for topic in TOPICS:
         assert all(first[topic] == payload[topic] for payload in others), topic
@@ -150,7 +150,7 @@ def test_other_nodes_end_within_three_seconds_of_kill_and_name_it(
 def test_diverged_aircraft_ends_flight_with_reason_and_log(start: Start, tmp_path: Path) -> None:
     wrong = {"D": [-1, 1, 1, 1]}
     scenario = scenario_file(tmp_path, 60.0, "osprey_gust", controller=wrong)  # no saturation limits the wrong input
-    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--runs", "runs")
+    command = start("flight_cli.cli", "fly", str(scenario), "--lockstep", "--set", "runs=runs")
     assert command.end() == 3, command.output
     summary = json.loads((tmp_path / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
     assert re.fullmatch(r"aircraft ended with status 3: diverged at t = [\d.]+ s", summary["outcome"])

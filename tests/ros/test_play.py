@@ -124,7 +124,18 @@ def test_topics_that_cannot_be_sent_are_skipped_and_those_with_a_publisher_refus
 
 
 def test_controller_reproduces_flight_to_byte(start: Start, start_node: Start, tmp_path: Path, peer_node: Peer) -> None:
-    flight = start("flight_cli.cli", "fly", "osprey_gust", "--one-process", "--duration", "2", "--runs", str(tmp_path))
+    flight = start(
+        "flight_cli.cli",
+        "fly",
+        "osprey_gust",
+        "--lockstep",
+        "--set",
+        "composed",
+        "--duration",
+        "2",
+        "--set",
+        f"runs={tmp_path}",
+    )
     flight.succeed(120)
     recorded = tmp_path / "latest"
     u, internals = of(recorded, "u"), of(recorded, "internals")

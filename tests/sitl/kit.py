@@ -189,7 +189,15 @@ class Autopilot:
 
     def fly(self, scenario: Path, channel_map: str, duration: float, *options: str) -> Process:
         """Start a flight of the stack."""
-        arguments = (str(scenario), "--bridge", channel_map, "--duration", f"{duration:g}", "--runs", str(self.folder / "runs"))
+        arguments = (
+            str(scenario),
+            "--bridge",
+            channel_map,
+            "--duration",
+            f"{duration:g}",
+            "--set",
+            f"runs={self.folder / 'runs'}",
+        )
         return self.start("fly", *arguments, *options)
 
     @contextmanager

@@ -6,7 +6,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,6 +33,14 @@ BEGIN_TIME = 0.05  # s, in which the nodes of an aircraft receive t = 0, beside 
 A_FLEET = "a file of a fleet (.yaml): aircraft by name"
 Degrees = Annotated[float, Field(ge=-180, le=180)]
 Overrides = dict[str, dict[str, object]]
+
+
+def is_fleet(name: FilePath) -> bool:
+    """Whether the path is that of the file of a fleet, which has aircraft by name; a scenario has sections of nodes."""
+    with suppress(ParameterError):
+        content = read_yaml(Path(name), str(name), A_FLEET)
+        return isinstance(content, Mapping) and "aircraft" in content
+    return False
 
 
 class AircraftOfFleet(Config):

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fly a fleet on a full ROS 2: ros2 launch flight_bringup fleet.launch.py fleet:=fleet.yaml.
 
-It runs `rise-di fleet`, which starts, follows and ends every aircraft. The launch ends with it, with exit status 1 where an
+It runs `rise-di fly`, which starts, follows and ends every aircraft. The launch ends with it, with exit status 1 where an
 aircraft did not complete its flight.
 """
 
@@ -46,6 +46,6 @@ def _fly(context: LaunchContext) -> list[Action]:
         return [Shutdown(reason="fleet completed")]
 
     rise_di = ExecutableInPackage(package="flight_cli", executable="rise-di")
-    options = ["--runs", argument(context, "runs"), *(["--duration", duration] if duration else [])]
+    options = ["--set", f"runs={argument(context, 'runs')}", *(["--duration", duration] if duration else [])]
     options += ["--watch"] if argument(context, "watch") == "true" else []
-    return [ExecuteProcess(cmd=[rise_di, "fleet", file, *options], name="fleet", output="screen", on_exit=end)]
+    return [ExecuteProcess(cmd=[rise_di, "fly", file, *options], name="fleet", output="screen", on_exit=end)]

@@ -240,7 +240,7 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
         if isinstance(error, RuntimeError) and OUT_OF_MEMORY not in str(error):
             raise
         demand = f"{definition.chunk} aircraft at once, which need more memory than there is"
-        raise ParameterError(f"--chunk: found {demand}, expected fewer, or shorter delays of the aircraft") from None
+        raise ParameterError(f"chunk: found {demand}, expected fewer, or shorter delays of the aircraft") from None
     return encode(figures, definition.seed, definition.factor(job[0]))
 
 
@@ -423,7 +423,7 @@ class Campaign:
             table = pl.read_parquet(path, glob=False)
         except pl.exceptions.PolarsError:
             table = pl.DataFrame()
-        again = f"the figures of {size} aircraft of this campaign; remove the file, and --resume flies them again"
+        again = f"the figures of {size} aircraft of this campaign; remove the file, and the same command flies them again"
         require(table.height == size, str(path), f"{table.height or 'none'}", again)
         return table
 

@@ -97,7 +97,7 @@ def dask(workers: int | None = None, scheduler: str | None = None) -> Engine:
                     patience = RECONNECT
                 except KilledWorker as error:
                     failure = f"a chunk that ended {error.allowed_failures + 1} workers, as one that needs too much memory does"
-                    raise ParameterError(f"--engine dask: found {failure}, expected a smaller --chunk") from None
+                    raise ParameterError(f"--engine dask: found {failure}, expected a smaller --set chunk") from None
                 else:
                     return
 

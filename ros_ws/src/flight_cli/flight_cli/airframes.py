@@ -1,28 +1,89 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di airframes`: the assumptions of the theorem, checked on every airframe of the library, or on your own."""
+"""`rise-di airframes`: the assumptions of the theorem, on the airframes of the library or your own; a new airframe."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from flight_cli.output import new_table, print_json
+from flight_cli.output import new_table, parse_numbers, print_json
+from flight_core.files import display_path
+from flight_core.parameters import require
 from flight_design.gains.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
+from rise_di.own_airframe import NewAirframe, new_airframe
 
 
 def airframes(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[AIRFRAME]...", help="Names, or airframe files (.yaml); by default the library."),
+        typer.Argument(
+            metavar="[AIRFRAME]...",
+            help="Names, or airframe files (.yaml); by default the library. With --write one: an airframe file, a MATLAB file"
+            " (.mat), or a text of AVL (system matrix, stability derivatives) or XFLR5.",
+        ),
     ] = None,
+    write: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write NAME.yaml and NAME_flight.yaml, an airframe that flies.")
+    ] = None,
+    name: Annotated[str, typer.Option("--set name", help="Name of the airframe; by default that of the file.")] = "",
+    speed: Annotated[str | None, typer.Option("--set speed", help='Trim speed, in m/s or with a unit: "176 ft/s".')] = None,
+    states: Annotated[
+        str, typer.Option(help='States in the order of A, with units: "u: ft/s, w: ft/s, q: rad/s, theta: rad".')
+    ] = "",
+    inputs: Annotated[
+        str, typer.Option(help='Inputs in the order of B, with units and effects: "elevator: rad nose down, thrust: 1".')
+    ] = "",
+    outputs: Annotated[
+        str,
+        typer.Option(help='As many as inputs, or fewer: states, rows of C ("V: ft/s"), sums: "q, V = 0.987 u + 0.163 w".'),
+    ] = "",
+    thrust: Annotated[
+        bool, typer.Option("--set thrust", help="Add an input thrust in units of the weight along the flight path.")
+    ] = False,
+    lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the order of the inputs: 0.05,0.3")] = None,
+    mass: Annotated[str | None, typer.Option("--set mass", help='Beside AVL\'s derivatives: "3.2 kg" or "85 slug".')] = None,
+    Ixx: Annotated[str | None, typer.Option("--set Ixx", help='Body axes: "0.2 kg*m^2" or "1048 slug*ft^2".')] = None,
+    Iyy: Annotated[str | None, typer.Option("--set Iyy", help="As --Ixx.")] = None,
+    Izz: Annotated[str | None, typer.Option("--set Izz", help="As --Ixx.")] = None,
+    Ixz: Annotated[str | None, typer.Option("--set Ixz", help="As --Ixx; by default 0.")] = None,
+    density: Annotated[str | None, typer.Option("--set density", help='"1.225 kg/m^3" or "0.002377 slug/ft^3".')] = None,
+    length: Annotated[str | None, typer.Option("--set length", help="Unit of length of AVL's file, by default m.")] = None,
+    text: Annotated[str, typer.Option("--set source", help="Where the figures come from: a book and a page.")] = "",
+    replace: Annotated[bool, typer.Option("--set replace", help="Replace files of these names.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
 ) -> None:
     """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
 
+    With --write FOLDER: make NAME.yaml, an airframe that is checked against physics, and NAME_flight.yaml, a scenario with
+    selected gains. It has been flown once in this process: rise-di fly NAME_flight.yaml --in-process.
+
     Exit status: 0, or 2 for a file with a mistake.
     """
+    if write is not None:
+        require(len(names or ()) == 1, "airframes", f"{len(names or ())} sources", "one beside --write")
+        body = {"mass": mass, "Ixx": Ixx, "Iyy": Iyy, "Izz": Izz, "Ixz": Ixz, "density": density, "length": length}
+        lags = None if lag is None else parse_numbers(lag)
+        require(lags is None or bool(lags), "lag", repr(lag), "seconds separated by commas")
+        with Console().status("selecting gains and flying"):
+            draft = new_airframe(
+                (names or [""])[0],
+                folder=write,
+                name=name,
+                speed=speed,
+                states=states,
+                inputs=inputs,
+                outputs=outputs,
+                thrust=thrust,
+                text=text,
+                lag=lags,
+                replace=replace,
+                **{key: value for key, value in body.items() if value is not None},
+            )
+        _show_draft(draft)
+        return
     facts = [airframe_facts(name) for name in names] if names else library()
     if as_json:
         print_json([_as_json(airframe) for airframe in facts])
@@ -56,6 +117,18 @@ def airframes(
     )
     if marginal := marginal_sentence(facts):
         console.print(marginal, soft_wrap=True)
+
+
+def _show_draft(draft: NewAirframe) -> None:
+    """What was read, and the files that were written."""
+    frame = draft.airframe
+    print(f"read:     {draft.note}")
+    effects = (f"{key} ({channel.unit}, positive: {channel.positive})" for key, channel in frame.inputs.items())
+    print(f"inputs:   {', '.join(effects)}")
+    print(f"outputs:  {', '.join(frame.outputs)}")
+    print(f"airframe: {display_path(draft.airframe_file)}")
+    print(f"scenario: {display_path(draft.scenario_file)}")
+    print(f"fly it:   rise-di fly {display_path(draft.scenario_file)} --in-process")
 
 
 def _table(title: str, *headings: str) -> Table:

@@ -60,7 +60,7 @@ def identify_behind_bridge(
 ) -> None:
     """Excite the aircraft behind a map, or read the log of such a flight, and write what flies it into `folder`."""
     channel_map = load_map(map_name)
-    require(0.0 < amplitude <= 1.0, "--amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
+    require(0.0 < amplitude <= 1.0, "amplitude", amplitude, "above 0 and at most 1, a part of the limits of the map")
     known = speed is not None or not has_airspeed(channel_map)
     require(known, "--speed", "none", "the airspeed in trim, m/s: the map has one")
     require(folder.is_dir() or not folder.exists(), "--write", folder, "a folder, or the name of a new one")
@@ -78,7 +78,7 @@ def identify_behind_bridge(
         console.print(sentence, highlight=False, soft_wrap=True)
     airframe = folder / "airframe.yaml"
     flyable = flying_scenario(channel_map, channels, speed, str(airframe.resolve()), needed)
-    require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --accept beside --bridge")
+    require(accept or not flyable.lacking, "identify", flyable.lacking, "the margins, or --set accept beside --bridge")
     written_map = map_text(channel_map, trims, run.resolve().name)  # that of the run, not `latest`
     files = {"airframe": flyable.airframe, "scenario": flyable.scenario, "map": written_map}
     _write(folder, files)

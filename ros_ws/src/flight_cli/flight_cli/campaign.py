@@ -28,7 +28,6 @@ from flight_cli.output import (
     INTERRUPTED,
     SHOWN_COLUMN,
     new_table,
-    options,
     parse_numbers,
     print_json,
     progress_bar,
@@ -53,27 +52,38 @@ class EngineName(StrEnum):
 def campaign(
     context: typer.Context,
     scenario: Annotated[
-        str | None, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml); none with --resume.")
-    ] = None,
+        str,
+        typer.Argument(
+            help="Name of a scenario, or path of a scenario file (.yaml); or the folder of an interrupted campaign to continue."
+        ),
+    ] = "osprey_servo",
     aircraft: Annotated[int, typer.Option(min=1, help="How many uncertain aircraft.")] = 1000,
     uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B, 0 to 1.")] = 0.3,
     wind: Annotated[
         WindEffect | None,
-        typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
+        typer.Option(
+            "--set wind", help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."
+        ),
     ] = None,
     entry: Annotated[
         list[str] | None,
         typer.Option(
-            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', lag=0.5, noise=0.5, delay=0.02 (s)."
+            "--set entry",
+            help="An entry with a deviation of its own, once for each: 'B[V,thrust]=0.6', lag=0.5, noise=0.5, delay=0.02 (s).",
         ),
     ] = None,
     distribution: Annotated[
         Distribution | None,
-        typer.Option(help="Of the deviations: uniform, normal with three standard deviations at the limit, or its two limits."),
+        typer.Option(
+            "--set distribution",
+            help="Of the deviations: uniform, normal with three standard deviations at the limit, or its two limits.",
+        ),
     ] = None,
     score: Annotated[
         list[str] | None,
-        typer.Option(help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."),
+        typer.Option(
+            "--set score", help="Unit of the rms error of an output in the score, SI, as q=0.02; once for each output."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the aircraft.")] = 1,
     sweep: Annotated[
@@ -83,16 +93,21 @@ def campaign(
     duration: Annotated[float | None, typer.Option(help="Seconds to fly, in place of the scenario's.")] = None,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU."),
+        typer.Option(
+            "--set chunk", min=1, help=f"Aircraft computed at once, by default {CHUNK}, with a learner 1. Use more on a GPU."
+        ),
     ] = None,
     engine: Annotated[
         EngineName | None,
         typer.Option(help="Threads of this process, or processes and hosts of dask; by default dask with a learner."),
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Threads or processes; by default one a core.")] = None,
-    scheduler: Annotated[str | None, typer.Option(help="Address of a dask scheduler, as in tcp://host:8786.")] = None,
-    runs: Annotated[Path, typer.Option(help="Folder that the campaign's folder is made in.")] = Path("runs"),
-    resume: Annotated[Path | None, typer.Option(help="Folder of an interrupted campaign to continue.")] = None,
+    workers: Annotated[
+        int | None, typer.Option("--set workers", min=1, help="Threads or processes; by default one a core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--set scheduler", help="Address of a dask scheduler, as in tcp://host:8786.")
+    ] = None,
+    runs: Annotated[Path, typer.Option("--set runs", help="Folder that the campaign's folder is made in.")] = Path("runs"),
     rows: Annotated[
         Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
     ] = None,
@@ -102,31 +117,29 @@ def campaign(
 
     Aircraft with a learner fly one by one on each core, as by rise-di fly --in-process, half a minute each.
 
-    Exit status: 0 all flown, 2 bad input, 130 interrupted; --resume continues it.
+    Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
     require_package("jax")
-    require((scenario is None) == (resume is not None), "SCENARIO", scenario, "one of a scenario and --resume")
-    require(scheduler is None or engine is EngineName.DASK, "--scheduler", scheduler, "--engine dask with it")
+    require(scheduler is None or engine is EngineName.DASK, "scheduler", scheduler, "--engine dask with it")
     if rows is not None:
-        require(rows.parent.is_dir(), "--rows", rows, "a file in a folder that exists")
-    if resume is not None:
+        require(rows.parent.is_dir(), "rows", rows, "a file in a folder that exists")
+    if Path(scenario).is_dir():
         for name in OF_DEFINITION:
             source = context.get_parameter_source(name)
             is_default = source is None or source.name != "COMMANDLINE"
-            require(is_default, f"--{name}", "it beside --resume", "none: the folder of a campaign holds its definition")
-        monte_carlo = Campaign.resume(resume)
+            require(is_default, name, "it beside a folder", "none: the folder of a campaign holds its definition")
+        monte_carlo = Campaign.resume(Path(scenario))
     else:
-        chosen = find_scenario(str(scenario), duration)
+        chosen = find_scenario(scenario, duration)
         learner(chosen)  # refuses what the aircraft could not learn with
         swept = None if sweep is None else _parse_sweep(sweep)
         spread = chosen.aircraft.uncertainty.spread()
         if entry is not None:
-            spread = spread._replace(entries=_named_numbers("--entry", entry, "A[q,alpha]=0.6"))
+            spread = spread._replace(entries=_named_numbers("entry", entry, "A[q,alpha]=0.6"))
         if distribution is not None:
             spread = spread._replace(distribution=distribution)
-        units = None if score is None else _named_numbers("--score", score, "q=0.02")
-        with options("sweep", "score"):
-            definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
+        units = None if score is None else _named_numbers("score", score, "q=0.02")
+        definition = define(chosen, aircraft, uncertainty, seed, chunk, swept, wind, spread, units)
         monte_carlo = Campaign.begin(new_run(chosen, runs, "campaign-"), definition)
     if engine is None:
         engine = EngineName.DASK if monte_carlo.definition.scenario().learns() else EngineName.THREADS
@@ -134,7 +147,7 @@ def campaign(
     speed = _fly_missing(monte_carlo, flies, quiet=as_json)
     figures, results = write_results(monte_carlo)
     if rows is not None:
-        with writing("--rows", rows, "the path of a file"):
+        with writing("rows", rows, "the path of a file"):
             monte_carlo.write_rows(rows)
     if as_json:
         print_json(figures)
@@ -190,7 +203,7 @@ def _fly_missing(monte_carlo: Campaign, engine: engines.Engine, *, quiet: bool) 
     except KeyboardInterrupt:
         print(
             f"interrupted after {stored + flown} of {total}; continue with:"
-            f" rise-di campaign --resume {shlex.quote(display_path(monte_carlo.folder))}"
+            f" rise-di campaign {shlex.quote(display_path(monte_carlo.folder))}"
         )
         raise typer.Exit(INTERRUPTED) from None
     return flown * seconds / (time.monotonic() - begin)

@@ -11,6 +11,8 @@ import errno
 import gc
 import os
 import sys
+from collections import ChainMap
+from collections.abc import Collection
 from contextlib import suppress
 from keyword import iskeyword
 from pkgutil import resolve_name
@@ -19,6 +21,8 @@ from typing import Annotated
 
 import typer
 
+from flight_cli.words import Command, Commands
+
 FAILED = 1
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -26,37 +30,43 @@ NICE = 10  # of a command that may run beside a flight
 GARBAGE_THRESHOLD = 100_000  # new objects before a collection, 700 by default: a flight keeps what it makes
 REPEATED_AFTER = 0.01  # s, of an interrupt that Python ignores
 
-COMMANDS = MappingProxyType(
+GROUPS = MappingProxyType(
     {
-        "fly": "Fly a scenario over ROS 2 topics, in real time or in lockstep, or in one process.",
-        "fleet": "Fly several aircraft at once over ROS 2 topics, each in its namespace.",
-        "report": "Write the report page of a recorded run again, or one that compares several.",
-        "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
-        "play": "Publish the topics of a recorded flight again with their timing.",
-        "watch": "See a flight on a page, live while it is recorded, or again later.",
-        "import": "Make a bag from the log of an autopilot: DataFlash, tlog or ULog.",
-        "repair": "Rebuild the log of a run whose recorder was killed, or that is damaged.",
-        "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
-        "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
-        "gains": "Select gains for an airframe, and check every condition on them.",
-        "airframes": "Show airframes of the library or your own, and what the theorem asks of each.",
-        "airframe": "Make an airframe of your own from matrices, with a scenario that flies.",
-        "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
-        "learn": "Repeat the learner on the log of a flight, with other settings, and write the model.",
-        "check-map": "Tell for which releases of an autopilot the rows of a channel map hold.",
-        "check-signs": "Compare the signs of a channel map with the D of the controller.",
-        "target": "Command what a running guided flight holds: heading, altitude, airspeed and more.",
-        "guidance": "Hold, skip a waypoint, resume, fly home or another route, in a running guided flight.",
-        "flightgear": "Show the aircraft of a running flight in FlightGear.",
-        "network": "Write the profile of the middleware for nodes on several hosts, and check the network.",
-        "engage": "Engage or disengage the autopilot behind a running bridge.",
-        "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
-        "compare": "Compare RISE-DI with other control laws on the same aircraft.",
-        "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file of scores.",
+        "Fly": {
+            "fly": "Fly a scenario or a fleet over ROS 2 topics, in real time or in lockstep, or in one process.",
+            "scenarios": "List the scenarios: what each flies, its aircraft and its law.",
+            "guide": "Command a running guided flight: a heading, an altitude, hold, home, another route.",
+            "network": "Write the profile of the middleware for nodes on several hosts, and check the network.",
+        },
+        "Look": {
+            "report": "Write the report page of a run again, compare several, export figures and data, repair a log.",
+            "watch": "See a flight on a page, in the terminal, in Foxglove or in FlightGear, live or recorded.",
+            "replay": "Compute every tick of a recorded flight again and compare it with the log bit by bit.",
+            "play": "Publish the topics of a recorded flight again with their timing.",
+            "layouts": "Write layouts for Foxglove and PlotJuggler that open the runs of a scenario.",
+        },
+        "Design": {
+            "airframes": "Show airframes and what the theorem asks of each, or make one of your own that flies.",
+            "gains": "Select gains for an airframe, and check every condition on them.",
+            "identify": "Identify an aircraft of JSBSim with a scenario, or the model of an airframe from a log.",
+            "learn": "Repeat the learner on the log of a flight, with other settings, and write the model.",
+            "export": "Write the controller of a scenario as C99, with a proof that C and Python give the same bits.",
+        },
+        "Autopilot": {
+            "engage": "Engage or disengage the autopilot behind a running bridge.",
+            "check": "Compare the signs of a channel map with the D of the controller, its rows with releases.",
+            "import": "Make a bag from the log of an autopilot: DataFlash, tlog or ULog.",
+        },
+        "Study": {
+            "campaign": "Fly a Monte Carlo campaign of uncertain aircraft.",
+            "compare": "Compare RISE-DI with other control laws on the same aircraft.",
+            "benchmark": "Enter a law in the public benchmark: fixed sets of flights, one file of scores.",
+        },
     }
 )
-"""What each command does. The function `NAME` of the module `flight_cli.NAME` is the command, with _ for -, and _ after
-a keyword."""
+"""What each command does, by group. The function `NAME` of the module `flight_cli.NAME` is the command, with _ after a
+keyword."""
+COMMANDS = MappingProxyType(dict(ChainMap(*GROUPS.values())))
 
 
 def _show_version(wanted: bool) -> None:
@@ -75,20 +85,16 @@ def _options(
     """Fly, record and analyse RISE dynamic inversion."""
 
 
-def application(words: list[str]) -> typer.Typer:
-    """The command line with the command that is among the words; the others are there by name and help alone."""
-    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
+def application(words: Collection[str]) -> typer.Typer:
+    """The command line with the commands that are among the words; the others are there by name and help alone."""
+    app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, cls=Commands)
     app.callback()(_options)
-    for name, sentence in COMMANDS.items():
-        if name in words:
-            module = f"{name}_" if iskeyword(name) else name.replace("-", "_")
-            command = resolve_name(f"flight_cli.{module}:{module}")
-            if isinstance(command, typer.Typer):  # a command with commands of its own
-                app.add_typer(command, name=name, help=sentence)
-            else:
-                app.command(name)(command)
-        else:
-            app.command(name, help=sentence)(lambda: None)
+    for group, commands in GROUPS.items():
+        for name, sentence in commands.items():
+            place = f"{name}_" if iskeyword(name) else name
+            command = resolve_name(f"flight_cli.{place}:{place}") if name in words else lambda: None
+            help_text = None if name in words else sentence
+            app.command(name, help=help_text, rich_help_panel=group, cls=Command)(command)
     return app
 
 

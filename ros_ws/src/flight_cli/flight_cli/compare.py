@@ -62,7 +62,9 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain aircraft.")] = 1,
     wind: Annotated[
         WindEffect | None,
-        typer.Option(help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."),
+        typer.Option(
+            "--set wind", help="Effect of wind: by each aircraft's own A, or that of the airframe; by default the scenario's."
+        ),
     ] = None,
     laws: Annotated[
         str | None,
@@ -78,9 +80,11 @@ def compare(
         bool, typer.Option("--tune", help="First tune the laws that have no gains for this scenario: minutes a law.")
     ] = False,
     turbulence_seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the turbulence, unlike that of the tuning.")
+        int, typer.Option("--set turbulence_seed", min=0, help="Seed of the turbulence, unlike that of the tuning.")
     ] = law_comparison.TURBULENCE_SEED,
-    gains: Annotated[Path | None, typer.Option(help="File of tuned gains; by default the one of the stack.")] = None,
+    gains: Annotated[
+        Path | None, typer.Option("--set gains", help="File of tuned gains; by default the one of the stack.")
+    ] = None,
     write: Annotated[
         Path | None,
         typer.Option(help="File for the gains of one law as a section of a scenario, which flies with the score shown."),

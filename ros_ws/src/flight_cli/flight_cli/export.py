@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from flight_cli.log_options import warn_of_lacks
-from flight_cli.output import options, print_json
+from flight_cli.output import print_json
 from flight_log.tape_reader import read_run
 from rise_di.c_code import export as write_export
 
@@ -46,7 +46,7 @@ def export(
     recorded = None if run is None else read_run(run)
     if recorded is not None:
         warn_of_lacks(recorded)
-    with options("compiler", "c", "run"), Console(stderr=True, quiet=as_json).status("flying and comparing"):
+    with Console(stderr=True, quiet=as_json).status("flying and comparing"):
         files, proof, text = write_export(
             scenario,
             folder,

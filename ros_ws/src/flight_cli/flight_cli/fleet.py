@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di fleet`: fly several aircraft at once, then show a line an aircraft."""
+"""The part of `rise-di fly` that flies several aircraft at once, then shows a line an aircraft."""
 
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
@@ -26,21 +26,10 @@ from flight_core.parameters import ParameterError
 SEVEREST = (0, STATUS_INCOMPLETE, STATUS_ENDED_EARLY, STATUS_INTERRUPTED)
 
 
-def fleet(
-    context: typer.Context,
-    file: Annotated[Path, typer.Argument(help="File of the fleet (.yaml): docs/fleets.md.")],
-    duration: Annotated[
-        float | None, typer.Option(help="Flight time of each aircraft in s; by default that of the file.")
-    ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="Serve the live page of the fleet while it flies.")] = False,
-    runs: Annotated[Path, typer.Option(help="Folder that the run's folder of each aircraft is made in.")] = Path("runs"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summaries as JSON, by name, nothing else.")] = False,
+def fly_fleet_file(
+    context: typer.Context, file: str, duration: float | None, runs: Path, *, watch: bool, as_json: bool
 ) -> None:
-    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report.
-
-    Exit status, the severest of the aircraft: 0 completed, 2 bad input, 3 ended early or never flew, 4 completed with an
-    incomplete log or a leg missed or not flown, 130 interrupted.
-    """
+    """Fly a fleet: every aircraft in a namespace, with nodes, a log and a report. Exits with the severest status."""
     require_package("rclpy", "")
     require_ros_environment()
     chosen = read_fleet(file, duration)

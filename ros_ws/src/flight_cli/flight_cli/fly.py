@@ -14,14 +14,16 @@ from flight_analysis.closed_loop.learning_loop import Learn
 from flight_analysis.closed_loop.scenario import Scenario, limits_beyond_stops
 from flight_analysis.closed_loop.scenario_library import find_scenario, with_route, written
 from flight_analysis.report.run_folder import new_run, remove_empty, write_empty_summary, write_report
+from flight_bringup.fleet import is_fleet
 from flight_bringup.fly import fly_in_process, fly_over_topics
 from flight_bringup.graph import Autopilot, absolute_namespace, find_autopilot, require_limits, second_stage
+from flight_cli.fleet import fly_fleet_file
 from flight_cli.output import (
     flight_progress,
     print_json,
     show_flight,
 )
-from flight_cli.route_options import Altitude, Line, Simplify, parse_origin, read_waypoints
+from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, parse_origin, read_waypoints
 from flight_cli.settings import Settings, with_settings
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
@@ -34,7 +36,9 @@ from flight_guidance.route_formats import FENCES
 
 def fly(
     context: typer.Context,
-    scenario: Annotated[str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).")] = "osprey_servo",
+    scenario: Annotated[
+        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.")
+    ] = "osprey_servo",
     duration: Annotated[float | None, typer.Option(help="Duration in s; by default that of the scenario.")] = None,
     settings: Settings = None,
     in_process: Annotated[
@@ -43,9 +47,8 @@ def fly(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Fly in lockstep over topics, as fast as possible, repeatable to the byte.")
     ] = False,
-    one_process: Annotated[bool, typer.Option("--one-process", help="Fly in lockstep with all nodes in one process.")] = False,
     composed: Annotated[
-        bool, typer.Option("--composed", help="Fly with all nodes in one process, in real time: a third of the processor time.")
+        bool, typer.Option("--set composed", help="Fly with all nodes in one process: a third of the processor time.")
     ] = False,
     bridge: Annotated[
         str | None,
@@ -56,12 +59,12 @@ def fly(
     route: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"Fly a route: {', '.join(ENDINGS)}. Guidance starts with it.")
     ] = None,
-    origin: Annotated[
-        str | None,
-        typer.Option(metavar="LAT,LON", help="Where north = east = 0 for a route in latitudes, degrees; else the file's home."),
-    ] = None,
+    origin: OriginOfRoute = None,
     fence: Annotated[
-        Path | None, typer.Option(metavar="FILE", help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home.")
+        Path | None,
+        typer.Option(
+            "--set route.fence", metavar="FILE", help=f"Keep the fence of a file: {', '.join(FENCES)}. Rally points are home."
+        ),
     ] = None,
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
@@ -71,32 +74,39 @@ def fly(
     namespace: Annotated[
         str, typer.Option(help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.")
     ] = "",
-    runs: Annotated[Path, typer.Option(help="Folder that the run's folder is made in.")] = Path("runs"),
+    runs: Annotated[Path, typer.Option("--set runs", help="Folder that the run's folder is made in.")] = Path("runs"),
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
 ) -> None:
-    """Fly a scenario: aircraft, reference model, controller, recorder, guidance as processes over ROS 2 topics, in real time.
+    """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real time.
 
     Exit status: 0 completed or landed, 2 bad input, 3 ended early or never flew, 4 completed with an incomplete log or a leg
-    missed or not flown, 130 interrupted.
+    missed or not flown, 130 interrupted; of a fleet the severest of its aircraft.
     """
+    if is_fleet(scenario):
+        rest: dict[str, object] = {
+            "settings": settings,
+            "in_process": in_process,
+            "lockstep": lockstep,
+            "composed": composed,
+            "bridge": bridge,
+        }
+        rest |= {"send": send, "route": route, "fence": fence, "namespace": namespace}
+        for key, chosen_value in rest.items():
+            require(not chosen_value, key, "it beside a fleet", "a scenario, or the key in the file of the fleet")
+        fly_fleet_file(context, scenario, duration, runs, watch=watch, as_json=as_json)
     chosen = with_settings(find_scenario(scenario, duration, with_route=route is None), settings)
-    require(
-        not (in_process and (lockstep or one_process or composed)),
-        "--in-process",
-        "a flight over topics, in lockstep",
-        "one of the two",
-    )
+    require(not (in_process and (lockstep or composed)), "in_process", "a flight over topics, in lockstep", "one of the two")
     require(not (in_process and namespace), "--namespace", "a flight in one process", "a flight over topics, which has nodes")
     namespace = absolute_namespace(namespace)
-    stepping = lockstep or one_process or chosen.flight.lockstep
+    stepping = lockstep or chosen.flight.lockstep
     autopilot = None if bridge is None else find_autopilot(bridge, dry_run=not send)
     require(not (send and bridge is None), "--send", "no --bridge", "the channel map of an autopilot: --bridge MAP")
     real_time = "a flight in real time over topics: an autopilot does not wait"
-    require(autopilot is None or not composed, "--composed", "a flight with a bridge", "one process a node")
+    require(autopilot is None or not composed, "composed", "a flight with a bridge", "one process a node")
     require(autopilot is None or not (in_process or stepping), "--bridge", "a flight in lockstep or in one process", real_time)
     files = route or fence
-    route_options = (("--simplify", simplify or None, route), ("--line", line, route))
-    for option, value, file in (("--origin", origin, files), ("--altitude", altitude, files), *route_options):
+    for_route = (("route.simplify", simplify or None, route), ("route.line", line, route))
+    for option, value, file in (("route.origin", origin, files), ("route.altitude", altitude, files), *for_route):
         require(value is None or file is not None, option, "no --route", "the file of a route: --route FILE")
     if files is not None:
         chosen = _with_files(chosen, route, fence, origin, altitude, simplify, line)
@@ -121,7 +131,7 @@ def fly(
                 run,
                 progress,
                 lockstep=stepping,
-                one_process=one_process or composed,
+                one_process=composed,
                 autopilot=autopilot,
                 namespace=namespace,
                 announce=announce,
@@ -163,7 +173,7 @@ def _with_files(
     """The scenario with the route and the fence of files. Raises ParameterError."""
     above_sea = scenario.aircraft.is_jsbsim
     sections = {} if fence is None else read_fence_file(fence, parse_origin(origin), altitude, above_sea=above_sea)
-    require(not sections or scenario.guidance is not None, "--fence", "a scenario without guidance", "one with guidance")
+    require(not sections or scenario.guidance is not None, "route.fence", "a scenario without guidance", "one with guidance")
     if route is not None:
         return with_route(scenario, read_waypoints(route, origin, altitude, simplify, line, above_sea=above_sea), sections)
     return scenario.vary(guidance=sections)

@@ -18,7 +18,7 @@ from flight_analysis.report.html import write_loop_page
 from flight_analysis.report.margin_figures import MARGIN_COLUMNS, MARGIN_LEGEND, margin_rows, margins_as_json, modes_text
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
-from flight_cli.output import LICENCE, new_table, options, parse_numbers, print_json, write_text
+from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
@@ -32,8 +32,6 @@ from flight_design.gains.trade import trade
 from rise_di_controller.params import ControllerConfig
 
 CONDITION_FAILS = 1
-PARTS = ("uncertainty", "gamma_2", "samples", "seed", "model", "margin", "speeds", "phase_margin", "mixing")
-"""Options of which `select_gains` says what is wrong, beside those of the loop."""
 SIDES = {"at least": ">=", "at most": "<=", "above": ">"}
 MEANINGS = {
     "lag product": "crossover lag product, bandwidth times the lag of the loop (actuator, 1.5 periods, delay), rad: times 57.3"
@@ -49,47 +47,66 @@ def gains(
     airframe: Annotated[str, typer.Argument(help="Name of an airframe, or path of an airframe file (.yaml).")],
     uncertainty: Annotated[float, typer.Option(help="Largest relative deviation of each entry of A and B.")] = 0.3,
     scenario: Annotated[str, typer.Option(help="Scenario with the commands, the gusts and the loop.")] = "osprey_servo",
-    rate: Annotated[float | None, typer.Option(help="Rate of the law in Hz; by default that of the scenario.")] = None,
+    rate: Annotated[
+        float | None, typer.Option("--set rate", help="Rate of the law in Hz; by default that of the scenario.")
+    ] = None,
     y_rate: Annotated[
         float | None,
-        typer.Option(help="Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three."),
+        typer.Option(
+            "--set y_rate", help="Rate of y in Hz: a period above that of the law counts as delay, and y is stale after three."
+        ),
     ] = None,
     lag: Annotated[str | None, typer.Option(help="Lags of the actuators in s, in the airframe's order: 0.02,0.1")] = None,
     delay: Annotated[float | None, typer.Option(help="Pure delay in s; by default that of the scenario.")] = None,
-    inputs: Annotated[str | None, typer.Option(help="Input of each output, in the airframe's order: rudder,aileron")] = None,
-    gamma_2: Annotated[float, typer.Option(help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.")] = 0.0,
+    inputs: Annotated[
+        str | None, typer.Option("--set inputs", help="Input of each output, in the airframe's order: rudder,aileron")
+    ] = None,
+    gamma_2: Annotated[
+        float, typer.Option("--set gamma_2", help="gamma_2 of Lemma 1 in 1/s. It is an assumption: nothing bounds it.")
+    ] = 0.0,
     samples: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Number of uncertain airframes for the bounds of the theorem.")
+        int,
+        typer.Option("--set samples", min=0, max=10_000, help="Number of uncertain airframes for the bounds of the theorem."),
     ] = 100,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the uncertain airframes.")] = 1,
+    seed: Annotated[int, typer.Option("--set seed", min=0, help="Seed of the uncertain airframes.")] = 1,
     write: Annotated[Path | None, typer.Option(help="File for the engineering gains, as a section of a scenario.")] = None,
     feedforward: Annotated[
-        bool, typer.Option("--feedforward", help="Write the airframe too, as the model of the feedforward (an extension).")
+        bool, typer.Option("--set feedforward", help="Write the airframe too, as the model of the feedforward (an extension).")
     ] = False,
     observer: Annotated[
         bool, typer.Option("--observer", help="Write feedforward and observer, and the gains beside them (an extension).")
     ] = False,
     model: Annotated[
-        str | None, typer.Option(help="Airframe that the observer takes as its model, as rise-di identify --log writes it.")
+        str | None,
+        typer.Option("--set model", help="Airframe that the observer takes as its model, as rise-di identify RUN writes it."),
     ] = None,
-    margin: Annotated[float, typer.Option(help="Least delay margin of the nominal loop with the observer, s.")] = 0.03,
+    margin: Annotated[
+        float, typer.Option("--set margin", help="Least delay margin of the nominal loop with the observer, s.")
+    ] = 0.03,
     speeds: Annotated[
         str | None,
         typer.Option(
-            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a schedule that flies them."
+            "--set speeds",
+            help="With --observer: models at two parts of the trim speed too, as 0.7,1.4, and a schedule that flies them.",
         ),
     ] = None,
     phase_margin: Annotated[
-        float, typer.Option(help="Least phase margin of the loop behind servos, deg; 35 or less with the observer.")
+        float,
+        typer.Option(
+            "--set phase_margin", help="Least phase margin of the loop behind servos, deg; 35 or less with the observer."
+        ),
     ] = PHASE_MARGIN,
     theorem: Annotated[
-        bool, typer.Option("--theorem", help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.")
+        bool, typer.Option("--set theorem", help="With --write: the gains of Theorem 1, for an ideal loop: --lag 0 --delay 0.")
     ] = False,
     mixing: Annotated[
-        str, typer.Option(help="diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B.")
+        str,
+        typer.Option(
+            "--set mixing", help="diagonal: an input an output; full: inputs of the law, distributed by the inverse of C B."
+        ),
     ] = "diagonal",
     accept: Annotated[
-        bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+        bool, typer.Option("--set accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Check the gain set of the scenario instead of selecting one.")
@@ -107,12 +124,10 @@ def gains(
     Exit status: 0; 1 if a condition of the loop fails with --check; 2 bad input.
     """
     console = Console(quiet=as_json)
-    require(
-        not theorem or (write is not None and not observer), "--theorem", "it alone", "--write beside it, without --observer"
-    )
+    require(not theorem or (write is not None and not observer), "theorem", "it alone", "--write beside it, without --observer")
     loop = {"rate": rate, "y_rate": y_rate, "lag": lag, "delay": delay, "inputs": inputs}
     answers: dict[str, Assessment]
-    with console.status("selecting gains on uncertain airframes") as status, options(*loop, *PARTS):
+    with console.status("selecting gains on uncertain airframes") as status:
         if check:
             _require_check_alone({"--write": write, "--feedforward": feedforward, "--observer": observer}, loop)
             answer = check_gains(airframe, scenario, uncertainty=uncertainty, gamma_2=gamma_2, samples=samples, seed=seed)
@@ -182,10 +197,10 @@ def _write_page(path: Path, answer: Assessment) -> None:
 
 
 def _require_margins(assessment: Assessment, accept: bool) -> None:
-    """Raises ParameterError for gains whose margins fall short of the requirement, without --accept."""
+    """Raises ParameterError for gains whose margins fall short of the requirement, unless accepted."""
     if assessment.unmet and not accept:
         lacking = "; ".join(condition.sentence(assessment.controller.outputs) for condition in assessment.unmet)
-        raise ParameterError(f"--write: {lacking}; --accept writes them all the same")
+        raise ParameterError(f"--write: {lacking}; --set accept writes them all the same")
 
 
 def _show_trade(console: Console, selection: Selection) -> None:

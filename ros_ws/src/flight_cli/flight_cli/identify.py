@@ -4,6 +4,7 @@
 
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -41,7 +42,6 @@ from flight_cli.output import (
     entries_as_json,
     entry_table,
     new_table,
-    options,
     print_json,
     progress_bar,
     write_text,
@@ -71,67 +71,81 @@ LINEAR = 0.8  # the ratio of smallest to largest slope below which an input is r
 
 
 def identify(
-    aircraft: Annotated[
-        str | None, typer.Argument(help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim, without --log.")
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            help="jsbsim:NAME or jsbsim:PATH, an aircraft of JSBSim; or a log: the folder of a run, or an MCAP file. None with"
+            " --bridge alone."
+        ),
     ] = None,
     speed: Annotated[float | None, typer.Option(help="True airspeed to trim and fly at, m/s.")] = None,
     altitude: Annotated[float | None, typer.Option(help="Altitude above sea level to trim and fly at, m.")] = None,
-    output: Annotated[
-        Path | None, typer.Option(help="Scenario file to write; by default jsbsim_NAME.yaml, which must not exist.")
-    ] = None,
-    log: Annotated[Path | None, typer.Option(help="Log of a flight: the folder of a run, or an MCAP file.")] = None,
-    airframe: Annotated[str | None, typer.Option(help="With --log: the nominal airframe, a name or a file (.yaml).")] = None,
+    airframe: Annotated[str | None, typer.Option(help="With a log: the nominal airframe, a name or a file (.yaml).")] = None,
     write: Annotated[
         Path | None,
-        typer.Option(help="With --log: airframe file for the model, with a page. With --bridge: folder for what flies it."),
+        typer.Option(
+            help="Scenario file, by default jsbsim_NAME.yaml, which must not exist. With a log: airframe file for the model,"
+            " with a page. With --bridge: folder for what flies it."
+        ),
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(help="With --log: scenario with lags and delay of the controller; by default that in the log.")
+        str | None,
+        typer.Option(
+            "--set scenario", help="With a log: scenario with lags and delay of the controller; by default that in the log."
+        ),
     ] = None,
     delay: Annotated[
-        float | None, typer.Option(help="With --log: delay of u, s; by default that of the scenario. One process has none.")
+        float | None,
+        typer.Option("--set delay", help="With a log: delay of u, s; by default that of the scenario. One process has none."),
     ] = None,
-    namespace: Annotated[str | None, typer.Option(help="With --log: namespace of the aircraft, if it holds several.")] = None,
+    namespace: Annotated[
+        str | None, typer.Option("--set namespace", help="With a log: namespace of the aircraft, if it holds several.")
+    ] = None,
     refly: Annotated[
         bool,
-        typer.Option("--refly", help="With --log: fly its scenario with feedforward and observer of the model, in process."),
+        typer.Option(
+            "--set refly", help="With a log: fly its scenario with feedforward and observer of the model, in process."
+        ),
     ] = False,
     observer: Annotated[
-        bool, typer.Option("--observer", help="Without --log: add an extended-state observer from Omega and lags.")
+        bool, typer.Option("--observer", help="Of JSBSim: add an extended-state observer from Omega and lags.")
     ] = False,
     guidance: Annotated[
-        bool, typer.Option("--guidance", help="Without --log: fly and write guidance by rule in place of the pulses.")
+        bool, typer.Option("--guidance", help="Of JSBSim: fly and write guidance by rule in place of the pulses.")
     ] = False,
-    learn: Annotated[
-        bool, typer.Option("--learn", help="Without --log: write a scenario that learns A and B in flight.")
-    ] = False,
+    learn: Annotated[bool, typer.Option("--learn", help="Of JSBSim: write a scenario that learns A and B in flight.")] = False,
     margin: Annotated[
-        float | None, typer.Option(help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests.")
+        float | None,
+        typer.Option(
+            "--set margin", help="Least delay margin of the loop with an observer, s: 0.03, or 0.015 from step tests."
+        ),
     ] = None,
     bridge: Annotated[
         str | None,
-        typer.Option(metavar="MAP", help="Excite the aircraft behind a channel map, or with --log read such a flight."),
+        typer.Option(metavar="MAP", help="Excite the aircraft behind a channel map, or read the log of such a flight."),
     ] = None,
     amplitude: Annotated[
-        float | None, typer.Option(help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2.")
+        float | None,
+        typer.Option("--set amplitude", help="With --bridge: amplitude of the excitation, a part of each input's limit; 0.2."),
     ] = None,
     phase_margin: Annotated[
-        float | None, typer.Option(help="Without --log, or with --bridge: least phase margin of the loop, deg; 45.")
+        float | None,
+        typer.Option("--set phase_margin", help="Of JSBSim, or with --bridge: least phase margin of the loop, deg; 45."),
     ] = None,
     accept: Annotated[
-        bool, typer.Option("--accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
+        bool, typer.Option("--set accept", help="Accept a phase margin below 40 deg, and write gains whose margins fall short.")
     ] = False,
     commands: Annotated[
         list[str] | None,
         typer.Option(
-            "--command",
+            "--set command",
             metavar="INPUT:PROPERTY=VALUE",
-            help="Without --log: a model's own property for an input, and its value at full command; repeat for more.",
+            help="Of JSBSim: a model's own property for an input, and its value at full command; repeat for more.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
-    """Identify an aircraft of JSBSim by step tests, or with --log A and B of an airframe from a recorded flight.
+    """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a flight.
 
     The step tests also select gains, fly the aircraft and write a scenario for `rise-di fly`. A model from a log is accepted if
     it predicts the part of the flight that it was not fitted to better than the nominal airframe. With --bridge, each input of
@@ -139,60 +153,47 @@ def identify(
 
     Exit status: 0, 2 bad input or a model that is refused, 3 the aircraft does not trim or does not fly.
     """
-    with options("phase_margin"):
-        needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
+    needed = requirement(PHASE_MARGIN if phase_margin is None else phase_margin, accept=accept)
+    log = None if source is None or source.startswith(PREFIX) else Path(source)
+    aircraft = source if log is None else None
     if bridge is not None:
-        unused = {
-            "aircraft": aircraft,
-            "--altitude": altitude,
-            "--output": output,
-            "--airframe": airframe,
-            "--margin": margin,
-        }
-        unused |= {"--scenario": scenario, "--delay": delay, "--refly": refly or None, "--observer": observer or None}
-        unused |= {"--guidance": guidance or None, "--learn": learn or None, "--command": ", ".join(commands or []) or None}
-        for name, value in (unused | {"--namespace": namespace}).items():
-            require(value is None, name, f"{value}", "none beside --bridge")
+        unused = {"aircraft": aircraft, "altitude": altitude, "airframe": airframe, "margin": margin, "scenario": scenario}
+        unused |= {"delay": delay, "refly": refly, "observer": observer, "guidance": guidance, "learn": learn, "commands": commands}
+        _require_none(unused | {"namespace": namespace}, "none beside --bridge")
         if write is None:
             raise ParameterError("identify: found too few arguments, expected --write beside --bridge")
-        require(speed is None or 0.0 < speed < math.inf, "--speed", f"{speed}", "above 0 m/s")
+        require(speed is None or 0.0 < speed < math.inf, "speed", f"{speed}", "above 0 m/s")
         part = AMPLITUDE if amplitude is None else amplitude
         identify_behind_bridge(bridge, speed, write, part, log, as_json, needed, accept)
         return
-    require(amplitude is None, "--amplitude", amplitude, "--bridge beside it")
-    test_options = {
-        "aircraft": aircraft,
-        "--speed": speed,
-        "--altitude": altitude,
-        "--output": output,
-        "--observer": observer or None,
-        "--guidance": guidance or None,
-        "--learn": learn or None,
-        "--phase-margin": phase_margin,
-        "--accept": accept or None,
-        "--command": ", ".join(commands or []) or None,
-    }
-    log_options = {"--airframe": airframe, "--write": write, "--scenario": scenario, "--delay": delay, "--namespace": namespace}
-    log_options |= {"--refly": refly or None}
-    require(margin is None or refly or observer or learn, "--margin", margin, "--refly, --observer or --learn beside it")
-    require(not (observer and learn), "--observer", "--learn beside it", "one of the two: a learner designs its own observer")
-    for name, value in (log_options if log is None else test_options).items():
-        require(value is None, name, f"{value}", "--log with it" if log is None else "none beside --log")
+    require(amplitude is None, "amplitude", amplitude, "--bridge beside it")
+    require(margin is None or refly or observer or learn, "margin", margin, "--set refly, --observer or --learn beside it")
+    require(not (observer and learn), "observer", "--learn beside it", "one of the two: a learner designs its own observer")
     if log is not None:
-        require(airframe is not None, "--airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
+        of_aircraft = {"speed": speed, "altitude": altitude, "observer": observer, "guidance": guidance, "learn": learn}
+        _require_none(of_aircraft | {"phase_margin": phase_margin, "accept": accept, "commands": commands}, "none beside a log")
+        require(airframe is not None, "airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
         nominal = load_airframe(airframe or "")
         refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None
         _identify_log(_Source(log, scenario, delay, namespace), nominal, write, refly_margin, as_json)
     elif aircraft is None or speed is None or altitude is None:
-        raise ParameterError("identify: found too few arguments, expected --log, or an aircraft with --speed and --altitude")
+        raise ParameterError("identify: found too few arguments, expected a log, or an aircraft with --speed and --altitude")
     else:
+        of_log = {"airframe": airframe, "scenario": scenario, "delay": delay, "namespace": namespace, "refly": refly}
+        _require_none(of_log, "a log in place of the aircraft")
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
         texts: dict[str, str] = {}
         for text in commands or []:
             name, _, paths = text.partition(":")
             texts[name] = f"{texts.get(name, '')} {paths}".strip()
-        flown = _Flown(observer_margin, guidance, learn, named_properties(texts, "--command"))
-        _identify_by_steps(aircraft, speed, altitude, output, flown, as_json, needed, accept)
+        flown = _Flown(observer_margin, guidance, learn, named_properties(texts, "--set command"))
+        _identify_by_steps(aircraft, speed, altitude, write, flown, as_json, needed, accept)
+
+
+def _require_none(values: Mapping[str, object], expected: str) -> None:
+    """Raise ParameterError for the first of these options that is there."""
+    for name, value in values.items():
+        require(value in (None, False), name, f"{value}", expected)
 
 
 class _Flown(NamedTuple):
@@ -219,9 +220,9 @@ def _identify_by_steps(
     require(0.0 < speed < math.inf, "--speed", speed, "above 0 m/s")
     require(0.0 <= altitude < math.inf, "--altitude", altitude, "0 m or more")
     path = output or Path(f"jsbsim_{Path(name).stem}.yaml")
-    require(output is not None or not path.exists(), "--output", f"none, and {path} exists", "a file to write over, or another")
-    require(path.suffix == ".yaml", "--output", path, "a name that ends in .yaml, as scenario files do")
-    require(path.parent.is_dir(), "--output", path, "a file in a folder that exists")
+    require(output is not None or not path.exists(), "write", f"none, and {path} exists", "a file to write over, or another")
+    require(path.suffix == ".yaml", "write", path, "a name that ends in .yaml, as scenario files do")
+    require(path.parent.is_dir(), "write", path, "a file in a folder that exists")
     console = Console(quiet=as_json)
     try:
         with console.status("trim") as status:
@@ -241,8 +242,8 @@ def _identify_by_steps(
         raise typer.Exit(CANNOT_FLY) from None
     chosen = identified.selection.engineering
     lacking = "; ".join(condition.sentence(chosen.controller.outputs) for condition in chosen.unmet)
-    require(accept or not lacking, "identify", lacking, "the margins, or --accept, which writes the gains all the same")
-    write_text("--output", path, identified.text)
+    require(accept or not lacking, "identify", lacking, "the margins, or --set accept, which writes the gains all the same")
+    write_text("write", path, identified.text)
     if as_json:
         print_json(_as_json(identified, path))
     else:
@@ -271,7 +272,9 @@ def _identify_log(source: _Source, nominal: Airframe, write: Path | None, refly_
     recorded.require()
     warn_of_lacks(recorded)
     if recorded.scenario is None:
-        raise ParameterError(f"{source.log}: found a log without its scenario, expected --scenario with the controller's lags")
+        raise ParameterError(
+            f"{source.log}: found a log without its scenario, expected --set scenario=NAME with the controller's lags"
+        )
     controller = recorded_parameters(recorded.scenario)
     actuation = _actuation(controller, nominal, controller.delay if source.delay is None else source.delay)
     samples = recording(recorded.tape, nominal)

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from autopilot_bridge.params import UNITS, find_map, load_map
 from flight_analysis.report.run_folder import PROVENANCE
-from flight_cli.output import new_table, options
+from flight_cli.output import new_table
 from flight_core.files import display_path, dump_yaml, write_file, writing
 from flight_core.parameters import require
 from flight_core.rates import NANOSECONDS
@@ -41,14 +41,13 @@ def import_(
 ) -> None:
     """Make a bag of y, u and pose from the log of an autopilot that the stack did not fly.
 
-    By default it takes the longest stretch in the air, for sticks in MANUAL. `check-signs --bag`, `identify --bridge --log`,
+    By default it takes the longest stretch in the air, for sticks in MANUAL. `check --run`, `identify --bridge`,
     `report` and `watch` read the bag. u is the deviation from the median of the stretch, `commands` is the whole.
 
     Exit status: 0, or 2 bad input.
     """
-    with options("from", "until"):
-        for name, value in (("from", start), ("until", stop)):
-            require(value is None or value >= 0.0, name, value, "0 s or more")
+    for name, value in (("from", start), ("until", stop)):
+        require(value is None or value >= 0.0, name, value, "0 s or more")
     channel_map = load_map(map_name)
     console = Console()
 

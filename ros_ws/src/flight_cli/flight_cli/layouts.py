@@ -9,30 +9,24 @@ import typer
 
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.layouts import channels_of, foxglove, plotjuggler, rviz, urdf
-from flight_bringup.fleet import read_fleet
+from flight_bringup.fleet import is_fleet, read_fleet
 from flight_core.files import write_file, writing
-from flight_core.parameters import require
 
 
 def layouts(
     scenario: Annotated[
-        str | None,
-        typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml).", show_default="osprey_servo"),
-    ] = None,
-    fleet: Annotated[
-        Path | None, typer.Option("--fleet", metavar="FILE", help="File of a fleet: layouts with all its aircraft.")
-    ] = None,
+        str, typer.Argument(help="Name of a scenario, or path of a scenario file (.yaml) or of the file of a fleet.")
+    ] = "osprey_servo",
     folder: Annotated[Path, typer.Option(help="Folder to write the files to.")] = Path(),
 ) -> None:
     """Write layouts for Foxglove and PlotJuggler with plots of the runs of a scenario, for RViz with guidance."""
-    require(fleet is None or scenario is None, "--fleet", "a scenario beside it", "one of the two")
-    if fleet is None:
-        chosen = find_scenario(scenario or "osprey_servo")
+    if is_fleet(scenario):
+        name = Path(scenario).stem
+        scenarios = {member.name: member.scenario for member in read_fleet(scenario).members}
+    else:
+        chosen = find_scenario(scenario)
         name = chosen.name
         scenarios = {"": chosen}
-    else:
-        name = fleet.stem
-        scenarios = {member.name: member.scenario for member in read_fleet(fleet).members}
     aircraft = {namespace: channels_of(scenario) for namespace, scenario in scenarios.items()}
     files = {f"{name}.foxglove.json": foxglove(aircraft), f"{name}.plotjuggler.xml": plotjuggler(aircraft)}
     if guided := [namespace for namespace, scenario in scenarios.items() if scenario.guidance is not None]:

@@ -36,7 +36,6 @@ from flight_analysis.report.summary import (
     taken_over,
 )
 from flight_core.files import write_file, writing
-from flight_core.parameters import ParameterError
 
 # exit statuses; bad input is 2 (`flight_cli.cli`)
 ENDED_EARLY = 3
@@ -222,18 +221,6 @@ def parse_numbers(text: str) -> list[float]:
 def print_json(value: Any) -> None:
     """Print a value as JSON, with null for NaN and infinity, which JSON does not have."""
     print(json.dumps(finite_or_null(value)))
-
-
-@contextmanager
-def options(*names: str) -> Iterator[None]:
-    """Name the options of a command in a ParameterError inside the block whose key is one of these arguments."""
-    try:
-        yield
-    except ParameterError as error:
-        key, colon, reason = str(error).partition(":")
-        if key not in names:
-            raise
-        raise ParameterError(f"--{key.replace('_', '-')}{colon}{reason}") from None
 
 
 def write_text(option: str, path: Path, text: str) -> None:

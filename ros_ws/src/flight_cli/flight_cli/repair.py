@@ -1,11 +1,8 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di repair`: rebuild a log whose recorder was killed, so that every rosbag2 reader accepts it."""
+"""The part of `rise-di report` that rebuilds a log whose recorder was killed, so that every rosbag2 reader accepts it."""
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from flight_core.files import display_path
 from flight_core.parameters import ParameterError
@@ -17,12 +14,8 @@ from flight_log.rosbag2_metadata import METADATA
 from flight_log.tape_reader import read_run
 
 
-def repair(run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP file, which is repaired alone.")]) -> None:
-    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays as it is.
-
-    The new log holds every message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged file
-    stays as *.damaged. metadata.yaml keeps the names of missing files, and that of another program is never replaced.
-    """
+def repair_log(run: Path) -> None:
+    """Rebuild the log of a run whose recorder was killed, or that is damaged. An intact log stays as it is."""
     repaired = repair_bag(run)
     for file in repaired.files:
         if file.damaged is not None:
@@ -33,7 +26,8 @@ def repair(run: Annotated[Path, typer.Argument(help="Folder of a run, or an MCAP
     elif not any(file.damaged for file in repaired.files) and not repaired.missing:
         print(f"{display_path(run)} is intact: nothing to repair")
     if repaired.missing:
-        print(f"{printable(', '.join(repaired.missing))}: missing, and nothing here restores it; {METADATA} keeps the name")
+        lost = printable(", ".join(repaired.missing))
+        print(f"{lost}: missing, and nothing here restores it; {METADATA} keeps the name")
 
 
 def _missing_at_end(run: Path, last: FileRepair) -> str:

@@ -14,7 +14,8 @@ from flight_analysis.report.paper import WIDTH
 from flight_analysis.report.report import report as write_report
 from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
-from flight_cli.output import LATEST, new_table, options, print_json, show_flight
+from flight_cli.output import LATEST, new_table, print_json, show_flight
+from flight_cli.repair import repair_log
 from flight_core.files import display_path
 from flight_core.outcome import STATUS_INCOMPLETE
 
@@ -23,54 +24,69 @@ def report(
     runs: Annotated[
         list[Path] | None, typer.Argument(help="Folder of a run, by default runs/latest; several are compared with the first.")
     ] = None,
-    html: Annotated[Path | None, typer.Option(help="Page of a comparison; by default comparison.html beside run 1.")] = None,
+    html: Annotated[
+        Path | None, typer.Option("--set html", help="Page of a comparison; by default comparison.html beside run 1.")
+    ] = None,
     output: Annotated[
-        Path | None, typer.Option(help="Folder for the report of one run, by default that of its log: for archives.")
+        Path | None,
+        typer.Option("--set output", help="Folder for the report of one run, by default that of its log: for archives."),
     ] = None,
     png: Annotated[Path | None, typer.Option(help="Write y over y_m, e and u as one PNG figure.")] = None,
     csv: Annotated[
         Path | None, typer.Option(help="Write all signals as CSV, one row an instant, one column a channel.")
     ] = None,
     parquet: Annotated[Path | None, typer.Option(help="Write the same table as Parquet.")] = None,
+    repair: Annotated[
+        bool,
+        typer.Option("--repair", help="Rebuild each log whose recorder was killed, or that is damaged, and write no report."),
+    ] = False,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     figure: Annotated[
         Path | None, typer.Option(help="Write a figure for a paper: .pdf, .svg, .eps as vectors, or .png.")
     ] = None,
-    width: Annotated[str, typer.Option(help="Width of the figure: 88mm, 3.5in.")] = WIDTH,
+    width: Annotated[str, typer.Option("--set width", help="Width of the figure: 88mm, 3.5in.")] = WIDTH,
     channels: Annotated[
         str,
-        typer.Option(help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by default each output."),
+        typer.Option(
+            "--set channels",
+            help="Channels of the figure: outputs, inputs, errors, as in q,V,e.q,elevator; by default each output.",
+        ),
     ] = "",
-    mat: Annotated[Path | None, typer.Option(help="Write all signals as a MAT-file, a structure a topic.")] = None,
-    tables: Annotated[Path | None, typer.Option(help="Folder for a CSV a topic.")] = None,
-    latex: Annotated[Path | None, typer.Option(help="Write the tables of errors and inputs as LaTeX.")] = None,
+    mat: Annotated[Path | None, typer.Option("--set mat", help="Write all signals as a MAT-file, a structure a topic.")] = None,
+    tables: Annotated[Path | None, typer.Option("--set tables", help="Folder for a CSV a topic.")] = None,
+    latex: Annotated[Path | None, typer.Option("--set latex", help="Write the tables of errors and inputs as LaTeX.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, a list for several runs.")] = False,
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
 
+    A log of --repair holds every message that could be read, an index and, in the folder of a run, metadata.yaml. The damaged
+    file stays as *.damaged, an intact log as it is, and metadata.yaml of another program is never replaced.
     Exit status: 0, 2 bad input, 4 a log is incomplete.
     """
+    if repair:
+        for run in runs or [LATEST]:
+            repair_log(run)
+        return
     scenario_source = scenario_file(scenario)
-    with options("html", "output", "png", "csv", "parquet", "figure", "width", "channels", "mat", "tables", "latex"):
-        page, flights = write_report(
-            *(runs or [LATEST]),
-            html=html,
-            output=output,
-            png=png,
-            csv=csv,
-            parquet=parquet,
-            figure=figure,
-            width=width,
-            channels=channels,
-            mat=mat,
-            tables=tables,
-            latex=latex,
-            namespace=namespace,
-            scenario=scenario_source,
-            remaps=remaps_of(remap),
-        )
+    page, flights = write_report(
+        *(runs or [LATEST]),
+        html=html,
+        output=output,
+        png=png,
+        csv=csv,
+        parquet=parquet,
+        figure=figure,
+        width=width,
+        channels=channels,
+        mat=mat,
+        tables=tables,
+        latex=latex,
+        namespace=namespace,
+        scenario=scenario_source,
+        remaps=remaps_of(remap),
+    )
     if as_json:
         summaries = [flight.summary for flight in flights]
         print_json(summaries[0] if len(flights) == 1 else summaries)

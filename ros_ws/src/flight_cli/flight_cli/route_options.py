@@ -14,14 +14,26 @@ from flight_core.parameters import require
 from flight_guidance.route_file import Origin, Waypoint, read_route_file
 
 Altitude = Annotated[
-    float | None, typer.Option(help="Altitude of a route without, or of the ground or home that it counts from, m.")
+    float | None,
+    typer.Option("--set route.altitude", help="Altitude of a route without, or of the ground or home that it counts from, m."),
+]
+OriginOfRoute = Annotated[
+    str | None,
+    typer.Option(
+        "--set route.origin",
+        metavar="LAT,LON",
+        help="Where north = east = 0 for a route in latitudes, degrees; else the file's home.",
+    ),
 ]
 Simplify = Annotated[
-    float, typer.Option(min=0.0, help="Leave out positions of a route within this distance of the line without them, m.")
+    float,
+    typer.Option(
+        "--set route.simplify", min=0.0, help="Leave out positions of a route within this distance of the line without them, m."
+    ),
 ]
-
 Line = Annotated[
-    str | None, typer.Option("--line", metavar="LINE", help="Which line of a file with several: a number from 1 on, or a name.")
+    str | None,
+    typer.Option("--set route.line", metavar="LINE", help="Which line of a file with several: a number from 1 on, or a name."),
 ]
 
 
@@ -29,8 +41,8 @@ def read_waypoints(
     file: Path, origin: str | None, altitude: float | None, simplify: float, line: str | None, *, above_sea: bool | None
 ) -> tuple[Waypoint, ...]:
     """The waypoints of a route file; notes on the rest of the file go to standard error. Raises as `read_route_file`."""
-    require(altitude is None or math.isfinite(altitude), "--altitude", altitude, "a number")
-    require(math.isfinite(simplify), "--simplify", simplify, "a number")
+    require(altitude is None or math.isfinite(altitude), "route.altitude", altitude, "a number")
+    require(math.isfinite(simplify), "route.simplify", simplify, "a number")
     route = read_route_file(file, parse_origin(origin), altitude, simplify, above_sea=above_sea, line=line)
     for note in route.notes:
         print(f"note: {note}", file=sys.stderr)
@@ -47,5 +59,5 @@ def parse_origin(text: str | None) -> Origin | None:
         return None
     numbers = parse_numbers(text)
     fits = len(numbers) == 2 and abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0
-    require(fits, "--origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
+    require(fits, "route.origin", repr(text), "a latitude and a longitude in degrees, as in 47.38,8.54")
     return Origin(*numbers)

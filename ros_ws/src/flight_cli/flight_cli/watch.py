@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from flight_bringup.processes import end_with_parent
+from flight_cli.flightgear import show_in_flightgear
 from flight_cli.log_options import LogScenario, scenario_file
 from flight_cli.route_options import parse_origin
 from flight_core.environment import require_ros_environment
@@ -48,11 +49,18 @@ def watch(
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Serve a flight in progress to Foxglove, Lichtblick and PlotJuggler instead.")
     ] = False,
+    flightgear: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Send the pose of a flight in progress to FlightGear instead, as to 127.0.0.1:5500, with --set origin.",
+        ),
+    ] = None,
     control: Annotated[
         bool, typer.Option("--control", help="Let the page command the flight, with a key that this command prints.")
     ] = False,
     control_real: Annotated[
-        bool, typer.Option("--control-real", help="As --control, and gains also while a bridge sends to an autopilot.")
+        bool, typer.Option("--set real", help="As --control, and gains also while a bridge sends to an autopilot.")
     ] = False,
     scenario: LogScenario = None,
     namespace: Annotated[
@@ -60,15 +68,30 @@ def watch(
         typer.Option(help="Namespace of the aircraft: by default the first in the log, with --control the root."),
     ] = None,
     background: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="GeoJSON of lines, polygons and points for the map, with --origin.")
+        Path | None,
+        typer.Option(
+            "--set background", metavar="FILE", help="GeoJSON of lines, polygons and points for the map, with --set origin."
+        ),
     ] = None,
-    origin: Annotated[str | None, typer.Option(metavar="LAT,LON", help="Where north and east are 0, for --background.")] = None,
-    runs: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("runs"),
+    origin: Annotated[
+        str | None,
+        typer.Option("--set origin", metavar="LAT,LON", help="Where north and east are 0, for the background and FlightGear."),
+    ] = None,
+    altitude: Annotated[
+        float,
+        typer.Option("--set altitude", help="Altitude above sea of altitude 0 for FlightGear, m; 0 for an aircraft of JSBSim."),
+    ] = 0.0,
+    rate: Annotated[float, typer.Option("--set rate", min=1.0, max=100.0, help="Packets a second to FlightGear.")] = 30.0,
+    runs: Annotated[Path, typer.Option("--set runs", help="Folder of the runs.")] = Path("runs"),
 ) -> None:
     """See a flight on a page: charts, horizon, scene and timeline, live while it is recorded, or again later.
 
     The page is served on this host alone, until Ctrl-C. Exit status: 0 ended, 2 bad input, 130 interrupted in the terminal.
     """
+    if flightgear is not None:
+        require(origin is not None, "flightgear", "no origin", "--set origin=LAT,LON beside it, where north and east are 0")
+        show_in_flightgear(flightgear, origin or "", altitude, namespace or "", rate)
+        return
     require(not wait or bool(run), "--wait", "no RUN", "the folder of a run that will be recorded")
     require(fleet or len(run or ()) < 3, "RUN", f"{len(run or ())} runs", "a run and a ghost, or --fleet")
     controlled = control or control_real
@@ -81,7 +104,7 @@ def watch(
     for folder in chosen:
         if not wait:
             require_log(folder, namespace)
-    require(background is None or not (text or foxglove), "--background", "--text or --foxglove beside it", "the page")
+    require(background is None or not (text or foxglove), "background", "--text or --foxglove beside it", "the page")
     lines = [] if background is None else read_background(background, parse_origin(origin))
     ports = (DEFAULT_PORT, 0) if port is None else (port,)
     if text:

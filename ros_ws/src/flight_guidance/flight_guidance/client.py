@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clients of guidance, for `rise-di target`, `rise-di guidance` and the live page."""
+"""Clients of guidance, for `rise-di guide` and the live page."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -24,13 +24,13 @@ def read_plan(content: bytes, key: str, line: str | None = None) -> Places:
 
 def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
     """The mission of a plan that is parsed."""
-    require(line is None, "--line", f"a mission, {key}", "a file with several lines")
+    require(line is None, "route.line", f"a mission, {key}", "a file with several lines")
     mission = member(tree, "mission")
     rows = member(mission, "items")
     require(isinstance(rows, list), key, "no mission with items", "a plan of QGroundControl")
     items = [_plan_item(entry, number, f"{key}: item {number}") for number, entry in _plan_items(rows or (), key)]
     fence = plan_fence(tree, key)
-    notes = ["the fence and the rally points are no part of the route; --fence keeps them"] * bool(fence.zones or fence.rally)
+    notes = ["the fence and the rally points are no part of the route; --set route.fence keeps them"] * bool(fence.zones or fence.rally)
     notes += [f"not read: {FIRST_FENCE}"] * has_first_fence(tree)
     return mission_route(key, items, home_of(member(mission, "plannedHomePosition")), notes)
 
@@ -85,7 +85,7 @@ COMMA = re.compile(r"-?\d+,\d+")  # of a program in a language with decimal comm
 
 def read_wpl(content: bytes, key: str, line: str | None = None) -> Places:
     """The mission of a QGC WPL 110."""
-    require(line is None, "--line", f"a mission, {key}", "a file with several lines")
+    require(line is None, "route.line", f"a mission, {key}", "a file with several lines")
     items, home = wpl_items(content, key)
     note = "" if home is None else f"item 0 is the home, at {home.latitude:.7g},{home.longitude:.7g}, and no waypoint"
     return mission_route(key, items, home, [note] * bool(note))

@@ -74,7 +74,7 @@ def one_route(key: str, geometries: Sequence[Geometry], others: Sequence[str] = 
     if line is not None:
         chosen = [geometry for k, geometry in enumerate(lines, start=1) if line in (f"{k}", geometry.name)]
         mismatch = f"{short_repr(line)}, which names {len(chosen)} lines"
-        require(len(chosen) == 1, "--line", mismatch, _choice(lines) if lines else "a file with several lines")
+        require(len(chosen) == 1, "route.line", mismatch, _choice(lines) if lines else "a file with several lines")
         if len(lines) > 1:
             ignored = " and ".join([f"{len(lines) - 1} further lines", *[ignored] * bool(points)])
         lines = chosen
@@ -88,9 +88,9 @@ def one_route(key: str, geometries: Sequence[Geometry], others: Sequence[str] = 
 
 
 def _choice(lines: Sequence[Geometry]) -> str:
-    """What `--line` may name: "--line 1 (north), 2 or 3 (south)"."""
+    """What `--set route.line` may name: "--set route.line=1 (north), 2 or 3 (south)"."""
     names = [f"{k} ({geometry.name})" if geometry.name else f"{k}" for k, geometry in enumerate(lines[:SHOWN], start=1)]
-    return f"--line {', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
+    return f"--set route.line={', '.join(names)}{f' to {len(lines)}' if len(lines) > SHOWN else ''}"
 
 
 SHOWN = 5

@@ -140,7 +140,7 @@ class Follower:
                 size = status.st_size
                 identity = (status.st_dev, status.st_ino)
                 if self._position > 0 and (identity != self._identity or size < self._position):
-                    self.fault = f"{path} was replaced by another file, as rise-di repair does"
+                    self.fault = f"{path} was replaced by another file, as rise-di report --repair does"
                     return
                 self._identity = identity
                 for opcode, content in self._records(stream, size):

@@ -22,7 +22,7 @@ def read_background(path: Path, origin: Origin | None) -> list[Line]:
     and more than MAX_POINTS positions.
     """
     if origin is None:
-        raise ParameterError("--origin: found none, expected the latitude and longitude where north and east are 0")
+        raise ParameterError("origin: found none, expected the latitude and longitude where north and east are 0")
     lines = placed_lines(read_file(path, str(path), "a GeoJSON"), str(path), origin)
     count = sum(map(len, lines))
     require(count <= MAX_POINTS, str(path), f"{count} positions", f"at most {MAX_POINTS}: ogr2ogr -simplify leaves some out")

@@ -353,7 +353,7 @@ class Control:
     def _require_simulated(self) -> None:
         if not self._real and "bridge" in self._link.nodes() and self._sends():
             raise RefusedError(
-                HTTPStatus.FORBIDDEN, "the bridge sends to an autopilot: gains need rise-di watch --control-real"
+                HTTPStatus.FORBIDDEN, "the bridge sends to an autopilot: gains need rise-di watch --control --set real"
             )
 
     def _activate(self, *, active: bool) -> str:

@@ -57,7 +57,7 @@ class ControlClient(Client):
         return "" if response.success else f"the controller is {'active' if active else 'inactive'} already"
 
     def send_target(self, values: Mapping[str, float]) -> str:
-        """Command guidance, as `rise-di target`."""
+        """Command guidance, as `rise-di guide`."""
         return self._operator().send(values)
 
     def send_route(self, points: Sequence[Sequence[float]]) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An airframe of the user's own, with a scenario that flies, as `rise-di airframe new` writes both."""
+"""An airframe of the user's own, with a scenario that flies, as `rise-di airframes --write` writes both."""
 
 import tempfile
 from collections.abc import Sequence

@@ -148,7 +148,7 @@ class RiseDiConfig(ControllerConfig):
             )
             return
         both = self.observer is not None and len(schedule.models) == len(("slow", "fast"))
-        expected = "an observer with slow and fast, as rise-di gains --observer --speeds writes them"
+        expected = "an observer with slow and fast, as rise-di gains --observer --set speeds=LOW,HIGH writes them"
         require(both, "schedule", "a feedforward or an observer that holds at the trim speed alone", expected)
         slow, fast = (model.ratio for model in schedule.models)
         require(slow < 1.0 < fast, "schedule", f"ratios of {slow:g} and {fast:g}", "one below 1 and one above")

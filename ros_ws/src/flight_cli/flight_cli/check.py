@@ -1,8 +1,9 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`rise-di check-signs`: compare D of the controller with the signs of a channel map and of a recorded flight."""
+"""`rise-di check`: a channel map beside the D of the controller, a recorded flight, and releases of an autopilot."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,8 @@ from rich.console import Console
 
 from aircraft_sim.airframe import load_airframe
 from autopilot_bridge.channel_map import version_faults
-from autopilot_bridge.params import ChannelMap, InputRow, OutputRow, load_map
+from autopilot_bridge.map_check import CheckedRow, check_map, definitions_below, installed_definitions, is_known
+from autopilot_bridge.params import MAVLINK, ChannelMap, InputRow, OutputRow, load_map
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
@@ -19,31 +21,45 @@ from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 
 CONTRADICTS = 1
+INSTALLED = "installed"  # in place of a folder: the message packages of this host
 
 
-def check_signs(
+def check(
     map_name: Annotated[str, typer.Argument(metavar="MAP", help="Name of a channel map, or path of one (.yaml).")],
     airframe: Annotated[str | None, typer.Option(help="Airframe; by default that of the scenario.")] = None,
     scenario: Annotated[str, typer.Option(help="Scenario with the controller.")] = "osprey_servo",
-    bag: Annotated[
+    run: Annotated[
         Path | None, typer.Option(help="A recorded flight with y and u, each input excited; with a bridge, its engaged time.")
     ] = None,
     namespace: LogNamespace = None,
+    definitions: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Check the rows instead: the sources of a message package, of one release; several, each a column; or"
+            f" {INSTALLED}."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
 ) -> None:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 
+    With --definitions, tell for which releases of an autopilot the rows of the map hold: topic, field and constants of each.
+    Rows of MAVLink always stand against pymavlink.
+
     A sign without a certain measurement is no contradiction: a ? in the table, and a sentence with the necessary excitation.
-    Exit status: 0 agreement, 1 contradiction, 2 bad input.
+    Exit status: 0 agreement, 1 a contradiction or a row that does not hold, 2 bad input.
     """
     channel_map = load_map(map_name)
+    if definitions:
+        _check_rows(channel_map, definitions, as_json)
+        return
     for fault in version_faults((topic, kind) for _, topic, kind in channel_map.used_topics() if topic.startswith("/fmu/")):
         print(f"warning: {fault}", file=sys.stderr)
     chosen = find_scenario(scenario)
     frame = load_airframe(airframe or chosen.aircraft.airframe)
-    if bag is not None:
-        warn_of_lacks_in(bag, namespace)
-    checked = check_scenario(channel_map, chosen, frame, bag, namespace)
+    if run is not None:
+        warn_of_lacks_in(run, namespace)
+    checked = check_scenario(channel_map, chosen, frame, run, namespace)
     if as_json:
         channels = [channel._asdict() for channel in checked.channels]
         sentences = list(checked.contradictions)
@@ -95,3 +111,44 @@ def _show(console: Console, channel_map: ChannelMap, checked: SignCheck, airfram
 def _format_field(row: OutputRow | InputRow) -> str:
     """The field with the sign of the channel in front."""
     return f"{'-' if row.sign < 0 else '+'} {row.field}"
+
+
+def _check_rows(channel_map: ChannelMap, definitions: Sequence[Path], as_json: bool) -> None:
+    """Compare the rows of a map with the message definitions of releases, and show each that does not hold."""
+    kinds = list(dict.fromkeys(kind for _, _, kind, *_ in channel_map.used_fields()))
+    installed = installed_definitions(kinds)
+    mavlink_types = {kind: types for kind, types in installed.items() if kind.startswith(f"{MAVLINK}/")}
+    names = [folder.resolve().name for folder in definitions]
+    releases = [
+        installed if str(folder) == INSTALLED else {**definitions_below(folder, kinds), **mavlink_types}
+        for folder in definitions
+    ]
+    rows = check_map(channel_map, releases)
+    if as_json:
+        print_json({"map": channel_map.name, "releases": names, "rows": [row._asdict() for row in rows]})
+    else:
+        _show_rows(channel_map.name, rows, names)
+        for name, types in zip(names, releases, strict=True):
+            if absent := sorted({kind.partition("/")[0] for kind in kinds if not is_known(types, kind)}):
+                print(f"note: {name}: no definition of {', '.join(absent)}: make messages, or another folder", file=sys.stderr)
+    if any(any(row.faults) for row in rows):
+        raise typer.Exit(CONTRADICTS)
+
+
+def _show_rows(name: str, rows: Sequence[CheckedRow], releases: Sequence[str]) -> None:
+    """Print a row for each row of the map, and a sentence for each that does not hold."""
+    faults: dict[str, list[dict[str, None]]] = {}
+    for row in rows:
+        by_release = faults.setdefault(row.key, [{} for _ in releases])
+        for sentences, fault in zip(by_release, row.faults, strict=True):
+            sentences.update({fault: None} if fault else {})
+    table = new_table(f"Map {name}: which rows hold", ("row", *releases), left_aligned=("row", *releases), wrapped=releases)
+    for key, by_release in faults.items():
+        table.add_row(key, *("no" if fault else "holds" for fault in by_release))
+    Console().print(table)
+    for k, release in enumerate(releases):
+        held = sum(not by_release[k] for by_release in faults.values())
+        print(f"{release}: {held} of {len(faults)} rows hold")
+        for key, by_release in faults.items():
+            if by_release[k]:
+                print(f"    {key}: {', '.join(by_release[k])}")

@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di scenarios`: the scenarios by name."""
+
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_cli.output import new_table, print_json
+
+
+def scenarios(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SCENARIO]...", help="Names, or scenario files (.yaml); by default all that ship."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON, nothing else.")] = False,
+) -> None:
+    """List scenarios: what each flies, its aircraft and its law.
+
+    Exit status: 0, or 2 for a file with a mistake.
+    """
+    rows = []
+    for name in names or sorted(path.stem for path in LIBRARY.glob("*.yaml")):
+        scenario = find_scenario(name)
+        comment = (line.removeprefix("#").strip() for line in scenario.path.read_text(encoding="utf-8").splitlines())
+        sentence = next((line for line in comment if line and not line.startswith("SPDX")), "")
+        row = {"name": scenario.name, "flies": sentence, "aircraft": scenario.aircraft.airframe}
+        rows.append(row | {"law": scenario.controller.law})
+    if as_json:
+        print_json(rows)
+        return
+    headings = ("name", "flies", "aircraft", "law")
+    table = new_table("Scenarios", headings, left_aligned=headings, wrapped=("flies",))
+    for row in rows:
+        table.add_row(*row.values())
+    Console().print(table)
