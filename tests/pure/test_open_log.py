@@ -173,8 +173,8 @@ def test_two_aircraft_are_shown_one_at_time(messages: list[Recorded], osprey_gus
     for command in ("report", "replay", "check", "identify"):
         given = ["--set", "scenario=osprey_gust"] if command == "identify" else ["--scenario", "osprey_gust"]
         assert "aircraft in the namespaces /uav1, /uav2" in refusal(command, str(bag), *given)
-        name = ["--set", "namespace=uav3"] if command == "identify" else ["--namespace", "uav3"]
-        assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *name)
+        third = ["--set", "namespace=uav3"] if command == "identify" else ["--namespace", "uav3"]
+        assert "expected one in 'uav3'" in refusal(command, str(bag), *given, *third)
     assert "expected one in 'uav3'" in refusal("watch", str(bag), "--namespace", "uav3")
     assert "expected one in 'uav3'" in refusal("play", str(bag), "--namespace", "uav3")
     for name, duration in (("uav1", 2.0), ("uav2", 0.99)):  # by the last u

@@ -36,7 +36,7 @@ Overrides = dict[str, dict[str, object]]
 
 
 def is_fleet(name: FilePath) -> bool:
-    """Whether the path is that of the file of a fleet, which has aircraft by name; a scenario has sections of nodes."""
+    """Whether the path names the file of a fleet, with aircraft by name; a scenario has sections of nodes."""
     with suppress(ParameterError):
         content = read_yaml(Path(name), str(name), A_FLEET)
         return isinstance(content, Mapping) and "aircraft" in content

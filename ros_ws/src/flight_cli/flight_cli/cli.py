@@ -86,7 +86,7 @@ def _options(
 
 
 def application(words: Collection[str]) -> typer.Typer:
-    """The command line with the commands that are among the words; the others are there by name and help alone."""
+    """The command line with the commands among the words; further commands have name and help alone."""
     app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, cls=Commands)
     app.callback()(_options)
     for group, commands in GROUPS.items():

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di fly` that flies several aircraft at once, then shows a line an aircraft."""
+"""Several aircraft at once by `rise-di fly`, then a line an aircraft."""
 
 import sys
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di watch` that shows a running flight in FlightGear."""
+"""The FlightGear output of `rise-di watch`: the pose of a running flight as packets."""
 
 import math
 import re

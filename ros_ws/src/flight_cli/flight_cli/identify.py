@@ -191,7 +191,7 @@ def identify(
 
 
 def _require_none(values: Mapping[str, object], expected: str) -> None:
-    """Raise ParameterError for the first of these options that is there."""
+    """Raise ParameterError for the first option with a value."""
     for name, value in values.items():
         require(value in (None, False), name, f"{value}", expected)
 

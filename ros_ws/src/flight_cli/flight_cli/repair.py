@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The part of `rise-di report` that rebuilds a log whose recorder was killed, so that every rosbag2 reader accepts it."""
+"""The repair of `rise-di report`: rebuild a log whose recorder was killed, so that every rosbag2 reader accepts it."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The words of a command line: settings of a command by --set, and what replaces a command or an option that is gone."""
+"""The words of a command line: settings of a command by --set, and the new name of a removed command or option."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
@@ -31,18 +31,18 @@ GONE = MappingProxyType(
         "watch --control-real": "--control --set real",
     }
 )
-"""What replaces a command, or an option of a command, that is gone."""
+"""The new name of a removed command, or of a removed option of a command."""
 
 
 class Command(TyperCommand):
-    """A command with settings beside its options, and a sentence for an option that is gone."""
+    """A command with settings beside options, and a sentence for a removed option."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words after the name. Raises ParameterError for an option that is gone and for an unknown setting."""
+        """Parse the words after the name. Raises ParameterError for a removed option and an unknown setting."""
         return super().parse_args(ctx, [*_joined(self.name or "", args, self._spellings())])
 
     def invoke(self, ctx: Any) -> Any:
-        """Call the function. Raises its ParameterError with the spelling of the option whose name is the key."""
+        """Call the function. Raises ParameterError with the spelling of the option for the key."""
         try:
             return super().invoke(ctx)
         except ParameterError as error:
@@ -53,7 +53,7 @@ class Command(TyperCommand):
             raise ParameterError(f"{spelling}{colon}{reason}") from None
 
     def _spellings(self) -> dict[str, str]:
-        """How each option is spelled, by its name without --: `--set rate` for a setting."""
+        """The spelling of the options by name without --: `--set rate` for a setting."""
         options = (parameter for parameter in self.params if parameter.param_type_name == "option")
         return {
             option.opts[0].removeprefix(f"{SET} ").removeprefix("--").replace("-", "_"): option.opts[0] for option in options
@@ -61,16 +61,16 @@ class Command(TyperCommand):
 
 
 class Commands(TyperGroup):
-    """Commands by name, and a sentence for a command that is gone."""
+    """Commands by name, and a sentence for a removed command."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command of the first word. Raises ParameterError for a command that is gone."""
+        """The command of the first word. Raises ParameterError for a removed command."""
         require(args[0] not in GONE, args[0], "a command that is gone", GONE.get(args[0], ""))
         return super().resolve_command(ctx, args)
 
 
 def _joined(command: str, args: Sequence[str], spellings: Mapping[str, str]) -> Iterator[str]:
-    """The words, each setting as one word; the other words of --set stay where the command has this option."""
+    """The words, a setting joined to a single word; further words of --set stay where the command has this option."""
     settings = {name for name, spelling in spellings.items() if spelling.startswith(f"{SET} ")}
     words = iter(args)
     for word in words:
