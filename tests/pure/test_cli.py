@@ -3,6 +3,7 @@
 """The command line: exit status, sentences, files."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -131,6 +132,25 @@ def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path:
     sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
     assert shown.stderr.splitlines()[-1] == sentence
     assert "Traceback" not in shown.stderr
+
+
+@pytest.mark.parametrize("command", ["campaign", "compare", "benchmark"])
+def test_device_that_jax_lacks_is_one_sentence_without_a_folder(command: str, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "flight_cli.cli", command, "osprey_servo", "--aircraft", "1"]
+    environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
+    shown = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert shown.returncode == 2
+    assert shown.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
+    assert "Traceback" not in shown.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust", "--in-process", "--duration", "0.1", "--set"]
+    shown = subprocess.run([*map(os.fsencode, words), b"runs=r\xff"], cwd=tmp_path, capture_output=True, check=False)
+    assert shown.returncode == 2
+    assert re.fullmatch(rb"error: --set runs: found .*udcff', expected a folder with a name in UTF-8.*\n", shown.stderr)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:

@@ -12,9 +12,11 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
+from flight_log import playback
 from flight_log.bag import BagWriter, LogAttachments
 from flight_log.named_vectors import JOINT_STATE
 from flight_log.playback import read_playback
+from flight_log.stored_messages import StoredMessage
 from flight_log.tape_writer import write_run
 
 pytestmark = pytest.mark.package("flight_log")
@@ -121,3 +123,20 @@ def test_clock_is_not_played_and_shared_topics_only_by_name(tmp_path: Path) -> N
     assert list(read_playback(bag, ["y", "rosout"]).types) == ["/rosout", "/y"]
     with pytest.raises(ParameterError, match="found no message of /clock, expected some of /diagnostics, /rosout, /y"):
         read_playback(bag, ["/clock"])
+
+
+@pytest.mark.parametrize(
+    ("durability", "depth", "early"), [("transient_local", 1, 1), (1, 3, 2), ("volatile", 1, 0), (1, 20_000, 0)]
+)
+def test_start_in_the_middle_sends_latched_messages_first(
+    durability: str | int, depth: int, early: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    qos = f"- history: keep_last\n  depth: {depth}\n  durability: {durability}\n"
+    stored = [StoredMessage(topic, "x/msg/X", "", t, t, b"", qos=qos if topic == "/a" else "") for topic, t in LATCHED]
+    monkeypatch.setattr(playback, "stored_messages", lambda run: iter(stored))
+    played = read_playback(tmp_path, start=2.0).messages
+    assert [message.topic for message in played] == ["/a"] * early + ["/y"]
+    assert {message.due_ns for message in played[:early]} <= {LATCHED[0][1] + 2 * NANOSECONDS}
+
+
+LATCHED = [("/a", 10 * NANOSECONDS), ("/a", 11 * NANOSECONDS), ("/y", 11 * NANOSECONDS), ("/y", 13 * NANOSECONDS)]

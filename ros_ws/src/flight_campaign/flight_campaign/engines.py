@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice
 from typing import Any
 
+from flight_core.installation import require_package
 from flight_core.parameters import ParameterError
 
 CONNECT = 10.0
@@ -28,6 +29,19 @@ Work = Callable[[Job], Any]
 
 Engine = Callable[[Work, Iterable[Job]], Iterator[tuple[Job, Any]]]
 """Runs jobs in any order: each job with its result, in the order of completion."""
+
+
+def require_jax() -> None:
+    """Raise ParameterError where JAX is not installed or finds no device, as with JAX_PLATFORMS of another host."""
+    require_package("jax")
+    import jax  # noqa: PLC0415 - takes a second, which few commands need
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError) as error:
+        platforms = os.environ.get("JAX_PLATFORMS", "")
+        reason = str(error).partition("\n")[0] or "no such device"
+        raise ParameterError(f"JAX_PLATFORMS: found {platforms!r} ({reason}), expected cpu, or a device of this host") from None
 
 
 def threads(workers: int | None = None) -> Engine:

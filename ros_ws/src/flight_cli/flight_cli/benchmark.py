@@ -18,7 +18,6 @@ from flight_campaign.benchmark_scores import SCORES, Benchmark, Flights, define
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
 from flight_core.files import display_path
-from flight_core.installation import require_package
 from flight_core.parameters import require
 
 FOLDER = "benchmark-"
@@ -52,7 +51,7 @@ def benchmark(
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted.
     """
-    require_package("jax")
+    engines.require_jax()
     fits = not release or re.fullmatch(rf"[0-9a-f]{{{RELEASE_LENGTH}}}", release) is not None
     require(fits, "--release", release, f"the hash of a commit, {RELEASE_LENGTH} hex digits")
     with Console(stderr=True, quiet=as_json).status("preparing"):

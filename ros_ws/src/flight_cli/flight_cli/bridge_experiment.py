@@ -163,10 +163,10 @@ def _announce(console: Console, planned: Experiment, duration: float, *, hovers:
 
 
 def _engaged(run: Path, channel_map: ChannelMap) -> tuple[Tape, list[tuple[int, int]], str]:
-    """The tape of an experiment, its engaged spans, ns, and a sentence on how the bridge cut it short, empty for a whole one.
+    """The tape of an experiment, the engaged spans, ns, and a sentence on an early end by the bridge, else empty.
 
-    The span of a flight that `rise-di import` took from another log is all of it.
-    Raises ParameterError for a log without an engagement, and for a flight under feedback: its u follows y.
+    A flight of `rise-di import` is a single span.
+    Raises ParameterError for a log without an engagement, and for a flight under feedback: u follows y.
     """
     recorded = read_run(run)
     warn_of_lacks(recorded)

@@ -33,7 +33,6 @@ from flight_cli.output import (
     progress_bar,
 )
 from flight_core.files import display_path, writing
-from flight_core.installation import require_package
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import learner
 
@@ -119,7 +118,7 @@ def campaign(
 
     Exit status: 0 all flown, 2 bad input, 130 interrupted; its folder continues it.
     """
-    require_package("jax")
+    engines.require_jax()
     require(scheduler is None or engine is EngineName.DASK, "scheduler", scheduler, "--engine dask with it")
     if rows is not None:
         require(rows.parent.is_dir(), "rows", rows, "a file in a folder that exists")

@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.loop_margins import loop_assessment, scenario_l
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.report.summary import display_units, finite_or_null
-from flight_campaign import law_comparison, registered_laws, tuned_controller
+from flight_campaign import engines, law_comparison, registered_laws, tuned_controller
 from flight_campaign import tuning as gain_tuning
 from flight_campaign.campaign_report import WIND_EFFECTS
 from flight_campaign.law_comparison import LawResult
@@ -95,6 +95,7 @@ def compare(
 
     Exit status: 0, or 2 bad input.
     """
+    engines.require_jax()
     names = list(LAWS) if laws is None else laws.split(",")
     aims = tuning.split(",")
     levels, tuning_seed = parse_numbers(uncertainty), gain_tuning.TUNING_TURBULENCE_SEED

@@ -21,8 +21,8 @@ def engage(
 ) -> None:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 
-    It waits until u is at trim, and until the autopilot has changed its mode where the map asks for that. The bridge activates
-    the controller, and deactivates it at the end of the engagement. The loss of the pilot's transmitter ends the engagement
+    The command waits until u is at trim, and for a change of mode where the map asks for one. The bridge activates the
+    controller until the end of the engagement. The loss of the pilot's transmitter ends the engagement
     where the map has a condition for it; elsewhere max_engaged of the map ends the engagement, unless you engage again before.
     Exit status: 0 done, 1 refused with the bridge's reason, 2 service not available.
     """

@@ -170,8 +170,8 @@ def identify(
     require(margin is None or refly or observer or learn, "margin", margin, "--set refly, --observer or --learn beside it")
     require(not (observer and learn), "observer", "--learn beside it", "one of the two: a learner designs its own observer")
     if log is not None:
-        of_aircraft = {"speed": speed, "altitude": altitude, "observer": observer, "guidance": guidance, "learn": learn}
-        _require_none(of_aircraft | {"phase_margin": phase_margin, "accept": accept, "commands": commands}, "none beside a log")
+        steps_only = {"speed": speed, "altitude": altitude, "observer": observer, "guidance": guidance, "learn": learn}
+        _require_none(steps_only | {"phase_margin": phase_margin, "accept": accept, "commands": commands}, "none beside a log")
         require(airframe is not None, "airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
         nominal = load_airframe(airframe or "")
         refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None
@@ -179,8 +179,8 @@ def identify(
     elif aircraft is None or speed is None or altitude is None:
         raise ParameterError("identify: found too few arguments, expected a log, or an aircraft with --speed and --altitude")
     else:
-        of_log = {"airframe": airframe, "scenario": scenario, "delay": delay, "namespace": namespace, "refly": refly}
-        _require_none(of_log, "a log in place of the aircraft")
+        log_only = {"airframe": airframe, "scenario": scenario, "delay": delay, "namespace": namespace, "refly": refly}
+        _require_none(log_only, "a log in place of the aircraft")
         observer_margin = (STEP_MARGIN if margin is None else margin) if observer or learn else None
         texts: dict[str, str] = {}
         for text in commands or []:

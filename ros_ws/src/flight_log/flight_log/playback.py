@@ -3,9 +3,13 @@
 """Playback schedule of a log: the messages and the times to send. Needs no ROS; `flight_bringup.player` sends."""
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
+
+import yaml
 
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, seconds
@@ -19,6 +23,7 @@ CLOCK = "/clock"  # never played: the player publishes its own clock
 SHARED = ("/diagnostics", "/parameter_events", "/rosout")
 """Topics on which every node of a domain may publish. They are played only by name."""
 
+MAX_LATCHED = 100  # messages of a topic; a lockstep flight keeps 20,000, which is no latch
 MAX_CLOCK_OFFSET_NS = 86_400 * NANOSECONDS  # a stamp further than a day from the host's clock is flight time, as in lockstep
 NO_FIELD = re.compile(r"\s*(#|$|\S+\s+\w+\s*=)")  # a comment, an empty line, a constant
 STAMPED = re.compile(r"\s*((std_msgs(/|::)(msg::)?)?Header|builtin_interfaces(/|::)(msg::)?Time)\s")
@@ -86,8 +91,34 @@ def read_playback(run: Path, topics: Sequence[str] = (), start: float = 0.0, nam
     begin_ns = start_ns + nanoseconds(start)
     end = seconds(messages[-1].due_ns - start_ns)
     require(begin_ns <= messages[-1].due_ns, "start", f"{start:g} s", f"a flight time before the end of the log, {end:g} s")
-    played = messages if start <= 0.0 else [message for message in messages if message.due_ns >= begin_ns]
+    played = (
+        messages
+        if start <= 0.0
+        else [*_latched(messages, known, begin_ns), *(later for later in messages if later.due_ns >= begin_ns)]
+    )
     return Playback({topic: known[topic].type_name for topic in sorted(wanted)}, played, start_ns, skipped)
+
+
+def _latched(
+    messages: Sequence[ScheduledMessage], known: Mapping[str, StoredMessage], begin_ns: int
+) -> Iterator[ScheduledMessage]:
+    """The last messages of latched topics before the begin, as of /robot_description, for late subscribers."""
+    kept = {topic: deque[ScheduledMessage](maxlen=latched_depth(message.qos)) for topic, message in known.items()}
+    for message in messages:
+        if message.due_ns < begin_ns:
+            kept[message.topic].append(message._replace(due_ns=begin_ns))
+    yield from chain.from_iterable(kept.values())
+
+
+def latched_depth(qos: str) -> int:
+    """The number of messages for a late subscriber, by the offered profiles of rosbag2 as YAML; 0 of a volatile topic."""
+    try:
+        profiles = yaml.safe_load(qos)
+        depths = [int(each["depth"]) for each in profiles or () if each["durability"] in {1, "transient_local"}]
+    except (yaml.YAMLError, KeyError, TypeError, ValueError):
+        return 0
+    depth = max(depths, default=0)
+    return depth if depth <= MAX_LATCHED else 0
 
 
 def _unsendable(message: StoredMessage) -> str:

@@ -31,6 +31,7 @@ class StoredMessage(NamedTuple):
     sent_ns: int
     data: bytes
     encoding: str = "cdr"
+    qos: str = ""  # the offered profiles, YAML of rosbag2
 
 
 NO_SCHEMA = Schema(id=0, data=b"", encoding="", name="")
@@ -58,6 +59,7 @@ def stored_messages(run: Path) -> Iterator[StoredMessage]:
                             record.publish_time,
                             plain_message(record.data),
                             channel.message_encoding,
+                            channel.metadata.get("offered_qos_profiles", ""),
                         )
                     elif isinstance(record, Schema):
                         schemas[record.id] = record

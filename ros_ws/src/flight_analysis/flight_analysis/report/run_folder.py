@@ -47,6 +47,9 @@ class FlightResult(NamedTuple):
 
 def new_run(scenario: Scenario, runs: Path, kind: str = "") -> Path:
     """Create the folder of a new run, runs/<UTC stamp>-<kind><scenario>. Raises ParameterError for a failure."""
+    place = str(runs.absolute())
+    is_text = not any("\ud800" <= character <= "\udfff" for character in place)
+    require(is_text, "runs", ascii(place), "a folder with a name in UTF-8, as logs and reports hold it")
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{kind}{scenario.name}"
     for name in (stem, *(f"{stem}-{k}" for k in range(2, 100))):
         run = (runs / name).absolute()
