@@ -12,14 +12,16 @@ from pathlib import Path
 
 import pytest
 import typer
+from tests.conftest import REPOSITORY
 from typer.testing import CliRunner
 
 from flight_analysis.closed_loop.replay import recorded_scenario
-from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.cli import COMMANDS, application
 from flight_cli.words import GONE
 from flight_core.parameters import ParameterError
+from rise_di_controller.rise_di_config import RiseDiConfig
 
 pytestmark = [pytest.mark.package("flight_cli"), pytest.mark.slow]
 
@@ -223,3 +225,13 @@ cli.main()
 """
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
+def test_keys_of_the_first_page_are_keys_of_a_scenario() -> None:
+    page = (REPOSITORY / "docs" / "get-started.md").read_text(encoding="utf-8")
+    keys = re.findall(r"^\| `(\w+\.\w+)` \|", page.partition("15 keys")[2], re.MULTILINE)
+    assert len(keys) == 15
+    for key in keys:
+        section, _, name = key.partition(".")
+        models = [SCHEMAS[section], RiseDiConfig] if section == "controller" else [SCHEMAS[section]]
+        assert any(name in model.model_fields for model in models), key  # type: ignore[attr-defined]

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flight_cli.output import new_table, parse_numbers, print_json
+from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains.airframe_properties import AirframeFacts, ComplexArray, airframe_facts, library, marginal_sentence
@@ -53,7 +54,7 @@ def airframes(
     length: Annotated[str | None, typer.Option("--set length", help="Unit of length of AVL's file, by default m.")] = None,
     text: Annotated[str, typer.Option("--set source", help="Where the figures come from: a book and a page.")] = "",
     replace: Annotated[bool, typer.Option("--set replace", help="Replace files of these names.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the facts as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Show airframes: poles, zeros, the minors of Omega = C B, D as published and what gives D = I.
 

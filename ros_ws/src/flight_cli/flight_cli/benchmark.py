@@ -17,6 +17,7 @@ from flight_campaign.benchmark_entry import find_entry
 from flight_campaign.benchmark_scores import SCORES, Benchmark, Flights, define
 from flight_campaign.benchmark_sets import RELEASE_LENGTH, SCENARIOS, VERSION, Sets
 from flight_cli.output import COUNT_COLUMNS, INTERRUPTED, new_table, print_json, progress_bar
+from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.parameters import require
 
@@ -45,7 +46,7 @@ def benchmark(
         Path | None, typer.Option(help="Folder of the run, which an interrupted run continues; by default in runs.")
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Threads; by default one a core.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the scores as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fly the public benchmark with a law, and write a file of scores. The same command continues an interrupted run.
 

@@ -32,6 +32,7 @@ from flight_cli.output import (
     print_json,
     progress_bar,
 )
+from flight_cli.words import AsJson
 from flight_core.files import display_path, writing
 from flight_core.parameters import require
 from flight_design.learning.scenario_learner import learner
@@ -110,7 +111,7 @@ def campaign(
     rows: Annotated[
         Path | None, typer.Option(help="Write a row an aircraft as Parquet: figures, outcome, drawn entries.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fly a Monte Carlo campaign: thousands of uncertain aircraft around the airframe of a scenario, many at once.
 

@@ -17,6 +17,7 @@ from autopilot_bridge.params import MAVLINK, ChannelMap, InputRow, OutputRow, lo
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.log_options import LogNamespace, warn_of_lacks_in
 from flight_cli.output import new_table, print_json
+from flight_cli.words import AsJson
 from flight_design.identification.response_identification import MIN_RATIO
 from flight_design.identification.sign_check import SignCheck, check_scenario, motion_as_channel_grows
 
@@ -39,7 +40,7 @@ def check(
             f" {INSTALLED}."
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare the D of the controller with the D of a channel map, and with a recorded flight.
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from flight_cli.words import Namespace
 from flight_core.environment import require_ros_environment
 
 REFUSED = 1
@@ -17,7 +18,7 @@ def engage(
     blind: Annotated[
         bool, typer.Option("--blind", help="Engage without regard to the pilot's transmitter, and without end by max_engaged.")
     ] = False,
-    namespace: Annotated[str, typer.Option(help="Namespace of the bridge and the controller.")] = "",
+    namespace: Namespace = "",
 ) -> None:
     """Engage the autopilot behind a running bridge without a jump of u, or disengage it.
 

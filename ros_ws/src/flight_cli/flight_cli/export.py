@@ -10,6 +10,7 @@ from rich.console import Console
 
 from flight_cli.log_options import warn_of_lacks
 from flight_cli.output import print_json
+from flight_cli.words import AsJson
 from flight_log.tape_reader import read_run
 from rise_di.c_code import export as write_export
 
@@ -36,7 +37,7 @@ def export(
         bool, typer.Option("--fmu", help="Write a co-simulation unit of FMI 2.0 (rise_di.fmu) beside the code.")
     ] = False,
     without_proof: Annotated[bool, typer.Option("--no-proof", help="Write the code without a proof.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write the controller of a scenario as C99, compile it, and prove that C and Python give the same bits.
 

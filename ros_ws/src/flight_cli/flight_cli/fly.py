@@ -25,6 +25,7 @@ from flight_cli.output import (
 )
 from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, parse_origin, read_waypoints
 from flight_cli.settings import Settings, with_settings
+from flight_cli.words import AsJson
 from flight_core.environment import require_ros_environment
 from flight_core.files import display_path
 from flight_core.installation import require_package
@@ -75,7 +76,7 @@ def fly(
         str, typer.Option(help="Namespace of all nodes, as uav1: one for each aircraft that flies in this domain.")
     ] = "",
     runs: Annotated[Path, typer.Option("--set runs", help="Folder that the run's folder is made in.")] = Path("runs"),
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Fly a scenario or a fleet: the nodes of each aircraft as processes over ROS 2 topics, in real time.
 

@@ -19,6 +19,7 @@ from flight_analysis.report.margin_figures import MARGIN_COLUMNS, MARGIN_LEGEND,
 from flight_analysis.report.summary import display_unit
 from flight_campaign.statistics import SCORE_UNIT, score_units
 from flight_cli.output import LICENCE, new_table, parse_numbers, print_json, write_text
+from flight_cli.words import AsJson
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
@@ -115,7 +116,7 @@ def gains(
         Path | None,
         typer.Option(help="HTML file for the margins with Bode and Nyquist plots: of the engineering gains, or with --check."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Select gains for an airframe by Theorem 1 and by the engineering procedure, and show every condition on both.
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, read_waypoints
+from flight_cli.words import Namespace
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import ParameterError, require
 from flight_guidance.modes import ANGLES, TARGETS
@@ -40,7 +41,7 @@ def guide(
     altitude: Altitude = None,
     simplify: Simplify = 0.0,
     line: Line = None,
-    namespace: Annotated[str, typer.Option(help="Namespace of the aircraft.")] = "",
+    namespace: Namespace = "",
 ) -> None:
     """Command a running guided flight, as in: rise-di guide heading=90 altitude=1300. What is not named stays.
 

@@ -46,6 +46,7 @@ from flight_cli.output import (
     progress_bar,
     write_text,
 )
+from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import ParameterError, require, require_channels
@@ -143,7 +144,7 @@ def identify(
             help="Of JSBSim: a model's own property for an input, and its value at full command; repeat for more.",
         ),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Identify an aircraft of JSBSim by step tests, or A and B of an airframe from the log of a flight.
 

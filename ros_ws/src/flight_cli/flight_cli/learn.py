@@ -14,6 +14,7 @@ from flight_analysis.report.summary import display_units
 from flight_cli.log_options import LogNamespace, LogScenario, scenario_file, warn_of_lacks
 from flight_cli.output import LATEST, entries_as_json, entry_table, model_table, print_json, write_text
 from flight_cli.settings import Settings, with_settings
+from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -29,7 +30,7 @@ def learn(
     write: Annotated[Path | None, typer.Option(help="File for the learned model, an airframe file.")] = None,
     scenario: LogScenario = None,
     namespace: LogNamespace = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Repeat the learner on the log of a flight, with the settings of its scenario or, by --set controller.learn.*, others.
 

@@ -23,6 +23,7 @@ from flight_analysis.report.run_folder import log_account
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, write_text
 from flight_cli.settings import Settings, parse_settings
+from flight_cli.words import AsJson
 from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import require
 from flight_core.text import printable
@@ -38,7 +39,7 @@ def replay(
     namespace: LogNamespace = None,
     remap: LogRemaps = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="CSV file for u as recorded and as computed.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compute every tick of a recorded flight again, and every step of guidance, and compare it with the log bit by bit.
 

@@ -16,6 +16,7 @@ from flight_analysis.report.summary import ERROR_COLUMNS, RecordedFlight
 from flight_cli.log_options import LogNamespace, LogRemaps, LogScenario, remaps_of, scenario_file
 from flight_cli.output import LATEST, new_table, print_json, show_flight
 from flight_cli.repair import repair_log
+from flight_cli.words import AsJson
 from flight_core.files import display_path
 from flight_core.outcome import STATUS_INCOMPLETE
 
@@ -57,7 +58,7 @@ def report(
     mat: Annotated[Path | None, typer.Option("--set mat", help="Write all signals as a MAT-file, a structure a topic.")] = None,
     tables: Annotated[Path | None, typer.Option("--set tables", help="Folder for a CSV a topic.")] = None,
     latex: Annotated[Path | None, typer.Option("--set latex", help="Write the tables of errors and inputs as LaTeX.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON, a list for several runs.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write the report page of a recorded run again, or one that compares several, and print its tables.
 

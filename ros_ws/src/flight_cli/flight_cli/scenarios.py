@@ -9,6 +9,7 @@ from rich.console import Console
 
 from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
 from flight_cli.output import new_table, print_json
+from flight_cli.words import AsJson
 
 
 def scenarios(
@@ -16,7 +17,7 @@ def scenarios(
         list[str] | None,
         typer.Argument(metavar="[SCENARIO]...", help="Names, or scenario files (.yaml); by default all that ship."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the list as JSON, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """List scenarios: what each flies, its aircraft and its law.
 

@@ -4,13 +4,17 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from typer.core import TyperCommand, TyperGroup
 
 from flight_core.parameters import ParameterError, require
 
 SET = "--set"
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, nothing else.")]
+Namespace = Annotated[str, typer.Option(help="Namespace of the aircraft.")]
+"""Options of several commands."""
 GONE = MappingProxyType(
     {
         "airframe": "rise-di airframes FILE --write FOLDER",
