@@ -22,6 +22,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_cli.airframes import airframes
 from flight_cli.gains import gains as gains_command
+from flight_cli.words import Command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
@@ -329,7 +330,7 @@ def test_the_literal_sign_has_no_linear_loop(osprey: Study) -> None:
 
 def rise_di(*arguments: str) -> Result:
     app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(gains_command)
+    app.command("gains", cls=Command)(gains_command)
     app.command()(airframes)
     return CliRunner(env={"COLUMNS": "80"}).invoke(app, arguments)
 

@@ -20,6 +20,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error, error_metrics
 from flight_cli.gains import gains as gains_command
+from flight_cli.words import Command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
 from flight_design.gains import gain_selection
@@ -173,7 +174,7 @@ def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
 
 def rise_di(*arguments: str) -> Result:
     app = typer.Typer(pretty_exceptions_enable=False)
-    app.command()(gains_command)
+    app.command("gains", cls=Command)(gains_command)
     return CliRunner(env={"COLUMNS": "150"}).invoke(app, arguments)
 
 
