@@ -158,9 +158,15 @@ def identify(
     log = None if source is None or source.startswith(PREFIX) else Path(source)
     aircraft = source if log is None else None
     if bridge is not None:
-        unused = {"aircraft": aircraft, "altitude": altitude, "airframe": airframe, "margin": margin, "scenario": scenario}
-        unused |= {"delay": delay, "refly": refly, "observer": observer, "guidance": guidance, "learn": learn, "commands": commands}
-        _require_none(unused | {"namespace": namespace}, "none beside --bridge")
+        unused: dict[str, object] = {
+            "aircraft": aircraft,
+            "altitude": altitude,
+            "airframe": airframe,
+            "margin": margin,
+            "scenario": scenario,
+        }
+        unused |= {"delay": delay, "refly": refly, "observer": observer, "guidance": guidance, "learn": learn}
+        _require_none(unused | {"namespace": namespace, "command": commands}, "none beside --bridge")
         if write is None:
             raise ParameterError("identify: found too few arguments, expected --write beside --bridge")
         require(speed is None or 0.0 < speed < math.inf, "speed", f"{speed}", "above 0 m/s")
@@ -171,8 +177,14 @@ def identify(
     require(margin is None or refly or observer or learn, "margin", margin, "--set refly, --observer or --learn beside it")
     require(not (observer and learn), "observer", "--learn beside it", "one of the two: a learner designs its own observer")
     if log is not None:
-        steps_only = {"speed": speed, "altitude": altitude, "observer": observer, "guidance": guidance, "learn": learn}
-        _require_none(steps_only | {"phase_margin": phase_margin, "accept": accept, "commands": commands}, "none beside a log")
+        steps_only: dict[str, object] = {
+            "speed": speed,
+            "altitude": altitude,
+            "observer": observer,
+            "guidance": guidance,
+            "learn": learn,
+        }
+        _require_none(steps_only | {"phase_margin": phase_margin, "accept": accept, "command": commands}, "none beside a log")
         require(airframe is not None, "airframe", "none", "the nominal airframe of the log, a name or a file (.yaml)")
         nominal = load_airframe(airframe or "")
         refly_margin = (REFLY_MARGIN if margin is None else margin) if refly else None

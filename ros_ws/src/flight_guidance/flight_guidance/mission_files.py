@@ -30,7 +30,8 @@ def read_plan_tree(tree: Any, key: str, line: str | None) -> Places:
     require(isinstance(rows, list), key, "no mission with items", "a plan of QGroundControl")
     items = [_plan_item(entry, number, f"{key}: item {number}") for number, entry in _plan_items(rows or (), key)]
     fence = plan_fence(tree, key)
-    notes = ["the fence and the rally points are no part of the route; --set route.fence keeps them"] * bool(fence.zones or fence.rally)
+    apart = "the fence and the rally points are no part of the route; --set route.fence keeps them"
+    notes = [apart] * bool(fence.zones or fence.rally)
     notes += [f"not read: {FIRST_FENCE}"] * has_first_fence(tree)
     return mission_route(key, items, home_of(member(mission, "plannedHomePosition")), notes)
 
