@@ -291,7 +291,7 @@ def test_saturation_limits_can_be_added_in_flight(flight: Flight) -> None:
         ({"rate": 200.0}, "read-only"),
         ({"D": [-1, 1, 1, 1]}, "read-only"),
         ({"k_gg": 1.0}, "undeclared parameter"),
-        ({"use_sim_time": True}, "controller.use_sim_time: found true, expected false"),
+        ({"use_sim_time": True}, "controller.use_sim_time: found True, expected no change: a node chooses its clock"),
     ],
 )
 def test_invalid_change_rejected_with_reason_and_has_no_effect(changes: dict[str, Any], sentence: str, flight: Flight) -> None:

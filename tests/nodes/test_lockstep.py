@@ -129,8 +129,8 @@ def test_node_names_and_passes_on_the_role_that_a_peer_reports(osprey_gust: Scen
         peer = world.publisher(String, "/alive/reference_model", LIVELINESS)
         for role in ("aircraft", "autopilot"):
             peer.publish(String(data=role))
-            aircraft.require_peers()
+            aircraft.require_flight()
         peer.publish(String(data="controller"))
         with pytest.raises(FlightEnded, match="lost contact with controller"):
-            aircraft.require_peers()
+            aircraft.require_flight()
         assert [message.data for message in world.messages("/alive/aircraft")] == ["controller"]

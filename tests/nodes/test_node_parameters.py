@@ -43,7 +43,6 @@ def test_node_without_parameters_names_a_missing_one(name: str) -> None:
         (["-p", "max_agee:=1.0"], "controller.max_agee: unknown key, expected max_age perhaps"),
         (["-p", "beta:=[1.0,2.0]"], "controller.beta: found 2 values, expected 4, one for each of q, p, r, V"),
         (["-p", "D:=[1,1,1,0]"], "controller.D[3]: found 0, expected 1 or -1"),
-        (["-p", "use_sim_time:=true"], "controller.use_sim_time: found true, expected false: in real time a node ticks"),
         (["-r", "__node:=rise"], "rise: found no parameters, expected a section for /rise in a file of --params-file"),
         (["-p", "rate:=0100"], "rate: found '0100' in line 1, expected a number without a 0 before it"),
     ],

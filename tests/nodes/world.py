@@ -254,8 +254,12 @@ class World:
     def start(self, node: type[AnyNode]) -> Any:
         """A node that runs as the event loop runs it."""
         made = self.make(node)
-        self.loops[made] = RealTime(made, made.start_ns(), spin=False)
+        self.begin(made)
         return made
+
+    def begin(self, node: AnyNode) -> None:
+        """Run a node that was made."""
+        self.loops[node] = RealTime(node, node.start_ns() or 0, spin=False)
 
     @contextmanager
     def stopped(self, node: AnyNode) -> Iterator[None]:

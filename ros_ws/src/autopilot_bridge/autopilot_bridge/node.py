@@ -39,7 +39,7 @@ from autopilot_bridge.params import (
 )
 from flight_core.environment import PROFILE_VARIABLE
 from flight_core.outcome import FlightEnded
-from flight_core.parameters import ParameterError
+from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns, seconds
 from flight_core.text import bounded
 from flight_core.vectors import ChannelError
@@ -69,7 +69,10 @@ class BridgeNode(FlightNode[BridgeConfig]):
         self._bridge = Bridge(self._map, dry_run=dry_run)
         self._logged = self._bridge.phase, self._bridge.reason
         self._longest_pause_ns = nanoseconds(self._map.silence.max_age)
-        self._began_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        self._began_ns = self._boot_ns()
+        if self.simulated is not None:
+            key, cause = f"{self.get_name()}.use_sim_time", "false: an autopilot on MAVLink ticks by its own clock"
+            require(self._map.link is None, key, "true", cause)
         named: list[NamedRow] = [
             *self._map.outputs.items(),
             *self._map.pose.items(),
@@ -161,7 +164,7 @@ class BridgeNode(FlightNode[BridgeConfig]):
         step_ns = self.clock_step_ns()
         for subscription, rows in self._readers:
             for received in subscription.take():
-                self._read(subscription, rows, received.message, received.received_ns or now_ns + step_ns, now_ns, step_ns)
+                self._read(subscription, rows, received.message, self._arrived_ns(received, now_ns), now_ns, step_ns)
         self._watch_link()
         sample = self._bridge.y(now_ns)
         if sample is None:
@@ -187,7 +190,16 @@ class BridgeNode(FlightNode[BridgeConfig]):
 
     def _pause_ns(self) -> int:
         """Time since the tick before began, also that of a suspended host, in which the clock of the ticks stands still."""
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._began_ns
+        return self._boot_ns() - self._began_ns
+
+    def _boot_ns(self) -> int:
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if self.simulated is None else self.simulated.time_ns()
+
+    def _arrived_ns(self, received: Any, now_ns: int) -> int:
+        """The instant of a message that has no stamp, on the clock of the stamps."""
+        if not received.received_ns:
+            return now_ns + self.clock_step_ns()
+        return int(received.received_ns if self.simulated is None else self.simulated.at(received.received_ns))
 
     def _disengage_after_pause(self, now_ns: int) -> None:
         """Disengage where the bridge did not run: the autopilot, or its pilot, may fly on its own law since then."""

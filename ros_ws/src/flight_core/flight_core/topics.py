@@ -188,6 +188,11 @@ CLOCK = Topic(
     "clock", "rosgraph_msgs/msg/Clock", "aircraft -> reference_model",
     "in lockstep: the instant up to which the aircraft flies without another u",
 )  # fmt: skip
+SIMULATED_CLOCK = Topic(
+    "/clock", "rosgraph_msgs/msg/Clock", "external -> nodes",
+    "with `use_sim_time`: the time of [a simulator](ros.md#by-the-clock-of-a-simulator)",
+    NOTHING,
+)  # fmt: skip
 RECORDED = Topic(
     "recorded", TIME, "recorder -> aircraft, monitor",
     "the instant up to which the log is complete",

@@ -94,9 +94,9 @@ class GuidanceNode(FlightNode[GuidanceConfig]):
         self._y = self._receive(Y, Decoder(outputs).decode, self._guidance.take_y)
         self._named = NamedDecoder()
         self._pose = self._receive(POSE, self._decode_pose, self._guidance.take_pose)
-        # An operator has the system clock, not the flight time of lockstep. A target from before a stop of guidance is void:
+        # An operator has the system clock, not simulated time. A target from before a stop of guidance is void:
         # the operator knows that the target failed.
-        max_age_ns = None if self.parameters.lockstep else self._max_age_ns
+        max_age_ns = None if self.parameters.lockstep or self.simulated else self._max_age_ns
         self._target = self.receive(TARGET, self._named.decode, self._take_target, max_age_ns=max_age_ns, qos=NEWEST_SAMPLES)
         self._route_subscription = self.subscribe(ROUTE, STATE)  # the newest route alone
         self._publish_u_m, self._publish_log = self.advertise(U_M), self.advertise(GUIDANCE)

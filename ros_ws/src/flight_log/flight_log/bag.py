@@ -31,6 +31,7 @@ OUTCOME_FILE = "outcome"  # in the folder of a run, from the flight to the recor
 IMPORTED = "rise_di_imported"  # name of the metadata record of a log that the stack did not fly: "log", "kind", "map", COMPARED
 COMPARED = "parameters"  # what the parameters of the vehicle do not tell, a sentence; empty where all agree with the map
 CHANNEL_UNITS = "rise_di_units"  # name of the metadata record with the SI units of channels, for a log without a scenario
+SIMULATED_TIME = "rise_di_simulated_time"  # name of the metadata record of a flight by /clock: topic, speed over real time
 LOST_MESSAGES = "rise_di_lost"  # name of the metadata record that counts the messages the recorder lost, by topic
 CHUNK_BYTES = 256 * 1024
 

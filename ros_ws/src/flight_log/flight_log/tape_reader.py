@@ -24,7 +24,7 @@ from flight_core.scenario_file import A_SCENARIO
 from flight_core.tape import Recording, Signal, Tape, refusal_note
 from flight_core.text import printable
 from flight_log.age_of_u import DIAGNOSTICS, IN_MESSAGE, age_of_u
-from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES, stack_topic
+from flight_log.bag import IMPORTED, LOST_MESSAGES, OUTCOME, SCENARIO_MEDIA_TYPE, SILENCES, SIMULATED_TIME, stack_topic
 from flight_log.clock import SINCE_EPOCH_NS, StampClock, leap_note, recording_note, without_leaps
 from flight_log.columns import Columns
 from flight_log.engagements import ENGAGEMENT, KEY_VALUE, Engagement, engagements
@@ -434,7 +434,11 @@ class _Log:
         truncated = [f"{name} is truncated: read up to its last complete chunk{where}{more}" for name in self.truncated]
         lost = [f"{topic}: the recorder lost {count} messages" for topic, count in self.metadata.get(LOST_MESSAGES, {}).items()]
         silent = [f"{topic}: the recorder received nothing {text}" for topic, text in self.metadata.get(SILENCES, {}).items()]
-        return [*truncated, *self.notes, *lost, *silent]
+        simulated = []
+        if (clock := self.metadata.get(SIMULATED_TIME)) is not None:
+            speed = f", at {clock['speed']} times real time" if "speed" in clock else ""
+            simulated = [f"flown by the simulated time of {clock.get('topic', '')}{speed}"]
+        return [*truncated, *self.notes, *lost, *silent, *simulated]
 
 
 def _read(run: Path, remaps: Mapping[str, str]) -> _Log:

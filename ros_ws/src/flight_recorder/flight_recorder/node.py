@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -20,7 +21,7 @@ from flight_core.files import dump_yaml, is_file, link_latest, read_file, writin
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.text import bounded
-from flight_log.bag import LOST_MESSAGES, OUTCOME, OUTCOME_FILE, SILENCES, BagChannel, BagWriter, LogAttachments
+from flight_log.bag import LOST_MESSAGES, OUTCOME, OUTCOME_FILE, SILENCES, SIMULATED_TIME, BagChannel, BagWriter, LogAttachments
 from flight_log.disk import free_bytes
 from flight_log.message_definitions import definition
 from flight_recorder.params import RecorderConfig
@@ -29,7 +30,7 @@ from flight_ros.flight_node import NO_PUBLISHER_WARNING_NS, FlightNode
 from flight_ros.messages import instant, sender_of, stamp_of
 from flight_ros.qos import rosbag2_profiles, strongest_compatible
 from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
-from flight_ros.ticker import Tick
+from flight_ros.ticker import HostTime, Tick
 from flight_ros.topics import (
     EXTERNAL,
     FLIGHT,
@@ -94,6 +95,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def __init__(self) -> None:
         super().__init__("recorder", RecorderConfig)
+        self.host = time  # in a pause of /clock the log is flushed too
+        self._flight_time: HostTime = self.simulated or time  # of silences: a pause is none
         wanted = [self._full_name(name) for name in self.parameters.topics]
         self._bag = self._open_bag()
         self._topics: list[_RecordedTopic] = []
@@ -109,7 +112,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
         self._flushed_ns = self._drained_ns = self._disk_checked_ns = time.monotonic_ns()
         self._warn_missing_ns = time.monotonic_ns() + NO_PUBLISHER_WARNING_NS
         self._heard = 0  # messages of LOOP
-        self._heard_ns = time.monotonic_ns()  # and when the last message arrived
+        self._heard_ns = self._flight_time.monotonic_ns()  # and when the last message arrived
         self.get_logger().info(bounded(f"recording to {self._bag.path}"))
 
     def _full_name(self, name: str) -> str:
@@ -133,12 +136,20 @@ class RecorderNode(FlightNode[RecorderConfig]):
             directory.mkdir(parents=True, exist_ok=True)
             if sentence := self._space_shortage(directory):
                 raise ParameterError(f"recorder.min_free: {sentence}")
-            bag = BagWriter(directory)
+            bag = BagWriter(self._free_folder(directory))
             bag.add_attachments(attachments, time.time_ns())
+            if self.simulated is not None:
+                bag.add_metadata(SIMULATED_TIME, {"topic": self.simulated.subscription.name})
             bag.flush()
             if not parameters.directory:
                 link_latest(directory)
         return bag
+
+    def _free_folder(self, directory: Path) -> Path:
+        """The folder; another one beside it where it holds the log of a simulation that ended before this one."""
+        numbered = (directory.with_name(f"{directory.name}-{number}") for number in count(2))
+        taken = self.simulated is not None and any(directory.glob("*.mcap"))
+        return next(folder for folder in numbered if not folder.exists()) if taken else directory
 
     def _space_shortage(self, directory: Path) -> str:
         """The sentence about too little free space; empty with enough."""
@@ -193,8 +204,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
             return
         self._subscribe_missing(now_ns)
         self._warn_of_a_part()
-        self._warn_of_silence(now_ns)
-        self._warn_of_topic_silence(now_ns)
+        self._warn_of_silence(self._flight_time.monotonic_ns())
+        self._warn_of_topic_silence(self._flight_time.monotonic_ns())
         self._check_publisher_counts()
         if now_ns - self._disk_checked_ns > DISK_PERIOD_NS:
             self._disk_checked_ns = now_ns
@@ -207,6 +218,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
     def _drain_subscriptions(self) -> None:
         """Write the received messages. In lockstep publish the stamp of the newest sample of `truth` in the bag."""
         recorded = b""
+        if self.simulated is not None and (self.simulated.restarted or not self.simulated.known()):
+            return
         for topic in self._topics:
             received = topic.subscription.take()
             if received:
@@ -220,7 +233,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _hear(self, topic: _RecordedTopic, received: Sequence[ReceivedMessage]) -> None:
         """Note the time of the newest message of a topic."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._flight_time.monotonic_ns()
         last = received[-1]
         topic.first_ns = topic.first_ns or now_ns
         topic.heard_ns = now_ns
@@ -245,6 +258,8 @@ class RecorderNode(FlightNode[RecorderConfig]):
         # The sequences of several publishers interleave: a gap between publishers is no loss. Foreign topics name no publisher.
         counted = not topic.foreign and not topic.shared
         for message, sent_ns, received_ns, sequence in received:
+            if self.simulated is not None:
+                sent_ns, received_ns = map(self.simulated.at, (sent_ns, received_ns))  # noqa: PLW2901 - the log has one time
             write(channel, received_ns, sent_ns, sequence, message)
             if counted and sequence != topic.next_sequence:
                 publisher = sender_of(message)
@@ -277,6 +292,9 @@ class RecorderNode(FlightNode[RecorderConfig]):
         try:
             self._bag.add_metadata(LOST_MESSAGES, {name: str(count) for name, count in self.lost.items()})
             self._add_silences()
+            if self.simulated is not None and self.simulated.known():
+                values = {"topic": self.simulated.subscription.name, "speed": f"{self.simulated.speed():.3g}"}
+                self._bag.add_metadata(SIMULATED_TIME, values)
             if outcome := self._told_outcome():
                 self._bag.add_metadata(OUTCOME, {"outcome": outcome})
             self._bag.close()
@@ -286,7 +304,7 @@ class RecorderNode(FlightNode[RecorderConfig]):
 
     def _add_silences(self) -> None:
         """Store the silences of topics, also those that last."""
-        now_ns = time.monotonic_ns()
+        now_ns = self._flight_time.monotonic_ns()
         lasting = {topic.name: now_ns - topic.silent_ns for topic in self._topics if topic.silent_ns}
         silent = Counter(self.silent)
         silent.update(lasting)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Event loop of a node: ticks on the monotonic clock or lockstep steps, services in between, clean shutdown."""
+"""Event loop of a node: ticks on the monotonic clock or by /clock, or lockstep steps; services in between, clean shutdown."""
 
 import gc
 import sys
@@ -25,6 +25,7 @@ from flight_core.text import bounded
 from flight_ros import transport
 from flight_ros.flight_node import MAX_START_AGE_NS, FlightNode
 from flight_ros.rclpy_private import ARGUMENT_ERRORS, Participant, WaitSet, destroy_participant, ready_callback
+from flight_ros.simulated_time import ClockRestarted
 from flight_ros.ticker import Ticker
 from flight_ros.topics import NodeState
 
@@ -66,17 +67,31 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
     stop = _Stop()
     handle_shutdown(stop.request)
     try:
+        while not _run_to_end(_make_nodes(make_nodes, early_participant), stop):
+            early_participant = None
+            gc.unfreeze()
+            gc.collect()  # the services of the old nodes end with their objects
+    finally:
+        rclpy.try_shutdown()
+
+
+def _make_nodes(makes: Sequence[Callable[[], FlightNode[Any]]], early_participant: Participant | None) -> list[FlightNode[Any]]:
+    try:
         transport.prepare()
         if not rclpy.ok():
             rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        nodes = [make_node() for make_node in make_nodes]
+        nodes = [make() for make in makes]
         if early_participant is not None:
             destroy_participant(early_participant)
     except (ParameterError, FlightEnded, *ARGUMENT_ERRORS) as error:
         is_stack_error = isinstance(error, ParameterError | FlightEnded)  # one sentence; those of rclpy have several lines
         print(f"error: {error if is_stack_error else ' '.join(str(error).split())}", file=sys.stderr)
-        rclpy.try_shutdown()
         sys.exit(STATUS_ENDED_EARLY if isinstance(error, FlightEnded) else STATUS_BAD_INPUT)
+    return nodes
+
+
+def _run_to_end(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> bool:
+    """Whether the nodes ended for good; otherwise nodes with the same parameters are to begin again."""
     node = nodes[0]
     try:
         if sockets := transport.open_to_network():
@@ -91,14 +106,18 @@ def run(*make_nodes: Callable[[], FlightNode[Any]], early_participant: Participa
     except FlightEnded as error:
         node.get_logger().fatal(str(error))
         sys.exit(STATUS_ENDED_EARLY)
+    except ClockRestarted as restart:
+        node.get_logger().error(f"{restart}; this node begins again")
+        return False
     except Exception:
         node.get_logger().fatal(f"unexpected exception, the node ends: {traceback.format_exc()}")
         sys.exit(1)
+    else:
+        return True
     finally:
         for node in nodes:
             node.finish()
             node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def _serve(executor: SingleThreadedExecutor, node: FlightNode[Any], until_ns: int = 0) -> None:
@@ -144,7 +163,7 @@ def _run_lockstep(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
             serve_ns = now_ns + nanoseconds(SERVICE_POLL_PERIOD)
             _serve(executor, nodes[0])
             for node in nodes:
-                node.require_peers()
+                node.require_flight()
         if now_ns >= report_ns:
             report_ns = now_ns + NANOSECONDS
             for node in nodes:
@@ -174,15 +193,16 @@ class RealTime:
     """A node in real time: its ticks and its reports. `spin`: busy-wait before a deadline."""
 
     def __init__(self, node: FlightNode[Any], start_ns: int, *, spin: bool) -> None:
-        if (age := time.time_ns() - start_ns) > MAX_START_AGE_NS:
+        host = node.host
+        if (age := host.time_ns() - start_ns) > MAX_START_AGE_NS:
             key = f"{node.get_name()}.start_time"
             raise ParameterError(f"{key}: found an instant {seconds(age):.0f} s ago, expected a future one, or 0")
-        begin_ns = time.monotonic_ns() + start_ns - time.time_ns()
+        begin_ns = host.monotonic_ns() + start_ns - host.time_ns()
         node.time_offset_ns = start_ns - begin_ns
         self.node = node
         self._start_ns = start_ns
-        self.ticker = Ticker(node.period_ns(), begin_ns, spin=spin)
-        if (lead := start_ns - time.time_ns()) > nanoseconds(60):
+        self.ticker = Ticker(node.period_ns(), begin_ns, host, spin=spin and host is time)
+        if (lead := start_ns - host.time_ns()) > nanoseconds(60):
             node.get_logger().warning(f"start_time is {seconds(lead):.0f} s ahead; waiting for it")
         self._report_ns = time.monotonic_ns()
         self._reports: deque[Callable[[], None]] = deque()
@@ -216,8 +236,13 @@ def _start_instants(nodes: Sequence[FlightNode[Any]], executor: SingleThreadedEx
     known: dict[FlightNode[Any], int] = {}
     awaiting = [node for node in nodes if node.waits_for_start()]
     while not stop.requested:
-        known |= {node: start_ns for node in awaiting if node not in known and (start_ns := node.start_ns()) is not None}
-        if len(known) == len(awaiting):
+        for node in nodes:
+            node.warn_without_time()
+        has_time = all(node.has_time() for node in nodes)
+        for node in awaiting:
+            if has_time and node not in known and (start_ns := node.start_ns()) is not None:
+                known[node] = start_ns
+        if has_time and len(known) == len(awaiting):
             return [known[node] if node in known else node.start_ns() or 0 for node in nodes]
         for node in nodes:
             node.match()
@@ -245,7 +270,8 @@ def _run_real_time(nodes: Sequence[FlightNode[Any]], stop: _Stop) -> None:
             remaining = min(each.ticker.remaining() for each in running)
             _serve(executor, nodes[0], now_ns + nanoseconds(max(remaining, 0.0) / 2.0))
             for node in nodes:
-                node.require_peers()
+                node.require_flight()
+                node.warn_without_time()
                 node.match()
             duration_ns = time.monotonic_ns() - now_ns
             late = min(each.ticker.remaining() for each in running) <= 0.0

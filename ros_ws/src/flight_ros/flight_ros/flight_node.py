@@ -28,8 +28,9 @@ from flight_ros.messages import Encoder, stamp_of
 from flight_ros.parameters import changed, read_parameters
 from flight_ros.rclpy_private import refuse_foreign_parameters
 from flight_ros.receiver import Receiver, Refusals, Sample
+from flight_ros.simulated_time import SimulatedTime
 from flight_ros.subscriptions import PolledSubscription
-from flight_ros.ticker import Tick, TickTimes
+from flight_ros.ticker import HostTime, Tick, TickTimes
 from flight_ros.topics import (
     DIAGNOSTICS,
     LOCKSTEP,
@@ -54,7 +55,7 @@ WAITING_PERIOD_NS = 2 * NANOSECONDS  # between two warnings of a topic without s
 MAX_START_AGE_NS = 10 * NANOSECONDS  # a late node catches up with its missed ticks, but not with hours
 
 SIM_TIME = "use_sim_time"
-NO_SIM_TIME = "false: in real time a node ticks by the system clock; a flight in simulated time is one in lockstep"
+AT_START = "no change: a node chooses its clock when it starts"
 
 CLOCK_STEP_NS = NANOSECONDS // 20  # slewing moves a clock by less than 0.01 s in the second between two checks
 
@@ -65,15 +66,16 @@ class FlightNode(Node, Generic[P]):
     def __init__(self, name: str, schema: type[P]) -> None:
         Node.__init__(self, name, automatically_declare_parameters_from_overrides=True)
         self.parameters = read_parameters(self, schema)
-        if not self.parameters.lockstep:
-            require(not self.get_parameter(SIM_TIME).value, f"{name}.{SIM_TIME}", "true", NO_SIM_TIME)
         self.add_on_set_parameters_callback(self._change_parameters)
         refuse_foreign_parameters(self)
         self.peers = LivelinessMonitor(self, name) if self.parameters.lockstep else None
         # Two equal lockstep flights give equal bytes, so the process number is left out.
         process = "" if self.parameters.lockstep else f"#{os.getpid()}"
         self.instance = self.get_fully_qualified_name() + process
-        self.clocks = None if self.parameters.lockstep else PeerClocks(self, self.instance)
+        simulated = self.get_parameter(SIM_TIME).value and not self.parameters.lockstep
+        self.simulated = SimulatedTime(self) if simulated else None
+        self.host: HostTime = self.simulated or time  # the time of the ticks
+        self.clocks = None if simulated or self.parameters.lockstep else PeerClocks(self, self.instance)
         self.refusals, self.endpoints = Refusals(self, self.clock_of), EndpointMonitor(self)
         self.polled_subscriptions: list[PolledSubscription] = []
         self.receivers: list[Receiver[Any]] = []
@@ -102,6 +104,10 @@ class FlightNode(Node, Generic[P]):
     def waits_for_start(self) -> bool:
         """Whether the topic `start` gives the instant of tick 0."""
         return self._start_subscription is not None
+
+    def has_time(self) -> bool:
+        """Whether the time of the ticks is known: in simulated time from the first /clock on."""
+        return self.host is not self.simulated or self.simulated.known()
 
     def start_ns(self) -> int | None:
         """System time of tick 0, ns: the parameter `start_time`; where that is -1 the topic `start`, None before its message.
@@ -139,7 +145,7 @@ class FlightNode(Node, Generic[P]):
 
     def next_period_ns(self) -> int:
         """The next whole period of the system clock, ns."""
-        now_ns = time.time_ns()
+        now_ns = self.host.time_ns()
         period_ns = self.period_ns()
         return now_ns - now_ns % period_ns + period_ns
 
@@ -180,11 +186,11 @@ class FlightNode(Node, Generic[P]):
 
     def now_ns(self) -> int:
         """The time of the ticks, ns: the system clock at the start plus the monotonic time since then."""
-        return time.monotonic_ns() + self.time_offset_ns
+        return self.host.monotonic_ns() + self.time_offset_ns
 
     def clock_step_ns(self) -> int:
         """How far the system clock is ahead of the time of the ticks; 0 for less than CLOCK_STEP_NS, which is no step."""
-        step_ns = time.time_ns() - self.now_ns()
+        step_ns = self.host.time_ns() - self.now_ns()
         return step_ns if abs(step_ns) > CLOCK_STEP_NS else 0
 
     def adopt(self, parameters: P) -> None:
@@ -232,8 +238,9 @@ class FlightNode(Node, Generic[P]):
             self._adopted = None
             return SetParametersResult(successful=True)
         try:
-            sim_time = any(change.name == SIM_TIME and change.value for change in changes)
-            require(not sim_time or self.parameters.lockstep, f"{self.get_name()}.{SIM_TIME}", "true", NO_SIM_TIME)
+            sim_time = self.get_parameter(SIM_TIME).value
+            same = all(change.value == sim_time for change in changes if change.name == SIM_TIME)
+            require(same, f"{self.get_name()}.{SIM_TIME}", not sim_time, AT_START)
             parameters = changed(self, self.parameters, changes)
             self.on_parameters(parameters)
         except ParameterError as error:
@@ -251,7 +258,7 @@ class FlightNode(Node, Generic[P]):
         """The instant on the topic `start`, ns. One long ago belongs to another flight."""
         messages = () if self._start_subscription is None else self._start_subscription.take()
         instants = (stamp_of(received.message) for received in messages)
-        return next((stamp_ns for stamp_ns in instants if stamp_ns > time.time_ns() - MAX_START_AGE_NS), None)
+        return next((stamp_ns for stamp_ns in instants if stamp_ns > self.host.time_ns() - MAX_START_AGE_NS), None)
 
     def match(self) -> None:
         """Real time: publish once that each input has a publisher."""
@@ -271,7 +278,7 @@ class FlightNode(Node, Generic[P]):
 
     def check_clock(self) -> None:
         """Log an error after a step of the system clock. This node keeps its time; a node that starts now has another time."""
-        step_ns = time.time_ns() - self.now_ns()
+        step_ns = self.host.time_ns() - self.now_ns()
         if abs(step_ns - self._clock_step_ns) > CLOCK_STEP_NS:
             restored = abs(step_ns) <= CLOCK_STEP_NS
             advice = "it is correct again" if restored else "this node keeps its own time; restart all nodes or none"
@@ -284,6 +291,11 @@ class FlightNode(Node, Generic[P]):
             self.clocks.exchange(time.time_ns() - self.now_ns())
             for sentence in self.clocks.news():
                 self.get_logger().warning(sentence)
+
+    def warn_without_time(self) -> None:
+        """In simulated time: log a warning while no /clock comes."""
+        if self.simulated is not None and self.simulated.silent():
+            self.warn_no_publisher(self.simulated.subscription)
 
     def graph_checks(self) -> list[Callable[[], None]]:
         """Checks of the graph, a topic each: to ask the middleware for all topics takes about a period of 2 ms.
@@ -299,8 +311,13 @@ class FlightNode(Node, Generic[P]):
         """Whether the event loop calls `advance` in lockstep instead of `tick` in real time."""
         return self.parameters.lockstep
 
-    def require_peers(self) -> None:
-        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to the other peers."""
+    def require_flight(self) -> None:
+        """Raise FlightEnded after the loss of a peer of a lockstep flight, and report the loss to the other peers.
+
+        In simulated time raise ClockRestarted after a jump of /clock.
+        """
+        if self.simulated is not None:
+            self.simulated.require_one_simulation()
         if self.peers is not None and (role := self.peers.lost()):
             self.peers.report(role)
             raise FlightEnded(f"{LOST_CONTACT} {role}")

@@ -1,15 +1,28 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Ticker: a fixed rate on the monotonic clock with absolute deadlines, without drift and independent of the system clock."""
+"""Ticker: a fixed rate with absolute deadlines, without drift: on the monotonic clock, or in simulated time."""
 
 import math
 import time
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 SPIN_TIME = 2.5e-4  # s of busy-wait before a deadline: the wake-up of a sleeping thread takes 20 to 250 us
 MAX_SPIN_FRACTION = 0.2  # maximum of the busy-wait, as a fraction of the period and so of a core
+
+
+class HostTime(Protocol):
+    """What the ticks of a node need of the module `time`."""
+
+    def monotonic_ns(self) -> int:
+        """The time of the ticks."""
+
+    def time_ns(self) -> int:
+        """The time of the stamps."""
+
+    def sleep(self, duration: float, /) -> None:
+        """Wait, at most `duration` s."""
 
 
 class Tick(NamedTuple):
@@ -26,9 +39,13 @@ class Tick(NamedTuple):
 
 
 class Ticker:
-    """Deadlines start + k period, in ns of time.monotonic_ns(). Without `spin` a wait does not busy-wait."""
+    """Deadlines start + k period, in ns of host.monotonic_ns(); `host` is the module `time` by default.
 
-    def __init__(self, period_ns: int, start_ns: int, *, spin: bool = True) -> None:
+    Without `spin` a wait does not busy-wait.
+    """
+
+    def __init__(self, period_ns: int, start_ns: int, host: HostTime | None = None, *, spin: bool = True) -> None:
+        self._host: HostTime = host or time
         self.period_ns = period_ns
         self._spin_time = min(SPIN_TIME, MAX_SPIN_FRACTION * period_ns / 1e9) if spin else 0.0  # s
         self._start_ns = start_ns
@@ -36,19 +53,19 @@ class Ticker:
 
     def remaining(self) -> float:
         """Time to the next deadline in s, negative when it has passed."""
-        return (self._start_ns + (self._last + 1) * self.period_ns - time.monotonic_ns()) / 1e9
+        return (self._start_ns + (self._last + 1) * self.period_ns - self._host.monotonic_ns()) / 1e9
 
     def wait(self, most: float) -> None:
         """Sleep until the next deadline, at most `most` s. The last part before the deadline is a busy-wait."""
         pause = self.remaining()
         if pause > self._spin_time:
-            time.sleep(min(pause - self._spin_time, most))
+            self._host.sleep(min(pause - self._spin_time, most))
         while 0.0 < self.remaining() <= self._spin_time:
             pass
 
     def due(self) -> Tick | None:
         """The newest deadline that has passed and was not returned yet, else None."""
-        number, late_ns = divmod(time.monotonic_ns() - self._start_ns, self.period_ns)
+        number, late_ns = divmod(self._host.monotonic_ns() - self._start_ns, self.period_ns)
         if number <= self._last:
             return None
         tick = Tick(number, max(self._last, 0), late_ns)

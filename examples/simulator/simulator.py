@@ -1,0 +1,55 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A simulator with its own clock: `python simulator.py 3` flies at 3 times real time, `python simulator.py 0` in lockstep."""
+
+import sys
+import time
+from contextlib import suppress
+
+import rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+SECOND = 1_000_000_000  # ns
+STEP = SECOND // 200  # of the simulation and of /clock
+SAMPLE = 2 * STEP  # of y and of the servos
+EFFECTS = {"q": ("elevator", 56.15), "p": ("aileron", 85.94), "r": ("rudder", 9.74), "V": ("thrust", 6.0)}
+DAMPING = 0.5  # 1/s
+KEPT = QoSProfile(depth=2000, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # in lockstep no sample may be lost
+
+speed = float(sys.argv[1])
+y, u = dict.fromkeys(EFFECTS, 0.0), {}
+received = {"u": JointState()}
+
+
+def answered() -> int:
+    """The stamp of the last u, ns: that of its y."""
+    stamp = received["u"].header.stamp
+    return stamp.sec * SECOND + stamp.nanosec if received["u"].header.frame_id else -1
+
+
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+node = rclpy.create_node("simulator")
+clock_publisher = node.create_publisher(Clock, "/clock", KEPT)
+y_publisher = node.create_publisher(JointState, "y", KEPT)
+node.create_subscription(JointState, "u", lambda message: received.update(u=message), KEPT)
+t, due = 0, time.monotonic()
+with suppress(KeyboardInterrupt):
+    while True:
+        clock = Clock()
+        clock.clock.sec, clock.clock.nanosec = divmod(t, SECOND)
+        if t % SAMPLE == 0:
+            u = dict(zip(received["u"].name, received["u"].position, strict=True))  # the servos take the u of the last sample
+            sample = JointState(name=list(y), position=list(y.values()))
+            sample.header.stamp = clock.clock
+            y_publisher.publish(sample)  # before the clock: a node then finds y at its tick
+        clock_publisher.publish(clock)
+        due = max(due + STEP / SECOND / speed, time.monotonic()) if speed else 0.0  # a pause is not caught up with
+        rclpy.spin_once(node, timeout_sec=0.0)
+        while time.monotonic() < due or (not speed and t % SAMPLE == 0 and answered() < t):  # lockstep: u answers this y
+            rclpy.spin_once(node, timeout_sec=0.0005)
+        for output, (name, effect) in EFFECTS.items():
+            y[output] += STEP / SECOND * (effect * u.get(name, 0.0) - DAMPING * y[output])
+        t += STEP

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated time: the time of the topic /clock, in place of the clocks of the host.
+
+Ticks, stamps and ages are in this time. So a flight takes the same ticks at any speed of the simulator, and a pause of /clock
+is a pause of the flight. What concerns the process stays in the time of the host: diagnostics, services and log lines.
+"""
+
+import time
+from bisect import bisect_right
+
+from rclpy.node import Node
+
+from flight_core.rates import NANOSECONDS, seconds
+from flight_ros.messages import LENGTH_PLACE, stamp_of
+from flight_ros.rclpy_private import WaitSet
+from flight_ros.subscriptions import PolledSubscription
+from flight_ros.topics import NEWEST_SAMPLES, SIMULATED_CLOCK
+
+LARGEST_JUMP_NS = 60 * NANOSECONDS  # /clock may be lost for so long; a node then catches up with its missed ticks
+LONGEST_WAIT_NS = NANOSECONDS // 50  # so that signals and service calls are handled in a pause
+SILENT_NS = NANOSECONDS  # without a message of /clock, before a node says that it waits
+HISTORY = 4096  # messages of /clock, by which the instants of other messages are known
+
+
+class ClockRestarted(Exception):  # noqa: N818 - an event of the simulator
+    """/clock went back or far ahead: another simulation begins."""
+
+
+class SimulatedTime:
+    """The newest instant of /clock, as a `HostTime`."""
+
+    def __init__(self, node: Node) -> None:
+        self.subscription = PolledSubscription(node, SIMULATED_CLOCK, NEWEST_SAMPLES, raw=True)
+        self._context = node.context
+        self._wait_set: WaitSet | None = None
+        self._received_ns: list[int] = []  # of the messages, by the system clock
+        self._instants_ns: list[int] = []  # and what the messages say
+        self._first = 0, 0  # of both
+        self._jump_ns = 0
+
+    def known(self) -> bool:
+        """Whether a message has come."""
+        self._take()
+        return bool(self._instants_ns)
+
+    def silent(self) -> bool:
+        """Whether no message has come for SILENT_NS of the host."""
+        return not self.known() or time.time_ns() - self._received_ns[-1] > SILENT_NS
+
+    def time_ns(self) -> int:
+        """The newest instant; 0 before the first."""
+        return self._instants_ns[-1] if self.known() else 0
+
+    monotonic_ns = time_ns
+
+    def sleep(self, duration: float, /) -> None:
+        """Wait for the next message, at most LONGEST_WAIT_NS of the host: a duration of simulated time has no length there."""
+        self._wait_set = self._wait_set or WaitSet([self.subscription.entity], self._context)
+        self._wait_set.wait(LONGEST_WAIT_NS)
+
+    def at(self, system_ns: int) -> int:
+        """The simulated time at an instant of the system clock, between two messages in proportion."""
+        received_ns = self._received_ns
+        instants_ns = self._instants_ns
+        place = min(max(bisect_right(received_ns, system_ns), 1), len(received_ns) - 1)
+        if place == 0 or system_ns >= received_ns[place]:
+            return instants_ns[-1]
+        step_ns = instants_ns[place] - instants_ns[place - 1]
+        share = max(system_ns - received_ns[place - 1], 0) / max(received_ns[place] - received_ns[place - 1], 1)
+        return instants_ns[place - 1] + round(share * step_ns)
+
+    def speed(self) -> float:
+        """Simulated time over that of the host, since the first message."""
+        instant_ns, received_ns = self._first
+        return (self.time_ns() - instant_ns) / max(self._received_ns[-1] - received_ns, 1) if self.known() else 0.0
+
+    @property
+    def restarted(self) -> bool:
+        """Whether /clock went back or far ahead; the time stands still since then."""
+        return self._jump_ns != 0
+
+    def require_one_simulation(self) -> None:
+        """Raise ClockRestarted after a jump of /clock."""
+        if self.restarted:
+            publishers = self.subscription.entity.get_publisher_count()
+            which = f" ({publishers} nodes publish it, expected one)" if publishers > 1 else ""
+            raise ClockRestarted(f"/clock jumped by {seconds(self._jump_ns):+.3f} s{which}: another simulation begins")
+
+    def _take(self) -> None:
+        for received in self.subscription.take():
+            if len(received.message) < LENGTH_PLACE or self._jump_ns:
+                continue
+            instant_ns = stamp_of(received.message)
+            received_ns = received.received_ns or time.time_ns()
+            if not self._instants_ns:
+                self._first = instant_ns, received_ns
+            elif not 0 <= (jump_ns := instant_ns - self._instants_ns[-1]) <= LARGEST_JUMP_NS:
+                self._jump_ns = jump_ns
+                return
+            self._instants_ns.append(instant_ns)
+            self._received_ns.append(received_ns)
+        if len(self._instants_ns) > 2 * HISTORY:
+            del self._instants_ns[:HISTORY], self._received_ns[:HISTORY]
