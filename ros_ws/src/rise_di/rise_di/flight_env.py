@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aircraft_sim.airframe import load_airframe
-from aircraft_sim.simulator import Simulator
 from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario, as_scenario
+from flight_analysis.closed_loop.stations import AircraftStation, Loop, ReferenceStation, Topics
 from flight_campaign.benchmark_course import HOLD, build_course
 from flight_campaign.statistics import LOSS_OF_TRACK_SCORE, score_units
 from flight_core.arguments import as_count, as_number
@@ -18,8 +18,7 @@ from flight_core.installation import require_package
 from flight_core.outcome import FlightEnded
 from flight_core.parameters import require
 from flight_core.rates import nanoseconds
-from flight_core.vectors import FloatArray, as_array, select
-from reference_model.reference import Reference
+from flight_core.vectors import FloatArray, StampedVector, as_array
 
 require_package("gymnasium")
 import gymnasium  # noqa: E402 - an extra
@@ -107,10 +106,9 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
         self.inputs = controller.effectors
         self.action_space, self.observation_space, self._units = _channels(scenario)
         self._period = 1.0 / controller.rate
-        self._k, self._ticks = -1, nanoseconds(scenario.flight.duration) // nanoseconds(self._period)
-        self._samples = round(scenario.aircraft.rate / controller.rate)
-        self._last_alone = _is_newest_last(scenario)
-        self._references = round(scenario.reference_model.rate / controller.rate)
+        self._period_ns = nanoseconds(self._period)
+        self._k = -1
+        self._ticks = nanoseconds(scenario.flight.duration) // self._period_ns
 
     @property
     def t(self) -> float:
@@ -121,20 +119,33 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[FloatArray, dict[str, Any]]:
         """Trim at t = 0. A seed repeats the aircraft, the noise and the turbulence of an episode."""
         super().reset(seed=seed, options=options)
-        self._simulator = Simulator(self._drawn().aircraft)
-        self._reference = Reference(self.scenario.reference_model)
-        self._k = 0
         self._y = np.zeros(len(self.outputs))
-        self._advance(np.zeros(len(self.inputs)))
+        self._topics = Topics(recorded=False)
+        self._topics.advertise("u", self.inputs)
+        self._topics.subscribe("y", self._take_y, self.outputs)
+        self._topics.subscribe("y_m", self._take_y_m, self.outputs)
+        reference = ReferenceStation(self.scenario.reference_model, self._topics, self._period_ns)
+        every_ns = self._period_ns if _is_newest_last(self.scenario) else None
+        aircraft = AircraftStation(self._drawn().aircraft, self._topics, every_ns)
+        self._loop = Loop([reference, aircraft])
+        self._k = 0
+        self._loop.run(0)
         return self._observed(), {}
+
+    def _take_y(self, sample: StampedVector, _t_ns: int) -> None:
+        self._y = sample.value
+
+    def _take_y_m(self, sample: StampedVector, _t_ns: int) -> None:
+        self._y_m = sample.value
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Hold u for a period. Raises ParameterError outside an episode, and for an action that is not m finite numbers."""
         require(0 <= self._k < self._ticks, "step", "a step outside an episode", "reset() first")
         u = _actions(action, (len(self.inputs),))
+        self._topics.publish("u", StampedVector(self._k * self._period_ns, u), self._k * self._period_ns)
         self._k += 1
         try:
-            self._advance(u)
+            self._loop.run(self._k * self._period_ns)
         except FlightEnded as error:
             remaining = (self._ticks - self._k + 1) * self._period
             self._k = self._ticks
@@ -156,17 +167,8 @@ class FlightEnv(gymnasium.Env[FloatArray, FloatArray]):
             aircraft["turbulence"] = self.scenario.aircraft.turbulence.model_dump() | {"seed": seed}
         return self.scenario.vary(aircraft=aircraft)
 
-    def _advance(self, u: FloatArray) -> None:
-        """The aircraft to the present tick, u held since the last tick."""
-        held = select(self._simulator.inputs, self.inputs, u)
-        last = self._samples * self._k
-        for number in range(last if self._last_alone else max(last - self._samples + 1, 0), last + 1):
-            for sample in self._simulator.sample(number, held):
-                self._y = select(self.outputs, self._simulator.outputs, sample.value)
-
     def _observed(self) -> FloatArray:
-        y_m = self._reference.sample(self._references * self._k)
-        return np.concatenate([self._y, select(self.outputs, self.scenario.reference_model.outputs, y_m)])
+        return np.concatenate([self._y, self._y_m])
 
 
 class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray[Any]]):

@@ -111,7 +111,7 @@ class Learning:
 
     def __init__(self, parameters: RiseDiConfig, announce: Callable[[Event], None], *, simulated: bool) -> None:
         assert parameters.learn is not None  # noqa: S101 - the caller makes none without it
-        self._start = parameters
+        self.start = parameters
         self._digest = parameters.digest()
         self._settings = parameters.learn
         self._announce = announce
@@ -131,7 +131,7 @@ class Learning:
         """`authority` of what flies."""
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - a proposal is of the law of the start
-        return authority(flown, self._start)
+        return authority(flown, self.start)
 
     def ticked(self, controller: Controller, now_ns: int) -> bool:
         """Note a tick; whether an identification begins with it. None begins while the law is deactivated."""
@@ -181,7 +181,7 @@ class Learning:
         part = [name for name, diverges in zip(flown.outputs, coupled(flown, diverging), strict=True) if diverges]
         self._fallbacks.update(part)
         ended = [name for name in part if self._fallbacks[name] >= FALLBACKS]
-        fallen = without_models(self._start, self._start, {*outputs_without(flown), *ended})
+        fallen = without_models(self.start, self.start, {*outputs_without(flown), *ended})
         lasting = f", in {', '.join(ended)} to the end of the engagement" * bool(ended)
         reason = " and ".join(f"{name} diverges{' again' * bool(ended)}" for name in diverging)
         self._fallback = Fallback(controller.digest, flown.input_scale, fallen.digest())
@@ -195,9 +195,7 @@ class Learning:
         flown = controller.parameters
         assert isinstance(flown, RiseDiConfig)  # noqa: S101 - for the type checker
         bare = coupled(flown, periods)
-        fallen = without_models(
-            self._start, flown, [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare]
-        )
+        fallen = without_models(self.start, flown, [name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare])
         rates = " and ".join(f"{name} oscillates at {1.0 / period:.2g} Hz" for name, period in periods.items())
         outputs = ", ".join(name for name, is_bare in zip(flown.outputs, bare, strict=True) if is_bare)
         what = f"falls back to the law of the start in {outputs}, to the end of the engagement: {rates}"
@@ -214,11 +212,11 @@ class Learning:
         self._received.clear()
         self._fallbacks.clear()
         self._diverged.clear()
-        if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self._start):
+        if not controller.has_learned_model and outputs_without(controller.parameters) == outputs_without(self.start):
             return None
         what = "goes back to the law of the start: it was deactivated"
-        self._take(controller, now_ns, prepared(self._start), EventKind.RESTART, what)
-        return self._start
+        self._take(controller, now_ns, prepared(self.start), EventKind.RESTART, what)
+        return self.start
 
     def _acts_ns(self, end_ns: int) -> int:
         return end_ns + nanoseconds(self._settings.latency)
@@ -245,7 +243,7 @@ class Learning:
 
     def _begin(self, proposal: Proposal, controller: Controller, now_ns: int) -> None:
         if proposal.change:
-            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self._start)
+            self._certificate = proposal, _certificate(controller.parameters, proposal.change, self.start)
         elif proposal.sentence:
             self._announce(Event(now_ns, EventKind.NO_MODEL, {}, f"no model: {proposal.sentence}"))
 

@@ -1,16 +1,17 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A learner beside a controller in a loop of one process, and what a learner is."""
+"""What a learner is, and the stations of a learner in a flight in one process."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from flight_analysis.closed_loop.stations import ControllerStation, Topics
 from flight_core.modes import Mode
-from flight_core.vectors import FloatArray
-from rise_di_controller.controller import Controller, ControlOutput
-from rise_di_controller.proposals import Event, Learning, Proposal, designed, outputs_without
+from flight_core.vectors import FloatArray, StampedVector
+from rise_di_controller.controller import Controller
+from rise_di_controller.proposals import AUTHORITY_TICKS, Learning, Proposal, authority_names, designed, outputs_without
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 
@@ -104,31 +105,46 @@ def as_received(proposal: LearnerResult, start: RiseDiConfig, end_ns: int, flown
     return Proposal(end_ns, start.digest(), flown, change, proposal.sentence)
 
 
-class LearningLoop:
-    """Steps a learner with the ticks of a controller, in simulated time."""
+class ProposalStation:
+    """Lets the due proposals act, falls back where the law diverges, and publishes `authority`."""
 
-    def __init__(self, parameters: RiseDiConfig, learn: Learn, announce: Callable[[Event], None]) -> None:
-        self._parameters = parameters
-        self._learner = learn(parameters)
-        self._identifications = Identifications(self._learner, parameters.outputs)
-        self._learning = Learning(parameters, announce, simulated=True)
+    def __init__(self, controller: Controller, learning: Learning, topics: Topics) -> None:
+        self._controller = controller
+        self._learning = learning
+        self._topics = topics
+        self.period_ns = controller.period_ns
+        topics.advertise("authority", authority_names(controller.parameters.outputs))
 
-    def before_tick(self, controller: Controller, now_ns: int) -> None:
-        """Let the proposals act that are due, and fall back where the law diverges."""
-        self._learning.step(controller, now_ns)
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        self._learning.step(self._controller, t_ns)
+        if t_ns % (AUTHORITY_TICKS * self.period_ns) == 0:
+            self._topics.publish("authority", StampedVector(t_ns, self._learning.authority(self._controller)), t_ns)
 
-    def authority(self, controller: Controller) -> FloatArray:
-        """What the inputs can do at least, by the model that flies."""
-        return self._learning.authority(controller)
 
-    def after_tick(self, controller: Controller, output: ControlOutput | None, now_ns: int) -> Learned | None:
-        """Record a tick, and propose where an identification is due. Returns what it found."""
+class LearnerStation:
+    """The learner: records of the ticks of the controller, and a proposal where an identification is due."""
+
+    def __init__(self, station: ControllerStation, learning: Learning, learner: Learner, topics: Topics) -> None:
+        self._station = station
+        self._learning = learning
+        self._learner = learner
+        self._topics = topics
+        self.period_ns = station.period_ns
+        self._identifications = Identifications(learner, learning.start.outputs)
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        controller = self._station.controller
+        output = self._station.output
         if output is None or not controller.has_internals:
-            return None
+            return
         if controller.mode is Mode.ENGAGED:
             self._learner.take(output.stamp_ns, output.inputs.y, output.u, controller.digest)
-        if not self._learning.ticked(controller, now_ns):
-            return None
+        if not self._learning.ticked(controller, t_ns):
+            return
         proposal = self._learner.propose(controller.digest, outputs_without(controller.parameters))
-        self._learning.receive(as_received(proposal, self._parameters, now_ns, controller.digest), controller, now_ns)
-        return self._identifications.next(proposal)
+        self._learning.receive(as_received(proposal, self._learning.start, t_ns, controller.digest), controller, t_ns)
+        if (identified := self._identifications.next(proposal)) is not None:
+            self._topics.advertise("learned", identified.names)
+            self._topics.publish("learned", StampedVector(t_ns, identified.values), t_ns)

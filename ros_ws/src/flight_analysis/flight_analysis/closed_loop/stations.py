@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The loop of a flight in one process: stations with the code of the nodes step in the order of the data flow."""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from aircraft_sim.params import AircraftConfig
+from aircraft_sim.simulator import Simulator
+from flight_core.channels import ATTITUDE, POSE
+from flight_core.outcome import FlightEnded
+from flight_core.rates import period_ns, seconds
+from flight_core.tape import Signal
+from flight_core.vectors import ChannelError, FloatArray, StampedVector, select
+from flight_guidance.guidance import Guidance
+from flight_guidance.params import GuidanceConfig
+from reference_model.params import ReferenceModelConfig
+from reference_model.reference import Reference
+from rise_di_controller.controller import Controller, ControlOutput
+from rise_di_controller.proposals import authority_names
+
+Take = Callable[[StampedVector, int], object]
+"""Takes a sample at an instant, ns."""
+
+
+class Station(Protocol):
+    """A part of a flight, acting at the multiples of a period."""
+
+    @property
+    def period_ns(self) -> int:
+        """The period."""
+
+    def step(self, t_ns: int) -> None:
+        """Act at flight time t. Raises FlightEnded or ChannelError where the flight ends."""
+
+
+class Loop:
+    """Steps the due stations of each instant in simulated time, in the order of the list."""
+
+    def __init__(self, stations: Sequence[Station]) -> None:
+        self._stations = stations
+        self._base_ns = math.gcd(*(station.period_ns for station in stations))
+        self.t_ns = -self._base_ns
+
+    def run(self, end_ns: int) -> None:
+        """Step up to and including the instant `end_ns`. `t_ns` is the present instant, also after an error."""
+        for t_ns in range(self.t_ns + self._base_ns, end_ns + 1, self._base_ns):
+            self.t_ns = t_ns
+            for station in self._stations:
+                if t_ns % station.period_ns == 0:
+                    station.step(t_ns)
+
+
+class Topics:
+    """The samples of the topics: kept for the tape, if `recorded`, and handed to the subscribers."""
+
+    def __init__(self, *, recorded: bool = True) -> None:
+        self._recorded = recorded
+        self._names: dict[str, tuple[str, ...]] = {}
+        self._stamps: dict[str, list[int]] = defaultdict(list)
+        self._rows: dict[str, list[FloatArray]] = defaultdict(list)
+        self._subscriptions: dict[str, list[tuple[Sequence[str] | None, Take]]] = defaultdict(list)
+
+    def advertise(self, topic: str, names: Sequence[str]) -> None:
+        """Name the channels of a topic."""
+        self._names[topic] = tuple(names)
+
+    def subscribe(self, topic: str, take: Take, channels: Sequence[str] | None = None) -> None:
+        """Hand each sample of a topic to `take`: these channels in this order; None: all channels."""
+        self._subscriptions[topic].append((channels, take))
+
+    def is_taken(self, topic: str) -> bool:
+        """Whether a topic is recorded or taken by a station."""
+        return self._recorded or topic in self._subscriptions
+
+    def publish(self, topic: str, sample: StampedVector, t_ns: int) -> None:
+        """Record a sample, then call the subscribers. Raises ChannelError for a missing channel."""
+        if self._recorded:
+            self._stamps[topic].append(sample.stamp_ns)  # first: an interrupt before the next line leaves a stamp without a row
+            self._rows[topic].append(sample.value)
+        for channels, take in self._subscriptions.get(topic, ()):
+            wanted = sample.value if channels is None else select(channels, self._names[topic], sample.value)
+            take(StampedVector(sample.stamp_ns, wanted), t_ns)
+
+    def pop_signals(self) -> dict[str, Signal]:
+        """The recorded samples since the last call, by topic."""
+        signals = {}
+        for topic, names in self._names.items():
+            rows = self._rows.pop(topic, [])
+            values = np.array(rows) if rows else np.zeros((0, len(names)))
+            signals[topic] = Signal(np.array(self._stamps.pop(topic, [])[: len(rows)], dtype=np.int64), names, values)
+        return signals
+
+
+def _or_refuse(take: Take) -> Take:
+    """Refuse a sample with a ChannelError, as a node does."""
+
+    def take_or_refuse(sample: StampedVector, t_ns: int) -> None:
+        with suppress(ChannelError):
+            take(sample, t_ns)
+
+    return take_or_refuse
+
+
+class AircraftStation:
+    """The simulated aircraft: y, pose and truth with the last u held.
+
+    A lost sample of y is not published; a delayed sample keeps the stamp. `every_ns`: a period above the period of the sensors.
+    """
+
+    def __init__(self, parameters: AircraftConfig, topics: Topics, every_ns: int | None = None) -> None:
+        self._parameters = parameters
+        self._topics = topics
+        self.period_ns = every_ns or period_ns(parameters.rate, "rate")
+        channels = parameters.channels()
+        self._u = np.zeros(len(channels.inputs))
+        topics.advertise("y", tuple(channels.outputs))
+        topics.subscribe("u", self._take_u, tuple(channels.inputs))
+
+    def _take_u(self, sample: StampedVector, _t_ns: int) -> None:
+        self._u = sample.value
+
+    @cached_property
+    def _simulator(self) -> Simulator:
+        """In trim at t = 0. Raises FlightEnded for a flight condition without trim."""
+        simulator = Simulator(self._parameters)
+        self._topics.advertise("truth", simulator.truth_names)
+        self._topics.advertise("pose", POSE)
+        return simulator
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        simulator = self._simulator
+        for sample in simulator.sample(t_ns // simulator.period_ns, self._u):
+            self._topics.publish("y", sample, t_ns)
+        if self._topics.is_taken("pose"):
+            for sample in simulator.poses():
+                self._topics.publish("pose", sample, t_ns)
+        if self._topics.is_taken("truth"):
+            self._topics.publish("truth", StampedVector(t_ns, simulator.truth()), t_ns)
+
+
+class ReferenceStation:
+    """The reference model: y_m. A u_m acts from the next step on."""
+
+    def __init__(self, parameters: ReferenceModelConfig, topics: Topics, every_ns: int | None = None) -> None:
+        self._reference = Reference(parameters)
+        self._topics = topics
+        self.period_ns = every_ns or self._reference.period_ns
+        topics.advertise("y_m", parameters.outputs)
+        topics.subscribe("u_m", _or_refuse(self._take_u_m))
+
+    def _take_u_m(self, sample: StampedVector, t_ns: int) -> None:
+        u_m, attitude = np.split(sample.value, [-len(ATTITUDE)])
+        self._reference.take(t_ns, u_m, attitude)
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        y_m = self._reference.sample(t_ns // self._reference.period_ns)
+        self._topics.publish("y_m", StampedVector(t_ns, y_m), t_ns)
+
+
+class GuidanceStation:
+    """Guidance: u_m and the log of the steps."""
+
+    def __init__(self, guidance: Guidance, parameters: GuidanceConfig, topics: Topics) -> None:
+        self._guidance = guidance
+        self._topics = topics
+        self.period_ns = guidance.period_ns
+        self._authority = authority_names(parameters.outputs)
+        topics.advertise("u_m", (*parameters.outputs, *ATTITUDE))
+        topics.advertise("guidance", guidance.names)
+        topics.subscribe("y", _or_refuse(guidance.take_y), parameters.outputs)
+        topics.subscribe("pose", _or_refuse(guidance.take_pose))
+        topics.subscribe("authority", self._take_authority)
+
+    def _take_authority(self, sample: StampedVector, _t_ns: int) -> None:
+        self._guidance.take_authority(dict(zip(self._authority, sample.value.tolist(), strict=True)))
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        if waits := self._guidance.waits(t_ns):
+            raise FlightEnded(f"ended at t = {seconds(t_ns):.2f} s: {waits}")
+        if (guided := self._guidance.step(t_ns, t_ns)) is not None:
+            self._topics.publish("u_m", StampedVector(t_ns, guided.u_m), t_ns)
+            self._topics.publish("guidance", StampedVector(t_ns, guided.log), t_ns)
+
+
+class ControllerStation:
+    """The controller: u and the log of the ticks. `output` is from the last tick."""
+
+    def __init__(self, controller: Controller, topics: Topics) -> None:
+        parameters = controller.parameters
+        self.controller = controller
+        self._topics = topics
+        self.period_ns = controller.period_ns
+        self.output: ControlOutput | None = None
+        topics.advertise("u", parameters.effectors)
+        topics.advertise("internals", controller.names)
+        topics.subscribe("y", controller.take_y, parameters.measured)
+        topics.subscribe("y_m", controller.take_y_m, parameters.outputs)
+
+    def step(self, t_ns: int) -> None:
+        """See Station."""
+        self.output = self.controller.tick(t_ns)
+        if self.output is not None:
+            self._topics.publish("u", StampedVector(self.output.stamp_ns, self.output.u), t_ns)
+            self._topics.publish("internals", StampedVector(self.output.stamp_ns, self.output.internals), t_ns)
