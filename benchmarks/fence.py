@@ -33,7 +33,7 @@ from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch, missions
+from flight_campaign import batch, batch_matrices, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.outcome import COMPLETED
 from flight_guidance.params import GuidanceConfig
@@ -167,7 +167,7 @@ def fly_fleet(shape: str, wind: str, aircraft: int, seed: int, *, from_outside: 
     for first in range(0, aircraft, CHUNK):
         A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, min(CHUNK, aircraft - first))
         directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
-        assembled = batch.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
+        assembled = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, gust_directions=directions)
         result = batch.fly(assembled, vehicle, course, control_law, batch.shared(params), mission)
         figures = result.mission or {}
         beyond += np.asarray(figures["max.breach"]).tolist()

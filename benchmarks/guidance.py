@@ -39,8 +39,8 @@ from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.guidance import Guidance
+from flight_guidance.guidance_state import Lateral, Mode
 from flight_guidance.lateral import least_radius
-from flight_guidance.modes import Lateral, Mode
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.protection import FLOOR
 

@@ -30,7 +30,7 @@ from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_guidance import path
-from flight_guidance.modes import Lateral
+from flight_guidance.guidance_state import Lateral
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line, Route
 from flight_guidance.route_file import Waypoint

@@ -49,7 +49,7 @@ from flight_core.files import dump_yaml
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance.guidance import Guidance
-from flight_guidance.modes import TARGETS as MODE_TARGETS
+from flight_guidance.guidance_state import TARGETS as MODE_TARGETS
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import ENDINGS, Origin, read_fence_file, read_route_file
 from flight_log.bag import SCENARIO_MEDIA_TYPE, read_metadata_records

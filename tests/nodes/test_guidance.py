@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.channels import POSE
 from flight_core.modes import Mode as ControllerMode
 from flight_core.parameters import ParameterError
-from flight_guidance.modes import Lateral, Vertical
+from flight_guidance.guidance_state import Lateral, Vertical
 from flight_guidance.node import GuidanceNode
 from flight_guidance.reach import AUTHORITY
 

@@ -24,7 +24,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_bringup.graph import ONE_PROCESS, parameter_overrides
 from flight_core.outcome import FlightEnded
-from flight_guidance.modes import Lateral
+from flight_guidance.guidance_state import Lateral
 from flight_guidance.node import GuidanceNode
 from flight_ros.event_loop import require_input
 from flight_ros.flight_node import FlightNode

@@ -27,7 +27,7 @@ from flight_campaign.tuning import GUST, OBJECTIVES, TURBULENCE, Benchmark
 from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_design.gains import tuned_gains
-from flight_design.gains.gain_selection import section_yaml
+from flight_design.gains.gain_yaml import section_yaml
 from flight_design.gains.requirement import REQUIREMENT, least_fraction
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.control_law import Measurements

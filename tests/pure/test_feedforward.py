@@ -16,7 +16,8 @@ from flight_core.integrators import rk4
 from flight_core.modes import Mode
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray, StampedVector
-from flight_design.gains.gain_selection import manoeuvre, study_airframe, with_feedforward
+from flight_design.gains.gain_selection import with_feedforward
+from flight_design.gains.ideal_control import manoeuvre, study_airframe
 from rise_di_controller import feedforward, guard
 from rise_di_controller import law as rise
 from rise_di_controller.feedforward import Nominal, nominal_model

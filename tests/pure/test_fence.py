@@ -17,7 +17,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.report.guided import guidance_notices, unflown_legs
-from flight_campaign import batch, missions
+from flight_campaign import batch, batch_matrices, missions
 from flight_campaign.benchmark_course import build_course
 from flight_core.channels import POSE
 from flight_core.parameters import ParameterError
@@ -26,7 +26,8 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray, StampedVector
 from flight_guidance.fence import BACK, HOME, LEFT, RIGHT, SHARES, Escape, Motion, last_safe_turn, turn_clearance
 from flight_guidance.guidance import Guidance, GuidanceOutput
-from flight_guidance.modes import Lateral, holding, motion_of
+from flight_guidance.guidance_state import Lateral
+from flight_guidance.modes import holding, motion_of
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.ways import ways
 from flight_guidance.zones import Fence, Zone, clearance
@@ -331,7 +332,7 @@ def test_fleet_keeps_fence_as_one_process_does() -> None:
     mission = missions.build(scenario, course)
     mission = replace(mission, guidance=mission.guidance._replace(fence=FLEET_FENCE))
     control_law, params = scenario.controller.tuned_law()
-    assembled = batch.assemble(A, B, scenario.aircraft.plant(), course)
+    assembled = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course)
     result = batch.fly(assembled, batch.vehicle(scenario), course, control_law, batch.shared(params), mission)
     assert result.mission is not None
     tape = simulate(scenario.vary(aircraft={"uncertainty": uncertain}), guide=Fenced)

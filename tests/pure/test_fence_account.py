@@ -10,7 +10,7 @@ from flight_analysis.report.guided import Outside, time_outside
 from flight_core.outcome import COMPLETED, INTERRUPTED, STATUS_INCOMPLETE, STATUS_INTERRUPTED, exit_status
 from flight_core.rates import nanoseconds
 from flight_core.tape import Signal, Tape
-from flight_guidance.modes import LARGEST
+from flight_guidance.guidance_state import LARGEST
 from flight_guidance.notices import Notices
 from flight_guidance.params import GuidanceConfig
 

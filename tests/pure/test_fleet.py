@@ -15,7 +15,7 @@ from control_laws.nominal_model import campaign_law
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
-from flight_campaign import batch, batch_allocation
+from flight_campaign import batch, batch_allocation, batch_matrices
 from flight_campaign.benchmark_course import build_course
 from flight_core.parameters import ParameterError
 from flight_core.vectors import Array, FloatArray
@@ -55,7 +55,7 @@ def fly(
 ) -> batch.FleetResult:
     course = build_course(scenario)
     directions = gust_directions(load_airframe(scenario.aircraft.airframe), A, scenario.aircraft.uncertainty.wind)
-    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
+    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, wind, late, directions)
     return batch.fly(aircraft, batch.vehicle(scenario), course, control_law, params)
 
 
@@ -198,13 +198,13 @@ def test_wind_acts_on_x_dot_by_own_directions_of_each_aircraft() -> None:
     course, plant = build_course(SERVO), SERVO.aircraft.plant()
     A, B = sampled(0.3, 5, 2)
     directions = gust_directions(load_airframe("osprey"), A, "air_relative")
-    assembled = batch.assemble(A, B, plant, course, gust_directions=directions)
+    assembled = batch_matrices.assemble(A, B, plant, course, gust_directions=directions)
     assert [list(load_airframe("osprey").gusts)[axis] for axis in course.axes] == ["vertical", "lateral"]
     C = plant.aircraft.C[course.order]
     for k in range(2):
         assert np.asarray(assembled.forced_rate)[..., k] == pytest.approx(C @ directions[k][:, course.axes], rel=1e-14)
     # Without directions the plant's own act on all.
-    shared = np.asarray(batch.assemble(A, B, plant, course).forced_rate)
+    shared = np.asarray(batch_matrices.assemble(A, B, plant, course).forced_rate)
     assert (shared == (C @ plant.aircraft.gust_direction[:, course.axes])[..., None]).all()
 
 
@@ -238,7 +238,7 @@ def test_aircraft_that_diverges_marked_and_does_not_affect_others() -> None:
     vehicle = vehicle._replace(actuators=vehicle.actuators._replace(lower=None, upper=None, rate=None))
     infinite = np.full((4, 1), np.inf)
     vehicle = vehicle._replace(limits=Limits(-infinite, infinite, infinite))
-    aircraft = batch.assemble(A, B, SERVO.aircraft.plant(), course)
+    aircraft = batch_matrices.assemble(A, B, SERVO.aircraft.plant(), course)
     both = batch.fly(aircraft, vehicle, course, CONTROL_LAW, PARAMS)
     assert np.asarray(both.diverged).tolist() == [False, True]
     assert np.isfinite(np.asarray(both.rms)[:, 0]).all()

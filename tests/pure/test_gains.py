@@ -25,11 +25,12 @@ from flight_cli.gains import gains as gains_command
 from flight_cli.words import Command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from flight_design.gains import gain_conditions
+from flight_design.gains import gain_conditions, ideal_control
 from flight_design.gains import gain_selection as selection
 from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
 from flight_design.gains.gain_design import select_gains
-from flight_design.gains.gain_selection import ChannelPairing, GainAssessment, LoopSetting, Study
+from flight_design.gains.gain_selection import GainAssessment, LoopSetting
+from flight_design.gains.ideal_control import ChannelPairing, Study
 from rise_di_controller.decomposition import decompose
 from rise_di_controller.law import LawParams, Sign, engage, step, tuned
 from rise_di_controller.laws import AnyLaw
@@ -51,7 +52,7 @@ HAND = Bounds(
 def osprey() -> Study:
     """The osprey and twenty airframes around it along the manoeuvre of the default scenario, with its gusts."""
     scenario = find_scenario("osprey_gust")
-    return selection.study_airframe(AIRFRAME, selection.manoeuvre(scenario, AIRFRAME), samples=20)
+    return ideal_control.study_airframe(AIRFRAME, ideal_control.manoeuvre(scenario, AIRFRAME), samples=20)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +146,7 @@ def test_airframe_with_unstable_zero_refused(osprey_gust: Scenario) -> None:
     rows = [list(row) for row in AIRFRAME.A]
     rows[AIRFRAME.index("beta")][AIRFRAME.index("beta")] = 0.69  # the zero at -0.69 1/s is that entry
     with pytest.raises(ParameterError, match=r"^airframe osprey: found a zero at 0\.69 1/s, expected none in the right"):
-        selection.study_airframe(AIRFRAME.model_copy(update={"A": rows}), selection.manoeuvre(osprey_gust, AIRFRAME))
+        ideal_control.study_airframe(AIRFRAME.model_copy(update={"A": rows}), ideal_control.manoeuvre(osprey_gust, AIRFRAME))
 
 
 def test_engineering_gains_of_osprey_are_close_to_those_tuned_by_hand(selected: selection.Selection) -> None:

@@ -16,6 +16,7 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_guidance import modes, path, protection
 from flight_guidance.attitude import AttitudeParams, body_rates
+from flight_guidance.guidance_state import Vertical
 from flight_guidance.lateral import (
     PathError,
     PathParams,
@@ -27,7 +28,6 @@ from flight_guidance.lateral import (
     path_acceleration,
     slip_estimate,
 )
-from flight_guidance.modes import Vertical
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line
 from flight_guidance.vertical import VerticalParams, alpha_estimate, climb_for, path_lag, pitch_for, slewed

@@ -22,9 +22,9 @@ from flight_cli.cli import COMMANDS, application
 from flight_core.parameters import ParameterError
 from flight_core.tape import Signal, Tape
 from flight_core.vectors import ChannelError, FloatArray, StampedVector
-from flight_guidance import guidance, modes
+from flight_guidance import guidance, guidance_state, modes
 from flight_guidance.guidance import Guidance
-from flight_guidance.modes import Mode, Vertical
+from flight_guidance.guidance_state import Mode, Vertical
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.protection import climb_range
 from flight_guidance.route_file import Waypoint, read_route
@@ -153,7 +153,7 @@ def test_stale_pose_levels_wings(y_too: bool) -> None:
     assert made.step(6500 * MS, 6500 * MS) is not None
     state = made.state
     assert state is not None
-    assert (state.lateral, state.target.phi) == (modes.Lateral.PHI, 0.0)
+    assert (state.lateral, state.target.phi) == (guidance_state.Lateral.PHI, 0.0)
     assert (state.vertical, state.target.altitude) == (Vertical.ALTITUDE, 100.0)
 
 
@@ -194,16 +194,16 @@ def test_route_waits_for_engagement(by: str) -> None:
             made.pause(paused=not on, forget=not on)
 
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 100.0)]))
-    assert run(made, 1, 2)["mode.lateral"][0] == modes.Lateral.ROUTE
+    assert run(made, 1, 2)["mode.lateral"][0] == guidance_state.Lateral.ROUTE
     switch(on=False)
     switch(on=True)  # the route that was flown before is not flown on
-    assert run(made, 2, 3)["mode.lateral"][0] != modes.Lateral.ROUTE
+    assert run(made, 2, 3)["mode.lateral"][0] != guidance_state.Lateral.ROUTE
     switch(on=False)
     made.take_route(section.plan([Waypoint(0.0, 0.0, 100.0), Waypoint(900.0, 0.0, 130.0)]))
     made.take_target({"V": 27.0})
     switch(on=True)
     signal = run(made, 3, 4)
-    assert (signal["mode.lateral"][0], signal["leg"][0]) == (modes.Lateral.ROUTE, 0.0)
+    assert (signal["mode.lateral"][0], signal["leg"][0]) == (guidance_state.Lateral.ROUTE, 0.0)
     assert (signal["target.altitude"][0], signal["target.V"][0]) == (100.0, 25.0)  # at the begin of the leg
 
 

@@ -23,7 +23,7 @@ from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.fence import Fence, Zone
 from flight_guidance.guidance import names
-from flight_guidance.modes import Lateral, Mode, Vertical
+from flight_guidance.guidance_state import Lateral, Mode, Vertical
 from flight_guidance.path import Arc, Line
 
 pytestmark = [pytest.mark.package("flight_analysis"), pytest.mark.slow]

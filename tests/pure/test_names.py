@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.scenario_library import LIBRARY as SCENARIOS
 from flight_analysis.report.paper import _tabular
 from flight_core.files import comment, dump_yaml, parse_yaml
 from flight_core.parameters import Config, ParameterError
-from flight_design.gains.gain_selection import yaml_flow, yaml_template
+from flight_design.gains.gain_yaml import yaml_flow, yaml_template
 from rise_di import new_airframe
 
 FREE = {"conditions", "messages", "overrides", "topics", "fence", "link", "values"}

@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_campaign import law_comparison, tuning
 from flight_core.vectors import FloatArray
 from flight_design.gains.airframe_properties import invariant_zeros
-from flight_design.gains.gain_selection import manoeuvre, study_airframe
+from flight_design.gains.ideal_control import manoeuvre, study_airframe
 from flight_design.gains.lyapunov import KnownPlant, fly
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law import LawParams, Sign

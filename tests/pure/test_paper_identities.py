@@ -20,7 +20,8 @@ from scipy.integrate import cumulative_trapezoid, solve_ivp
 from tests.closed_loop import law_params, reference_outputs
 
 from aircraft_sim import dynamics
-from aircraft_sim.params import AircraftConfig, Gust
+from aircraft_sim.params import AircraftConfig
+from aircraft_sim.sections import Gust
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix, evidence, example, fly

@@ -12,10 +12,16 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import StampedVector
 from flight_guidance import modes
 from flight_guidance.guidance import Guidance
-from flight_guidance.modes import Begin, Commands, GuidanceState, Inputs, reach_sentence, within_reach
+from flight_guidance.guidance_state import (
+    Begin,
+    Commands,
+    GuidanceState,
+    Inputs,
+)
 from flight_guidance.notices import LEARNED, Notices
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY, Authority
+from flight_guidance.targets import reach_sentence, within_reach
 
 pytestmark = pytest.mark.package("flight_guidance")
 

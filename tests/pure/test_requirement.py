@@ -23,9 +23,9 @@ from flight_cli.gains import gains as gains_command
 from flight_cli.words import Command
 from flight_core.parameters import ParameterError
 from flight_core.vectors import FloatArray
-from flight_design.gains import gain_selection
+from flight_design.gains import gain_selection, ideal_control
 from flight_design.gains.gain_design import select_gains
-from flight_design.gains.gain_selection import Manoeuvre
+from flight_design.gains.ideal_control import Manoeuvre
 from flight_design.gains.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
 from flight_design.gains.trade import linear_error, trade
 from reference_model.params import ReferenceModelConfig
@@ -68,7 +68,7 @@ def selected(phase_margin: float) -> RiseDiConfig:
         "pulses": {"q": whole["pulses"]["q"]},
     }
     manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, 4.0)
-    studied = gain_selection.study_airframe(integrators(), manoeuvre, samples=3)
+    studied = ideal_control.study_airframe(integrators(), manoeuvre, samples=3)
     setting = gain_selection.loop_setting(SERVO)._replace(
         lag=LAG, delay=0.0, rate_limit={}, requirement=requirement(phase_margin, accept=True)
     )
@@ -145,7 +145,7 @@ def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
     law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
     plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
     of = LinearLoop("", ("u",), plant, law, Loop(np.zeros(1), 0.0, period))
-    u_dot = np.full((round(duration / gain_selection.STEP) + 1, 1), a)
+    u_dot = np.full((round(duration / ideal_control.STEP) + 1, 1), a)
     t = np.arange(0.0, duration, period)
     expected = a / k * (t - (1.0 - np.exp(-k * t)) / k)
     assert linear_error(of, u_dot)[0] == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.01)

@@ -20,8 +20,8 @@ from flight_core.units import GRAVITY
 from flight_core.vectors import ChannelError, StampedVector
 from flight_guidance import guidance, path
 from flight_guidance.guidance import Guidance
+from flight_guidance.guidance_state import Lateral, Mode
 from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
-from flight_guidance.modes import Lateral, Mode
 from flight_guidance.notices import LEARNED
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Arc, Line

@@ -15,7 +15,7 @@ from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
 from flight_core.vectors import FloatArray
-from flight_design.gains import gain_selection
+from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.gain_design import select_gains
 
 pytestmark = [pytest.mark.package("flight_design"), pytest.mark.slow]
@@ -35,7 +35,7 @@ def selection(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, gain_sele
 
 def flown(folder: Path, selected: gain_selection.Selection, rate: float) -> FloatArray:
     """The largest errors, law's order, under the gains of Theorem 1 as written, at a rate in Hz."""
-    written = gain_selection.as_yaml(selected, theorem=True).replace("rate: 100.0  # Hz", f"rate: {rate}  # Hz")
+    written = gain_yaml.as_yaml(selected, theorem=True).replace("rate: 100.0  # Hz", f"rate: {rate}  # Hz")
     path = folder / f"ideal_{rate:g}.yaml"
     path.write_text(FILES["sections.yaml"] + written, encoding="utf-8")
     _, error = best_error(simulate(load_scenario(path)))
@@ -56,7 +56,7 @@ def test_half_the_period_quarters_the_error(
 
 def test_written_gains_are_those_of_the_theorem(selection: tuple[Path, gain_selection.Selection]) -> None:
     _, selected = selection
-    text = gain_selection.as_yaml(selected, theorem=True)
+    text = gain_yaml.as_yaml(selected, theorem=True)
     section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
     assert "by Theorem 1" in text
     np.testing.assert_allclose(section["beta"], selected.literal.beta, rtol=1e-5)

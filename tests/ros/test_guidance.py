@@ -28,7 +28,7 @@ from flight_core.outcome import STATUS_INCOMPLETE
 from flight_core.parameters import ParameterError
 from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal
-from flight_guidance.modes import Lateral
+from flight_guidance.guidance_state import Lateral
 from flight_log.tape_reader import read_run
 from flight_ros.messages import to_message
 from flight_view.control_client import ControlClient

@@ -15,7 +15,7 @@ from aircraft_sim.uncertainty import gust_directions, sampled_matrices
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.simulate import simulate
 from flight_analysis.metrics import best_error
-from flight_campaign import batch, missions
+from flight_campaign import batch, batch_matrices, missions
 from flight_campaign.batch import FleetResult, Stepper
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.benchmark_entry import BenchmarkEntry, Step, Task, entered, stepped, task_of
@@ -212,7 +212,7 @@ def _fly_fleet(entry: BenchmarkEntry, prepared: _Prepared, seed: int, first: int
     A, B = sampled_matrices(airframe, UNCERTAINTY, UNCERTAINTY, seed, first, size)
     directions = gust_directions(airframe, A, scenario.aircraft.uncertainty.wind)
     late = round(SETS[prepared.task.set].late / course.period)
-    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
     vehicle = batch.vehicle(scenario)
     if isinstance(prepared.law, ControllerConfig):
         law = prepared.law.tuned_law()

@@ -246,7 +246,7 @@ def fly_chunk(text: str, job: Job, learner: MakeLearner | None = None) -> bytes:
 
 def fly_chunk_figures(text: str, job: Job) -> Chunk:
     """Fly a chunk of a campaign. One of a guided scenario flies missions."""
-    from flight_campaign import batch  # noqa: PLC0415 - JAX, which the command needs only for flights
+    from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, which the command needs only for flights
 
     definition = Definition.model_validate_json(text)
     case, chunk = job
@@ -260,7 +260,7 @@ def fly_chunk_figures(text: str, job: Job) -> Chunk:
     directions = gust_directions(airframe, A, definition.wind)
     equipped = definition.drawn_equipment(scenario, first, definition.chunk)
     late = np.round(equipped.get(equipment.DELAY, np.zeros(1)) / course.period).astype(np.int64)
-    aircraft = batch.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
+    aircraft = batch_matrices.assemble(A, B, scenario.aircraft.plant(), course, late=late, gust_directions=directions)
     vehicle = batch.with_equipment(vehicle, scenario, equipped)
     result = batch.fly(aircraft, vehicle, course, law.control_law, law.params, mission)
     rms, largest, slew = (np.asarray(part)[:, :count] for part in (result.rms, result.max, result.slew))

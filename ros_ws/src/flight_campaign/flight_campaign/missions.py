@@ -16,7 +16,7 @@ from jax import numpy as jnp
 from numpy.typing import NDArray
 
 from aircraft_sim import pose as pose_model
-from aircraft_sim.params import StartConfig
+from aircraft_sim.sections import StartConfig
 from aircraft_sim.simulator import POSE_STATES
 from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.metrics import CAPTURE_TIME
@@ -26,10 +26,17 @@ from flight_core.kinematics import heading_rate
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import divide, period_ns, seconds
 from flight_core.vectors import Array, FloatArray
-from flight_guidance import modes, path
+from flight_guidance import guidance_state, modes, path, targets
 from flight_guidance.fence import Escape, last_safe_turn
+from flight_guidance.guidance_state import (
+    GuidanceParams,
+    GuidanceState,
+    Lateral,
+    Mode,
+    Target,
+    Vertical,
+)
 from flight_guidance.lateral import PathError
-from flight_guidance.modes import GuidanceParams, GuidanceState, Lateral, Mode, Target, Vertical
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Line, Route
 from reference_model import model
@@ -244,7 +251,7 @@ def initial_state(count: int, late: int, mission: Mission) -> MissionState:
         none,
         velocity,
         *(none,) * 8,
-        none + modes.LARGEST,
+        none + guidance_state.LARGEST,
         none,
     )
 
@@ -309,7 +316,7 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
         if params.fence is not None:
             escape = last_safe_turn(params.fence, state.fence, modes.motion_of(before, pose, y_of, speed, params))
             homing = escape.action != 0.0
-            home = modes.home(pose, params)
+            home = targets.home(pose, params)
             home_altitude = jnp.where(escape.begins, home["altitude"], state.home_altitude)
             orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), position)
             error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))

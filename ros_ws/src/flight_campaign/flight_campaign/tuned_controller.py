@@ -12,9 +12,9 @@ from control_laws.observer_design import Names
 from flight_campaign.tuning import Benchmark, as_gains
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
+from flight_design.gains.extended_state import integrator_model
 from flight_design.gains.gain_conditions import MIN_K, split_gain
 from flight_design.gains.gain_selection import with_feedforward
-from flight_design.gains.observer_selection import integrator_model
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.law import MIN_GAIN
 from rise_di_controller.laws import AnyLaw

@@ -18,15 +18,16 @@ from control_laws.catalogue import AIRCRAFT, INTEGRATORS, NONE, Gains, Law, init
 from control_laws.nominal_model import NominalModel
 from flight_analysis.closed_loop.loop_margins import law_order
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_campaign import batch, statistics
-from flight_campaign.batch import Fleet, FleetResult, Vehicle
+from flight_campaign import batch, batch_matrices, statistics
+from flight_campaign.batch import FleetResult, Vehicle
+from flight_campaign.batch_matrices import Fleet
 from flight_campaign.benchmark_course import Course, build_course
 from flight_campaign.law_margins import has_margins, nominal_margins
 from flight_campaign.statistics import score_units
 from flight_core.vectors import Array, FloatArray
+from flight_design.gains.extended_state import integrator_model
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.nominal import nominal_model
-from flight_design.gains.observer_selection import integrator_model
 from flight_design.gains.requirement import REQUIREMENT, Requirement, least_fractions
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.linear_loop import Loop
@@ -175,7 +176,7 @@ def benchmark_fleet(A: FloatArray, B: FloatArray, late: Array, wind: str, benchm
     """Aircraft in a wind of the benchmark, u late by whole ticks; shapes as in `fleet.assemble`."""
     aircraft = benchmark.scenario.aircraft
     directions = gust_directions(aircraft.sampled_airframe(), A, aircraft.uncertainty.wind)
-    return batch.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
+    return batch_matrices.assemble(A, B, benchmark.plant, benchmark.courses[wind][NONE], late=late, gust_directions=directions)
 
 
 class Evaluation(NamedTuple):

@@ -30,7 +30,7 @@ from flight_cli.output import COUNT_COLUMNS, LICENCE, new_table, parse_numbers, 
 from flight_core.files import display_path
 from flight_core.parameters import require
 from flight_design.gains import tuned_gains
-from flight_design.gains.gain_selection import section_yaml
+from flight_design.gains.gain_yaml import section_yaml
 from flight_design.gains.tuned_gains import TuningResult
 from rise_di_controller.margins import Margins
 from rise_di_controller.params import ControllerConfig

@@ -23,11 +23,12 @@ from flight_cli.words import AsJson
 from flight_core.files import display_path, writing
 from flight_core.parameters import ParameterError, require
 from flight_core.units import quantity
-from flight_design.gains import gain_selection
+from flight_design.gains import gain_selection, gain_yaml
 from flight_design.gains.airframe_properties import airframe_facts, marginal_sentence
 from flight_design.gains.gain_conditions import Condition, failing
 from flight_design.gains.gain_design import check_gains, select_gains
-from flight_design.gains.gain_selection import GainAssessment, Selection, Study
+from flight_design.gains.gain_selection import GainAssessment, Selection
+from flight_design.gains.ideal_control import Study
 from flight_design.gains.requirement import PHASE_MARGIN
 from flight_design.gains.trade import trade
 from rise_di_controller.params import ControllerConfig
@@ -162,7 +163,7 @@ def gains(
             answers = {"observer": engineering} if observer else {"theorem": selection.theorem, "engineering": engineering}
             if write is not None:
                 _require_margins(selection.theorem if theorem else selection.engineering, accept)
-                write_text("--write", write, LICENCE + gain_selection.as_yaml(selection, theorem=theorem))
+                write_text("--write", write, LICENCE + gain_yaml.as_yaml(selection, theorem=theorem))
     study = next(iter(answers.values())).study
     if page is not None:
         _write_page(page, [*answers.values()][-1])
@@ -302,7 +303,7 @@ def _own_gains(controller: ControllerConfig, aircraft: str) -> Table:
     )
     for name in type(controller).model_fields:
         if name not in ControllerConfig.model_fields:
-            table.add_row(name, gain_selection.yaml_flow(getattr(controller, name), 4))
+            table.add_row(name, gain_yaml.yaml_flow(getattr(controller, name), 4))
     return table
 
 

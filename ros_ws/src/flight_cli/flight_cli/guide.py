@@ -13,7 +13,8 @@ from flight_cli.route_options import Altitude, Line, OriginOfRoute, Simplify, re
 from flight_cli.words import Namespace
 from flight_core.environment import require_ros_environment
 from flight_core.parameters import ParameterError, require
-from flight_guidance.modes import ANGLES, TARGETS
+from flight_guidance.guidance_state import TARGETS
+from flight_guidance.targets import ANGLES
 
 REFUSED = 1
 SERVICES = {

@@ -54,7 +54,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import si_per_unit
 from flight_design.gains.gain_design import observed
-from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.gains.requirement import PHASE_MARGIN, Requirement, requirement
 from flight_design.identification.bridge_identification import AMPLITUDE
 from flight_design.identification.innovation_filters import Actuation, recording

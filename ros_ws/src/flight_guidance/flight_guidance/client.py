@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from flight_core.parameters import ParameterError
 from flight_core.vectors import ChannelError
-from flight_guidance.modes import TARGETS
+from flight_guidance.guidance_state import TARGETS
 from flight_guidance.odometry import MAP
 from flight_ros.client import Client
 from flight_ros.messages import Encoder, NamedDecoder

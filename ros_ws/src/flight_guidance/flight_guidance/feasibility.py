@@ -10,8 +10,8 @@ import numpy as np
 
 from flight_core.parameters import ParameterError, require
 from flight_guidance import path, protection
+from flight_guidance.guidance_state import LARGEST
 from flight_guidance.lateral import least_period, least_radius
-from flight_guidance.modes import LARGEST
 from flight_guidance.path import Leg, Line, Loiter, Point, Route
 from flight_guidance.route_file import Waypoint
 from flight_guidance.zones import Fence, clearance, described

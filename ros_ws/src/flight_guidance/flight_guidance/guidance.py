@@ -15,8 +15,8 @@ import numpy as np
 from flight_core.channels import POSE
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import ChannelError, FloatArray, StampedVector, require_newer, require_not_future
-from flight_guidance import modes, path
-from flight_guidance.modes import (
+from flight_guidance import guidance_state, modes, path, targets
+from flight_guidance.guidance_state import (
     TARGETS,
     Begin,
     Commands,
@@ -87,7 +87,7 @@ def row(inputs: Inputs, state: GuidanceState, commands: Commands, route: int, li
             *(state.fence, commands.clearance, commands.predicted),
             *(commands.phi_c, commands.theta_c, state.climb_c, state.V_c),
             *(getattr(commands, f"{name}_limited") for name in LIMITED),
-            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, modes.bits(inputs.commands), *inputs.authority),
+            *(seconds(inputs.pose_age_ns), link_age, inputs.begin, guidance_state.bits(inputs.commands), *inputs.authority),
             *state.target,
             *(getattr(state, name) for name in STATE),
             *state.wind,
@@ -183,8 +183,8 @@ class Guidance:
     def take_pose(self, sample: StampedVector, now_ns: int) -> None:
         """Take a pose in the order of `channels.POSE`.
 
-        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond `modes.LARGEST`, and for
-        a pose equal to the last in every value.
+        Raises ChannelError for a stamp not newer than the last or in the future, for a value beyond LARGEST, and for a pose
+        equal to the last in every value.
         """
         last = self._pose
         newest = self._newest(self._pose, sample, now_ns)
@@ -204,15 +204,15 @@ class Guidance:
         require_not_future(sample.stamp_ns, now_ns, self._params.max_age_ns)
         if last is not None:
             require_newer(sample.stamp_ns, last.stamp_ns)
-        if (largest := float(np.max(np.abs(sample.value)))) > modes.LARGEST:
-            raise ChannelError("bounds", f"found a value of {largest:g}, expected at most {modes.LARGEST:g} in SI")
+        if (largest := float(np.max(np.abs(sample.value)))) > guidance_state.LARGEST:
+            raise ChannelError("bounds", f"found a value of {largest:g}, expected at most {guidance_state.LARGEST:g} in SI")
         return sample
 
     def take_target(self, values: Mapping[str, float]) -> None:
-        """Take commands by channel of `modes.Target`; commands of the same instant come in one call. Raises ChannelError."""
-        modes.read_target(values, self._params, self.route, degrees=True)
+        """Take commands by channel of Target; commands of the same instant come in one call. Raises ChannelError."""
+        targets.read_target(values, self._params, self.route, degrees=True)
         # A lateral or vertical command replaces the command of the mode before.
-        for table in (modes.LATERAL, modes.VERTICAL):
+        for table in (guidance_state.LATERAL, guidance_state.VERTICAL):
             if any(name in table for name in values):
                 self._given = {name: value for name, value in self._given.items() if name not in table}
         self._given |= values
@@ -245,14 +245,14 @@ class Guidance:
         if self.mode is not Mode.ENGAGED or self._pose is None or self._y is None:
             return False
         speed = modes.airspeed(tuple(self._y.value.tolist()), self._params)
-        self.take_target(modes.hold(self.pose(), speed, self._params))
+        self.take_target(targets.hold(self.pose(), speed, self._params))
         return True
 
     def home(self) -> bool:
         """Fly home and orbit there; False while guidance does not fly."""
         if self.mode is not Mode.ENGAGED or self._pose is None:
             return False
-        self.take_target(modes.home(self.pose(), modes.within_reach(self._params, self._authority)))
+        self.take_target(targets.home(self.pose(), targets.within_reach(self._params, self._authority)))
         return True
 
     def skip(self) -> bool:

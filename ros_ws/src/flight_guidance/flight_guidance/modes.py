@@ -8,23 +8,36 @@ a sample of the log can be computed again from the sample before.
 """
 
 import math
-from collections.abc import Callable, Collection, Mapping
-from enum import IntEnum
+from collections.abc import Callable, Mapping
 from functools import partial, reduce
 from operator import or_
-from typing import Any, NamedTuple
+from typing import Any
 
 from flight_core.channels import POSE
 from flight_core.kinematics import clip, euler_rates, heading_rate, tilt
 from flight_core.rates import seconds
 from flight_core.units import GRAVITY
-from flight_core.vectors import ChannelError, Scalar, array_namespace
-from flight_guidance import path, protection, reach
-from flight_guidance.attitude import AttitudeParams, BodyRates, body_rates, yaw_for_bank
+from flight_core.vectors import Scalar, array_namespace
+from flight_guidance import path, protection
+from flight_guidance.attitude import BodyRates, body_rates, yaw_for_bank
 from flight_guidance.fence import AROUND, BACK, HOME, RIGHT, Escape, Motion, last_safe_turn
+from flight_guidance.guidance_state import (
+    LARGEST,
+    LATERAL,
+    VERTICAL,
+    Begin,
+    Commands,
+    GuidanceParams,
+    GuidanceState,
+    Inputs,
+    Lateral,
+    Limits,
+    Mode,
+    Target,
+    Vertical,
+)
 from flight_guidance.lateral import (
     PathError,
-    PathParams,
     bank_for,
     course_acceleration,
     heading_estimate,
@@ -32,10 +45,10 @@ from flight_guidance.lateral import (
     slip_estimate,
     turn_towards,
 )
-from flight_guidance.path import Arc, Leg, Loiter, Point, Route
-from flight_guidance.reach import Authority
+from flight_guidance.legs import EXIT, along_route, course_and_speed, has_loitered, joining, leaves, on_profile
+from flight_guidance.path import Arc, Leg, Point, Route
+from flight_guidance.targets import hold, home, permitted_speed, within_reach
 from flight_guidance.vertical import (
-    VerticalParams,
     alpha_estimate,
     climb_for,
     climb_speed,
@@ -44,327 +57,13 @@ from flight_guidance.vertical import (
     slewed,
 )
 from flight_guidance.wind import Wind, wind_estimate, wind_of
-from flight_guidance.zones import Fence
-
-LARGEST = 1e9
-"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
 
 LONGEST_LEAD = 0.5
 """s. Largest age of a pose over which its attitude is brought to now: the rates change within a second."""
 
-EXIT = 0.5
-"""s of flight beyond the end of a circle within which an aircraft leaves; later it flies another turn."""
-
-LEVEL = 5.0
-"""m. Largest distance from the altitude at which an aircraft leaves a loiter."""
 
 STEEPEST = math.radians(89.0)
 """Largest bank that a mode asks for, before protection."""
-
-
-class Mode(IntEnum):
-    """What guidance does."""
-
-    OFF = 0  # no u_m
-    ENGAGED = 1
-    DEAD_RECKONING = 2  # pose is stale: wings level, attitude from the rates of y
-    POSE_LOST = 3  # pose is stale for longer: rates are zero
-
-
-class Lateral(IntEnum):
-    """What the bank serves."""
-
-    PHI = 0
-    HEADING = 1
-    COURSE = 2
-    ORBIT = 3
-    ROUTE = 4
-
-
-class Vertical(IntEnum):
-    """What the pitch serves."""
-
-    THETA = 0
-    CLIMB = 1
-    ALTITUDE = 2
-    PROFILE = 3  # the altitude along the leg of the route
-
-
-class Target(NamedTuple):
-    """Commands by channel; the channels of the modes in force act."""
-
-    phi: float = 0.0  # rad
-    heading: float = 0.0  # rad from true north
-    course: float = 0.0  # rad from true north, over ground
-    north: float = 0.0  # m, centre of the orbit
-    east: float = 0.0  # m
-    radius: float = 0.0  # m, positive clockwise from above
-    leg: float = 0.0  # number of the leg of the route
-    theta: float = 0.0  # rad
-    climb: Scalar = 0.0  # m/s
-    altitude: Scalar = 0.0  # m
-    V: Scalar = 0.0  # airspeed, m/s, absolute
-    along: float = 0.0  # m along a line of the route from the start, where the aircraft joins the line
-    r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
-
-
-TARGETS = Target._fields
-LATERAL: Mapping[str, Lateral] = {
-    **dict.fromkeys(("phi", "r"), Lateral.PHI),
-    "heading": Lateral.HEADING,
-    "course": Lateral.COURSE,
-    **dict.fromkeys(("north", "east", "radius"), Lateral.ORBIT),
-    **dict.fromkeys(("leg", "along"), Lateral.ROUTE),
-}
-VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
-
-
-class Home(NamedTuple):
-    """Where an aircraft goes in the end."""
-
-    north: float = 0.0  # m
-    east: float = 0.0  # m
-    altitude: float | None = None  # m; None: the altitude of then
-    after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
-
-
-class Limits(NamedTuple):
-    """Limits of commands."""
-
-    bank: float  # rad
-    least_pitch: float  # rad
-    largest_pitch: float  # rad
-    floor: float  # m/s, of the airspeed
-    stall_speed: float  # m/s
-    radius: float  # m, least radius of an orbit
-    largest_speed: float  # m/s
-    lowest: float  # m, least altitude
-    highest: float  # m, largest altitude
-
-
-class GuidanceParams(NamedTuple):
-    """Parameters of the step."""
-
-    outputs: tuple[str, ...]  # order of u_m
-    period_ns: int
-    speed: float  # trim speed V0, m/s
-    k_chi: float  # of heading and course, 1/s
-    attitude: AttitudeParams
-    vertical: VerticalParams
-    path: PathParams
-    limits: Limits
-    slew: tuple[float, ...]  # largest derivatives of u_m
-    max_age_ns: int
-    hold_ns: int
-    turn_lag: float = 0.0  # s, of the turn behind the bank
-    fence: Fence | None = None
-    home: Home = Home()
-    link_timeout_ns: int = 0  # of the operator's link; 0: no limit
-    dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
-
-
-def within_reach(params: GuidanceParams, authority: Authority) -> GuidanceParams:
-    """The parameters with limits by a model learned in flight, where less than their own.
-
-    Climb and sink by the throttle, the roll rate by the aileron, by the rules of the parameters. Reversals of the bank fit into
-    the period of path following, and orbits have the radius for the bank. Without an aileron the largest bank is YAWED_BANK.
-    Without a throttle there is no climb, and the sink stays: pitch then flies the airspeed at the floor.
-    """
-    if authority == Authority():
-        return params
-    dead = tuple(name for name in ("q", "p") if getattr(authority, name) < reach.LEAST)
-    limits = params.limits
-    attitude = params.attitude
-    vertical = params.vertical
-    climb, sink = reach.climb_rates(authority.down, authority.up, params.speed)
-    vertical = vertical._replace(climb=min(vertical.climb, climb))
-    if authority.down >= reach.LEAST:
-        vertical = vertical._replace(sink=min(vertical.sink, sink))
-    rate = attitude.roll_rate
-    bank = min(limits.bank, reach.YAWED_BANK)
-    if "p" not in dead:
-        rate = min(rate, reach.roll_rate(authority.p, 4.0 * attitude.k_phi))
-        bank = limits.bank * min(1.0, params.path.period / reach.least_period(limits.bank, rate))
-    if "q" in dead:  # the airspeed flies the climb: its command moves by the bandwidth of V, 1 m/s each
-        faster = tuple(4.0 * rate if name == "V" else rate for name, rate in zip(params.outputs, params.slew, strict=True))
-        params = params._replace(slew=faster)
-    radius = limits.radius * (math.tan(0.8 * limits.bank) / math.tan(0.8 * bank))
-    return params._replace(
-        dead=dead,
-        vertical=vertical,
-        limits=limits._replace(bank=bank, radius=radius),
-        attitude=attitude._replace(roll_rate=rate),
-    )
-
-
-def reach_sentence(params: GuidanceParams, authority: Authority) -> str:
-    """The limits by a model learned in flight, as a sentence; empty where the own limits are less."""
-    now = within_reach(params, authority)
-    parts = [f"no {command}: {name} has no input with an effect" for name, command in DEAD.items() if name in now.dead]
-    if min(authority.down, authority.up) < reach.LEAST:
-        parts.append("no climb: V has no input with an effect")
-    for name, nominal, limit, unit in (
-        ("bank", math.degrees(params.limits.bank), math.degrees(now.limits.bank), "deg"),
-        ("roll rate", math.degrees(params.attitude.roll_rate), math.degrees(now.attitude.roll_rate), "deg/s"),
-        ("climb", params.vertical.climb, now.vertical.climb, "m/s"),
-        ("sink", params.vertical.sink, now.vertical.sink, "m/s"),
-    ):
-        if 0.0 < limit < nominal:
-            parts.append(f"{name} at most {limit:.2g} {unit}")
-    return ", ".join(parts)
-
-
-DEAD = {"p": "roll rate", "q": "pitch rate"}
-"""Commands that end where an output has no input with an effect."""
-
-
-class Begin(IntEnum):
-    """Whether the filters begin at what is measured."""
-
-    NO = 0
-    AGAIN = 1  # modes and commands stay (bumpless transfer)
-    HOLD = 2  # with the heading, the altitude and the airspeed of now
-
-
-class Inputs(NamedTuple):
-    """What a step takes."""
-
-    t_ns: int
-    begin: Begin
-    pose: tuple[float, ...]  # the last pose, in the order of POSE
-    pose_age_ns: int
-    y: tuple[float, ...]  # the last y, in the order of u_m
-    commands: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
-    authority: Authority = Authority()  # of the inputs, as learned in flight
-
-
-class GuidanceState(NamedTuple):
-    """State after a step."""
-
-    t_ns: int
-    mode: Mode
-    lateral: Lateral
-    vertical: Vertical
-    target: Target
-    leg: int  # of the route
-    phi: float  # attitude, by dead reckoning while pose is stale, rad
-    theta: float
-    alpha: float  # estimated angle of attack, rad
-    alpha_trim: float  # the same at the start
-    slip: float  # what a sideslip takes from a turn, m/s^2
-    climb_c: float  # m/s
-    V_c: float  # m/s
-    u_m: tuple[float, ...]
-    joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
-    wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
-    fence: float = 0.0  # action of the fence: of `fence.Escape`
-    loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
-    psi: Scalar = 0.0  # estimated heading, rad
-
-
-class Commands(NamedTuple):
-    """Results of a step beside the state, for the log."""
-
-    phi_c: float = 0.0
-    theta_c: float = 0.0
-    xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
-    to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
-    track: float = 0.0  # course of the path at the nearest point, rad
-    missed: float = 0.0  # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
-    clearance: float = LARGEST  # m, from the fence
-    predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
-    bank_limited: bool = False
-    theta_limited: bool = False
-    climb_limited: bool = False
-    V_limited: bool = False
-    slew_limited: bool = False
-
-
-def bits(names: Collection[str]) -> int:
-    """The names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
-    return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
-
-
-ANGLES = ("phi", "heading", "course", "theta", "r")
-"""Channels of Target in rad, and r in rad/s."""
-
-
-def read_target(
-    values: Mapping[str, float], params: GuidanceParams, route: Route | None, what: str = "target", *, degrees: bool = False
-) -> None:
-    """Raise ChannelError for commands of no mode or two modes, of no leg of the route, or beyond the limits.
-
-    `degrees`: the sentence has angles in degrees, as an operator types angles; else in rad.
-    """
-    lateral_modes = {LATERAL[name] for name in values if name in LATERAL}
-    vertical_modes = {VERTICAL[name] for name in values if name in VERTICAL}
-    unknown = [name for name in values if name not in TARGETS]
-    if unknown or not values:
-        raise ChannelError("name", f"{what}: found {', '.join(unknown) or 'no channel'}, expected some of {', '.join(TARGETS)}")
-    if len(lateral_modes) > 1 or len(vertical_modes) > 1:
-        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected one lateral and one vertical command at most")
-    if Lateral.ORBIT in lateral_modes and not {"north", "east", "radius"} <= set(values):
-        raise ChannelError("name", f"{what}: found {', '.join(values)}, expected north, east and radius of an orbit together")
-    for name, needed in (("r", "phi"), ("along", "leg")):
-        if name in values and needed not in values:
-            raise ChannelError("name", f"{what}: found {name} without {needed}, expected {needed} too")
-    for name, value in values.items():
-        if abs(value) > LARGEST:
-            raise ChannelError("bounds", f"{what}.{name}: found {value:g}, expected at most {LARGEST:g} either way")
-    limits = params.limits
-    vertical = params.vertical
-    for name, least, largest in (
-        ("phi", -limits.bank, limits.bank),
-        ("r", -(turn := GRAVITY * math.tan(limits.bank) / params.speed), turn),
-        ("theta", limits.least_pitch, limits.largest_pitch),
-        ("climb", -vertical.sink, vertical.climb),
-        ("altitude", limits.lowest, limits.highest),
-        ("V", limits.floor, limits.largest_speed),
-    ):
-        if name in values and not least <= values[name] <= largest:
-            factor = math.degrees(1.0) if degrees and name in ANGLES else 1.0
-            unit = ("deg" if degrees else "rad") if name in ANGLES else "m" if name == "altitude" else "m/s"
-            unit += "/s" * (name == "r")
-            entered = f"{values[name] * factor:.6g}"
-            expected = f"{least * factor:.6g} to {largest * factor:.6g} {unit}"
-            raise ChannelError("bounds", f"{what}.{name}: found {entered}, expected {expected}")
-    if "radius" in values and abs(values["radius"]) < limits.radius:
-        expected = f"at least {math.ceil(limits.radius)} m either way"
-        raise ChannelError("bounds", f"{what}.radius: found {values['radius']:g} m, expected {expected}")
-    _read_leg(values, route, what)
-
-
-def _read_leg(values: Mapping[str, float], route: Route | None, what: str) -> None:
-    """Raise ChannelError for a leg that the route does not have."""
-    if "leg" in values and route is None:
-        raise ChannelError("bounds", f"{what}.leg: found no route, expected one")
-    if "leg" in values and route is not None and values["leg"] not in range(len(route.legs)):
-        expected = f"a whole number from 0 to {len(route.legs) - 1}"
-        raise ChannelError("bounds", f"{what}.leg: found {values['leg']:g}, expected {expected}")
-    if (
-        "along" in values
-        and route is not None
-        and not 0.0 <= values["along"] <= (longest := path.length(route.legs[int(values["leg"])]))
-    ):
-        expected = f"0 to {longest:.6g} m, the length of the leg; 0 for an arc"
-        raise ChannelError("bounds", f"{what}.along: found {values['along']:g} m, expected {expected}")
-
-
-def hold(pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> dict[str, Scalar]:
-    """Commands to hold the heading, the altitude and the airspeed of now, within the limits of the airspeed."""
-    return {"heading": pose["psi"], "altitude": pose["altitude"], "V": _permitted_speed(speed, params)}
-
-
-def _permitted_speed(speed: Scalar, params: GuidanceParams) -> Scalar:
-    xp = array_namespace(speed)
-    return xp.minimum(xp.maximum(speed, params.limits.floor), params.limits.largest_speed)
-
-
-def home(pose: Mapping[str, float], params: GuidanceParams) -> dict[str, float]:
-    """Commands to orbit home clockwise on the least radius, at the altitude of home or of now."""
-    place = params.home
-    altitude = pose["altitude"] if place.altitude is None else place.altitude
-    return {"north": place.north, "east": place.east, "radius": float(math.ceil(params.limits.radius)), "altitude": altitude}
 
 
 def holding(t_ns: int, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> GuidanceState:
@@ -454,7 +153,7 @@ def step(
 
 def escaping_bank(escape: Escape, wanted: Scalar, pose: Mapping[str, Scalar], speed: Scalar, params: GuidanceParams) -> Scalar:
     """Bank by the action of the fence, rad, in place of `wanted` by the lateral mode: that of a turn, or of a course."""
-    course, ground_speed = _over_ground(pose)
+    course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
     acceleration = params.k_chi * ground_speed * turn_towards(escape.course - course)
     towards = bank_for(acceleration, path_angle(pose["climb"], speed), STEEPEST)
@@ -496,7 +195,7 @@ def command(
     V_asked = state.target.V
     if flies and "q" in params.dead:
         V_asked = V_asked + climb_speed(climb_c - pose["climb"], speed)
-    V_wanted = _permitted_speed(V_asked, params)
+    V_wanted = permitted_speed(V_asked, params)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 
     attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
@@ -625,9 +324,9 @@ def _with_commands(
     missed = 0.0
     on_route = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and not LATERAL.keys() & commands.keys()
     if on_route and route is not None:
-        state, missed = _along_route(state, pose, dt, route)
+        state, missed = along_route(state, pose, dt, route)
     if not commands:
-        return _on_profile(state, pose, route), missed
+        return on_profile(state, pose, route), missed
     if LATERAL.keys() & commands.keys():
         state = state._replace(target=state.target._replace(r=0.0))
     state = state._replace(target=state.target._replace(**commands))
@@ -636,93 +335,13 @@ def _with_commands(
     for name in commands:
         state = state._replace(lateral=LATERAL.get(name, state.lateral), vertical=VERTICAL.get(name, state.vertical))
     if "leg" in commands and route is not None:
-        state = _joining(state, int(commands["leg"]), commands.get("along", 0.0), pose, route)
+        state = joining(state, int(commands["leg"]), commands.get("along", 0.0), pose, route)
         state = state._replace(target=state.target._replace(**commands))
         named = [VERTICAL[name] for name in commands if name in VERTICAL]
         state = state._replace(vertical=named[0] if named else Vertical.PROFILE)
     if state.vertical is Vertical.PROFILE and state.lateral is not Lateral.ROUTE:
         state = state._replace(vertical=Vertical.ALTITUDE)  # that of now
-    return _on_profile(state, pose, route), missed
-
-
-def _along_route(state: GuidanceState, pose: Mapping[str, float], dt: float, route: Route) -> tuple[GuidanceState, float]:
-    """The state on the leg once the leg is joined, or on the next leg once the leg is passed; and the distance missed by, m."""
-    position = (pose["north"], pose["east"])
-    leg = route.legs[state.leg]
-    near = route.near(state.leg)
-    if state.joining:
-        start, course = route.start(state.leg, state.target.along)
-        if path.joined(start, course, near, position, _over_ground(pose)[0]):
-            state = _on_leg(state, state.leg, route)
-        return state, 0.0
-    if isinstance(leg, Arc) and leg.loiter is not None and leg.end is not None:
-        state = _loitering(state, leg, leg.loiter, pose, dt)
-        ends = _has_loitered(state, pose, route) and _leaves(leg, EXIT * _over_ground(pose)[1], pose, position)
-        return _on_leg(state, state.leg + 1, route) if ends else state, 0.0
-    if leg.end is None or not path.passed(leg, position):
-        return state, 0.0
-    distance = math.dist(leg.end, position)  # after a sharp corner, too, the next leg is joined
-    return _joining(state, state.leg + 1, 0.0, pose, route), distance if distance > near else 0.0
-
-
-def _loitering(state: GuidanceState, leg: Arc, loiter: Loiter, pose: Mapping[str, float], dt: float) -> GuidanceState:
-    """The state with the share of a loiter that is flown, from within 1 s of flight of the circle on."""
-    error, (course, ground_speed) = path.error(leg, (pose["north"], pose["east"])), _over_ground(pose)
-    if not state.loitered and abs(error.e) > ground_speed:
-        return state
-    share = dt / loiter.wait if loiter.wait else 1.0
-    if loiter.turns:
-        along = ground_speed * math.cos(course - error.track)
-        share = min(share, dt * along / (2.0 * math.pi * abs(leg.radius) * loiter.turns))
-    return state._replace(loitered=min(state.loitered + share, 1.0))
-
-
-def _has_loitered(state: GuidanceState, pose: Mapping[str, float], route: Route) -> bool:
-    return state.loitered >= 1.0 and abs(pose["altitude"] - route.altitude[state.leg]) <= LEVEL
-
-
-def _leaves(leg: Leg, reach: float, pose: Mapping[str, float], position: Point) -> bool:
-    """Whether a position is beyond the end of a circle, within `reach`, m, by an aircraft that flies the course there."""
-    return leg.end is not None and bool(path.joined(leg.end, path.end_course(leg), reach, position, _over_ground(pose)[0]))
-
-
-def _on_leg(state: GuidanceState, leg: int, route: Route) -> GuidanceState:
-    """The state on a leg of the route, with the leg's altitude and airspeed."""
-    target = state.target._replace(V=route.V[leg], along=0.0)
-    return state._replace(leg=leg, target=target, vertical=Vertical.PROFILE, joining=0.0, loitered=0.0)
-
-
-def _on_profile(state: GuidanceState, pose: Mapping[str, float], route: Route | None) -> GuidanceState:
-    """The state with the altitude and the climb rate of the leg at the nearest point, or where the aircraft joins the leg."""
-    flies = state.mode is Mode.ENGAGED and state.lateral is Lateral.ROUTE and state.vertical is Vertical.PROFILE
-    if not flies or route is None:
-        return state
-    leg = route.legs[state.leg]
-    climb = 0.0
-    if state.joining or (path.is_orbit(leg) and leg.end is not None and not state.loitered):
-        altitude = route.joining_altitude(state.leg, state.target.along)
-    else:
-        altitude, slope = route.profile(state.leg, path.nearest(leg, (pose["north"], pose["east"])))
-        if slope:
-            course = path.end_course(leg)
-            climb = slope * (pose["v_north"] * math.cos(course) + pose["v_east"] * math.sin(course))
-    return state._replace(target=state.target._replace(altitude=altitude, climb=climb))
-
-
-def _joining(state: GuidanceState, leg: int, along: float, pose: Mapping[str, float], route: Route) -> GuidanceState:
-    """The state on the way to a point of a leg, at the altitude and the airspeed there; on the leg where the point is near."""
-    state = _on_leg(state, leg, route)
-    flown = route.legs[leg]
-    if path.is_orbit(flown):  # the law of circles leads to an orbit from afar
-        return state
-    start, course = route.start(leg, along)
-    position = (pose["north"], pose["east"])
-    side = path.joining(start, course, route.radius, route.near(leg), position, _over_ground(pose)[0])
-    if isinstance(flown, Arc) and side:  # the circle of the arc itself
-        side = math.copysign(1.0, flown.radius)
-    if side and not along and route.from_V:
-        state = state._replace(target=state.target._replace(V=route.from_V[leg]))
-    return state._replace(joining=side, target=state.target._replace(along=along if side else 0.0))
+    return on_profile(state, pose, route), missed
 
 
 def _bank(
@@ -734,7 +353,7 @@ def _bank(
         return 0.0, nowhere, 0.0
     target = state.target
     gamma = path_angle(pose["climb"], speed)
-    over_ground = _over_ground(pose)
+    over_ground = course_and_speed(pose)
     if state.lateral is Lateral.PHI:
         return target.phi, nowhere, 0.0
     if state.lateral is Lateral.HEADING:
@@ -757,10 +376,10 @@ def _bank(
     error = path.error(leg, position)
     entry = error.curvature if following is None else path.error(following, leg.end or (0.0, 0.0)).curvature
     entered: Callable[[Point], Any] = partial(path.entered, leg, following)
-    if route is not None and following is not None and path.is_orbit(leg) and _has_loitered(state, pose, route):
+    if route is not None and following is not None and path.is_orbit(leg) and has_loitered(state, pose, route):
         near = route.near(state.leg)
-        late = _leaves(leg, near, pose, position) and not _leaves(leg, EXIT * over_ground[1], pose, position)
-        entered = partial(path.entered, leg, following) if late else partial(_leaves, leg, near, pose)
+        late = leaves(leg, near, pose, position) and not leaves(leg, EXIT * over_ground[1], pose, position)
+        entered = partial(path.entered, leg, following) if late else partial(leaves, leg, near, pose)
     wanted = follow(error, entry, entered, state.slip, pose, speed, params)
     return wanted, error, path.to_go(leg, position)
 
@@ -768,14 +387,6 @@ def _bank(
 def _joins(start: Point, course: Scalar, near: Scalar, flown: Scalar, position: Point) -> Any:
     """`path.joined` by the position, for `follow`."""
     return path.joined(start, course, near, position, flown)
-
-
-def _over_ground(pose: Mapping[str, Scalar]) -> tuple[Scalar, Scalar]:
-    """Course, rad, and speed over ground, m/s, at least 1."""
-    v_north = pose["v_north"]
-    v_east = pose["v_east"]
-    xp = array_namespace(v_north)
-    return xp.atan2(v_east, v_north), xp.maximum(xp.hypot(v_north, v_east), 1.0)
 
 
 def follow(
@@ -792,7 +403,7 @@ def follow(
     `entry` replaces the curvature of the leg early, by the lag of the bank: as soon as `entered` holds for the position a mean
     lag ahead. The mean lag of a change of the bank d is abs(d) / (2 p_max) + 1 / (2 k_phi): a ramp, then the loop of the bank.
     """
-    course, ground_speed = _over_ground(pose)
+    course, ground_speed = course_and_speed(pose)
     xp = array_namespace(ground_speed)
     change = xp.atan(ground_speed**2 * entry / GRAVITY) + xp.atan(ground_speed**2 * -error.curvature / GRAVITY)
     lag = abs(change) / (2.0 * params.attitude.roll_rate) + 0.5 / params.attitude.k_phi

@@ -27,7 +27,7 @@ from flight_core.rates import NANOSECONDS, nanoseconds, period_ns
 from flight_core.vectors import ChannelError, StampedVector, select
 from flight_guidance import path
 from flight_guidance.guidance import Guidance, GuidanceOutput
-from flight_guidance.modes import Mode
+from flight_guidance.guidance_state import Mode
 from flight_guidance.odometry import BODY, MAP, ROUTE_FRAMES, body_velocity, quaternion
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.reach import AUTHORITY as AUTHORITY_CHANNELS

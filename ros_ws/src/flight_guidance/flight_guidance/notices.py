@@ -12,7 +12,7 @@ from typing import NamedTuple
 from flight_core.channels import UNKNOWN
 from flight_core.vectors import Array, Scalar, array_namespace
 from flight_guidance.fence import RIGHT
-from flight_guidance.modes import LARGEST, Lateral
+from flight_guidance.guidance_state import LARGEST, Lateral
 from flight_guidance.reach import Authority
 
 DWELL = 10.0
@@ -76,7 +76,7 @@ class Notices:
     """The notices of a flight, sample by sample of the log of guidance.
 
     `wind`: guidance.wind, m/s; `max_age`: guidance.max_age, s; `largest_wind`: of the airspeed command, m/s, the wind up to
-    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s; `reach`: `modes.reach_sentence`.
+    which circles fit into the bank; `link_timeout`: guidance.home.link_timeout, s; `reach`: `targets.reach_sentence`.
     """
 
     CHANNELS = (

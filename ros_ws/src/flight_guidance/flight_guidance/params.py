@@ -29,11 +29,17 @@ from flight_guidance import protection, reach
 from flight_guidance.attitude import AttitudeParams
 from flight_guidance.feasibility import Performance, flyable, require_inside, speeds
 from flight_guidance.fence import MARGIN
+from flight_guidance.guidance_state import (
+    TARGETS,
+    GuidanceParams,
+    Home,
+    Limits,
+)
 from flight_guidance.lateral import PathParams, largest_wind, least_period, least_radius
-from flight_guidance.modes import TARGETS, GuidanceParams, Home, Limits, reach_sentence, read_target
 from flight_guidance.notices import Notices
 from flight_guidance.path import Arc, Route, is_orbit, leads
 from flight_guidance.route_file import Waypoint
+from flight_guidance.targets import reach_sentence, read_target
 from flight_guidance.vertical import VerticalParams, path_lag
 from flight_guidance.zones import Fence, Zone, clearance, described
 

@@ -23,7 +23,7 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_core.fields import short_repr
 from flight_core.parameters import ParameterError, flatten, nest
 from flight_core.rates import NANOSECONDS
-from flight_guidance.modes import TARGETS
+from flight_guidance.guidance_state import TARGETS
 from flight_view.flight import Flight
 from rise_di_controller.params import ControllerConfig
 

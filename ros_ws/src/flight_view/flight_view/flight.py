@@ -28,7 +28,7 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.text import printable
 from flight_core.vectors import FloatArray
-from flight_guidance import modes as guidance
+from flight_guidance import guidance_state
 from flight_guidance.odometry import ROUTE_FRAMES
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.route_file import Waypoint
@@ -139,7 +139,12 @@ class Flight:
         self.name = printable(run.stem if run.is_file() else run.resolve().name)
         self.samples: dict[str, Series] = {}  # by topic
         self.events: list[PageEvent] = []
-        modes = {"": Mode, "mode": guidance.Mode, "mode.lateral": guidance.Lateral, "mode.vertical": guidance.Vertical}
+        modes = {
+            "": Mode,
+            "mode": guidance_state.Mode,
+            "mode.lateral": guidance_state.Lateral,
+            "mode.vertical": guidance_state.Vertical,
+        }
         # What a page shows beside the samples, ready for JSON: the names of modes; `_described` once the scenario is read.
         self.description: dict[str, Any] = {
             "name": self.name,

@@ -108,7 +108,7 @@ if TYPE_CHECKING:  # for type checkers and completion; a test compares these imp
     from flight_design.gains.airframe_properties import airframe_facts
     from flight_design.gains.gain_design import check_gains, select_gains
     from flight_design.gains.gain_selection import GainAssessment, Selection
-    from flight_design.gains.gain_selection import as_yaml as gains_yaml
+    from flight_design.gains.gain_yaml import as_yaml as gains_yaml
     from flight_design.learning.scenario_learner import learner
     from flight_log.tape_reader import RecordedRun, read_run
     from rise_di.c_code import Exported, export

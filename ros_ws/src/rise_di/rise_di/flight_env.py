@@ -190,7 +190,7 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
     metadata = {"render_modes": [], "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as above
 
     def __init__(self, scenario: Scenario, num_envs: int, uncertainty: float = 0.3) -> None:
-        from flight_campaign import batch  # noqa: PLC0415 - JAX, a second to load
+        from flight_campaign import batch, batch_matrices  # noqa: PLC0415 - JAX, a second to load
 
         self.scenario = as_scenario(scenario)
         self.num_envs = as_count(num_envs, "num_envs", 1)
@@ -198,7 +198,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         plain = _without_models(self.scenario)
         self._course = build_course(plain)
         self._vehicle = batch.vehicle(plain)
-        self._fleet = batch
+        self._assemble = batch_matrices.assemble
+        self._stepper = batch.Stepper
         self.single_action_space, self.single_observation_space, units = _channels(self.scenario)
         self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
@@ -248,8 +249,8 @@ class FlightVectorEnv(gymnasium.vector.VectorEnv[FloatArray, FloatArray, NDArray
         seed = int(self.np_random.integers(0, 2**31))
         A, B = sampled_matrices(airframe, part, part, seed, 0, self.num_envs, aircraft.uncertainty.spread())
         directions = gust_directions(airframe, A, aircraft.uncertainty.wind)
-        drawn = self._fleet.assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
-        self._flights = self._fleet.Stepper(drawn, self._vehicle, self._course)
+        drawn = self._assemble(A, B, aircraft.plant(), self._course, gust_directions=directions)
+        self._flights = self._stepper(drawn, self._vehicle, self._course)
         self._k = 0
         self._last = self._flights.ticks - 1
         self._y, self._ended = np.zeros_like(self._y), np.zeros_like(self._ended)

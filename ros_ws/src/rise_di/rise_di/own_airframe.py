@@ -18,7 +18,7 @@ from flight_core.arguments import FilePath, as_path
 from flight_core.files import write_file, writing
 from flight_core.outcome import COMPLETED
 from flight_core.parameters import ParameterError, require
-from flight_design.gains import first_flight, gain_selection
+from flight_design.gains import first_flight, gain_yaml
 from flight_design.gains.gain_design import lags_by_input, select_gains
 
 SIZES = (1.0, 0.5, 0.25, 0.125)  # of the commands: the first that flies clear of the end stops
@@ -110,7 +110,7 @@ def _flying(airframe: Airframe, trial: Path, files: tuple[Path, Path], lag: Sequ
             return first_flight.scenario_text(airframe, str(path), str(files[1]), section, lag, size)
 
         selection = select_gains(trial, _parsed(text(trial, controller), files[1]), inputs=inputs, samples=SAMPLES)
-        section = gain_selection.as_yaml(selection)
+        section = gain_yaml.as_yaml(selection)
         flown = _parsed(text(trial, section), files[1])
         tape = simulate(flown)
         stops = zip(airframe.inputs, flown.aircraft.actuators.upper, strict=True)

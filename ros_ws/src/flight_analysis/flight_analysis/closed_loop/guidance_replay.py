@@ -13,7 +13,7 @@ from flight_core.parameters import ParameterError
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance import guidance, modes
-from flight_guidance.modes import Begin, GuidanceState, Lateral
+from flight_guidance.guidance_state import Begin, GuidanceState, Lateral
 from flight_guidance.notices import LINK_AGE
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route

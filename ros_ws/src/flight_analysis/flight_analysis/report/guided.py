@@ -14,7 +14,13 @@ from flight_analysis.metrics import SETTLING_DWELL, error_metrics, sample_times,
 from flight_core.tape import Tape
 from flight_core.vectors import FloatArray
 from flight_guidance.guidance import WIND
-from flight_guidance.modes import LATERAL, TARGETS, Lateral, Vertical, bits
+from flight_guidance.guidance_state import (
+    LATERAL,
+    TARGETS,
+    Lateral,
+    Vertical,
+    bits,
+)
 from flight_guidance.notices import LINK_AGE, Notice, has_channels
 from flight_guidance.params import GuidanceConfig
 from flight_guidance.path import Route, leg_places, lengths_after, route_outline

@@ -10,7 +10,7 @@ import numpy as np
 from aircraft_sim.airframe import Airframe
 from flight_core.parameters import require
 from flight_core.units import ANGLE, ANGULAR_RATE, GRAVITY, SPEED, quantity
-from flight_design.gains import gain_selection
+from flight_design.gains import gain_yaml
 from flight_design.gains.effectors import Effectors, LawInputs, design_allocation
 from rise_di_controller.decomposition import search
 from rise_di_controller.params import AllocationConfig
@@ -29,7 +29,7 @@ RATE = 200.0  # Hz, of y and y_m
 FASTEST = {"q": 3.0, "p": 4.0, "r": 2.0, "V": 1.2}  # rad/s, natural frequency of the reference model at most
 LAG_PRODUCT = 0.18  # 1, natural frequency times the lag of the input at most
 
-SCENARIO_YAML = gain_selection.yaml_template("""\
+SCENARIO_YAML = gain_yaml.yaml_template("""\
 # The airframe {{ airframe.name }} at {{ airframe.speed | digits(6) }} m/s: commands on every channel, servos, noise\
 {{ ", gusts" if gusts }}.
 # Lags, end stops, rates and noise are assumed: put those of your aircraft here, then select the gains again:
@@ -209,7 +209,7 @@ def placeholder(airframe: Airframe, lag: Sequence[float]) -> str:
         "ramp": 2.0,
         **({} if allocation is None else {"allocation": allocation}),
     }
-    lines = [f"    {key}: {gain_selection.yaml_flow(value, 10)}" for key, value in values.items()]
+    lines = [f"    {key}: {gain_yaml.yaml_flow(value, 10)}" for key, value in values.items()]
     return "\n".join(["/**/controller:", "  ros__parameters:", *lines, ""])
 
 

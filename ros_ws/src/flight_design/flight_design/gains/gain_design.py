@@ -14,9 +14,10 @@ from flight_analysis.closed_loop.scenario import Scenario
 from flight_analysis.closed_loop.scenario_library import find_scenario
 from flight_core.arguments import FilePath, as_count, as_names, as_number, as_numbers
 from flight_core.parameters import require
-from flight_design.gains import gain_selection, tuned_gains
+from flight_design.gains import gain_selection, ideal_control, tuned_gains
 from flight_design.gains.effectors import LAW_INPUT, Effectors, design_allocation
-from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection, Study
+from flight_design.gains.gain_selection import GainAssessment, LoopSetting, Selection
+from flight_design.gains.ideal_control import Study
 from flight_design.gains.nominal import sizes
 from flight_design.gains.observer_selection import (
     gains_beside_sketch,
@@ -155,9 +156,9 @@ def check_gains(
 
 def study(airframe: Airframe, scenario: Scenario, uncertainty: float, samples: int, seed: int) -> Study:
     """The airframe, and uncertain airframes around it, along the commands and gusts of a scenario. Raises ParameterError."""
-    return gain_selection.study_airframe(
+    return ideal_control.study_airframe(
         airframe,
-        gain_selection.manoeuvre(scenario, airframe),
+        ideal_control.manoeuvre(scenario, airframe),
         as_number(uncertainty, "uncertainty", 0.0, 1.0),
         as_count(samples, "samples", 0, MAX_SAMPLES),
         as_count(seed, "seed", 0),

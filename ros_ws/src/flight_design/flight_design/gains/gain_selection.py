@@ -7,24 +7,16 @@
 scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as the section of a scenario file.
 """
 
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from jinja2 import Environment, StrictUndefined, Template
 from numpy.typing import NDArray
 
-from aircraft_sim import dynamics
 from aircraft_sim.airframe import Airframe
-from aircraft_sim.disturbance import Gusts
-from aircraft_sim.dynamics import Aircraft
-from aircraft_sim.params import Gust
-from aircraft_sim.uncertainty import nominal_and_sampled
 from flight_analysis.closed_loop.loop_margins import (
     LoopMargins,
     is_literal,
@@ -34,15 +26,11 @@ from flight_analysis.closed_loop.loop_margins import (
     loop_of,
 )
 from flight_analysis.closed_loop.scenario import Scenario
-from flight_core.arguments import as_instance
-from flight_core.files import parse_yaml
-from flight_core.integrators import rk4
 from flight_core.parameters import LARGEST, ParameterError, require
-from flight_core.text import printable
-from flight_core.vectors import Array, FloatArray
+from flight_core.vectors import FloatArray
 from flight_design.gains import gain_conditions
-from flight_design.gains.airframe_properties import invariant_zeros, output_coordinates
 from flight_design.gains.gain_conditions import Bounds, Condition, GainSet
+from flight_design.gains.ideal_control import ChannelPairing, Study
 from flight_design.gains.lyapunov import KnownPlant, decay_matrix
 from flight_design.gains.requirement import NAMES as REQUIRED
 from flight_design.gains.requirement import (
@@ -53,14 +41,10 @@ from flight_design.gains.requirement import (
     conditions,
     within_requirement,
 )
-from reference_model import model
-from reference_model.command import command
-from reference_model.params import ReferenceModelConfig
 from rise_di_controller.decomposition import MANY, DecompositionError, coupling, search, signs
-from rise_di_controller.feedforward import ZERO_REAL_PART
 from rise_di_controller.law import Sign
 from rise_di_controller.linear_loop import Loop, is_stable
-from rise_di_controller.params import AllocationConfig, ControllerConfig, FeedforwardConfig, ObserverConfig, VanesConfig
+from rise_di_controller.params import ControllerConfig, FeedforwardConfig
 from rise_di_controller.rise_di_config import RiseDiConfig
 
 CROSSOVER_LAG_PRODUCTS: Mapping[str, float] = {"q": 0.63, "p": 0.63, "r": 0.46, "V": 0.46, "climb": 0.46}
@@ -81,8 +65,6 @@ MAX_COUPLING = 10.0
 swapped, 13.6 on the first edition's Aerosonde, which neither procedure stabilises behind servos, and at most 2.2 on the other
 airframes of the library."""
 
-STEP = 0.01
-"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to 1e-6 of their size."""
 
 INPUT_LIMITS = ("lower", "upper", "slew")  # limits of the controller, one an input. They are reordered with the inputs.
 
@@ -92,21 +74,6 @@ SPEED_STEP = 0.05
 MAX_SPEED_RATIO = 3.0
 
 Controller = TypeVar("Controller", bound=ControllerConfig)
-
-
-class Manoeuvre(NamedTuple):
-    """The commands and gusts that the gains are selected for."""
-
-    reference: ReferenceModelConfig
-    gusts: dict[str, Gust]
-    duration: float  # s
-
-
-class ChannelPairing(NamedTuple):
-    """Outputs and inputs in the law's order, output i paired with input i."""
-
-    outputs: tuple[str, ...]
-    inputs: tuple[str, ...]
 
 
 class LoopSetting(NamedTuple):
@@ -123,26 +90,6 @@ class LoopSetting(NamedTuple):
     inputs: tuple[str, ...] = ()  # input of each output, in the airframe's order; empty: the airframe's pairing
     feedforward: bool = False  # whether the result has the published airframe as model of a feedforward
     requirement: Requirement = Requirement()
-
-
-class Study(NamedTuple):
-    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's order, SI."""
-
-    airframe: Airframe
-    A: FloatArray  # (N, n, n)
-    B: FloatArray  # (N, n, m)
-    C: FloatArray  # (m, n)
-    gravity: FloatArray  # (n, n), the Jacobian of f at trim
-    u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
-    slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
-    slew_undisturbed: FloatArray  # (m,) the same without gusts
-    stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
-    uncertainty: float
-
-    @property
-    def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
-        """Omega = C B of the nominal airframe, shape (m, m), SI."""
-        return np.asarray(self.C @ self.B[0])
 
 
 class GainAssessment(NamedTuple, Generic[Controller]):
@@ -203,141 +150,6 @@ class Selection:
 
 
 # The manoeuvre and the ideal control along it
-
-
-def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
-    """The commands and gusts of a scenario for the channels and gust axes that an airframe has.
-
-    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed. Raises ParameterError for an
-    output without command in the scenario.
-    """
-    commands = scenario.reference_model
-    for name in airframe.outputs:
-        require(
-            name in commands.outputs,
-            f"{scenario.name}: reference_model.outputs",
-            ", ".join(commands.outputs),
-            f"{name} too: --scenario has them",
-        )
-    values = commands.model_dump(exclude_none=True)
-    if set(airframe.outputs) != set(commands.outputs):
-        require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
-        rows = [commands.outputs.index(name) for name in airframe.outputs]
-        values["outputs"] = airframe.outputs
-        for key, row in values["second_order"].items():
-            values["second_order"][key] = [row[i] for i in rows]
-        for key in ("pulses", "sines"):
-            values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
-    turn = commands.coordinated_turn
-    if turn is not None:
-        present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs) and airframe.speed > 0.0
-        values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
-    gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
-    reference = ReferenceModelConfig.validate_mapping(values, "reference_model")
-    return Manoeuvre(reference, gusts, scenario.flight.duration)
-
-
-def study_airframe(
-    airframe: Airframe, manoeuvre: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1
-) -> Study:
-    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
-
-    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs (`output_coordinates`):
-
-        eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
-        u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
-        u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
-
-    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are differences, central and over
-    1e-5 s. f is that of the nominal airframe. Raises ParameterError if Omega is singular or if the nominal airframe has a zero
-    in the right half plane: then Assumption 3 does not hold.
-    """
-    A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
-    zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
-    stable = np.array(zeros) <= ZERO_REAL_PART
-    require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
-    # The last column is the nominal airframe without gusts: their speed is 0 there.
-    A = np.concatenate([A, A[:1]])
-    B = np.concatenate([B, B[:1]])
-    aircraft = _columns(airframe, manoeuvre.gusts, len(A))
-    C = airframe.matrix_c()
-    n = len(airframe.states)
-    m = len(airframe.outputs)
-    P, N, H = output_coordinates(C)
-    Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
-    require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
-    inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
-    project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
-    follow = H.T @ B @ inverse
-    y_m, y_m_dot, y_m_ddot = _references(manoeuvre, airframe)
-
-    def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
-
-    def state(k: int, eta: FloatArray) -> FloatArray:
-        return np.asarray((P @ y_m[k])[:, None] + N @ eta)
-
-    def drift(t: Any, x: FloatArray) -> FloatArray:
-        return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
-
-    def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
-        k = round(2.0 * t / STEP)
-        return times(project, drift(t, state(k, eta))) + (follow @ y_m_dot[k]).T
-
-    steps = (len(y_m) - 1) // 2
-    eta = np.zeros((n - m, len(A)))
-    u_dot = np.zeros((steps + 1, len(A), m))
-    near = 1e-5
-    for k in range(steps + 1):
-        t = k * STEP
-        x = state(2 * k, eta)
-        free = drift(t, x)
-        u = times(inverse, np.asarray(y_m_dot[2 * k][:, None] - C @ free, dtype=np.float64))
-        x_dot = free + times(B, u)
-        ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
-        drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
-        u_dot[k] = times(inverse, y_m_ddot[2 * k][:, None] - C @ drift_dot).T
-        if k < steps and n > m:
-            eta = rk4(eta_dot, t, eta, None, None, STEP)
-    undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
-    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)
-
-
-def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
-    matrices = manoeuvre.reference.model()
-    profile = manoeuvre.reference.profile()
-    near = 1e-5
-    step = model.stepper(STEP / 2.0, matrices)
-    t = STEP / 2.0 * np.arange(2 * round(manoeuvre.duration / STEP) + 1)
-    u_m = command(t, profile)
-    half_later = command(t + STEP / 4.0, profile)
-    u_m_dot = (command(t + near, profile) - command(t - near, profile)) / (2.0 * near)
-    x = np.zeros((len(t), len(matrices.A_m)))
-    for k, stages in enumerate(np.concatenate([u_m[:-1], half_later[:-1], u_m[1:]], axis=1)):
-        x[k + 1] = model.step(x[k], stages, step)
-    x_dot = model.x_m_dot(t, x.T, u_m.T, matrices)
-    x_ddot = model.x_m_dot(t, x_dot, u_m_dot.T, matrices)  # (2) differentiated
-    places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
-    y_m, y_m_dot, y_m_ddot = (model.output(z, matrices)[places].T for z in (x.T, x_dot, x_ddot))
-    return y_m, y_m_dot, y_m_ddot
-
-
-def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
-    """The aircraft with f for states in columns, shape (n, columns), the last column without gusts."""
-    gust_on = np.append(np.ones(columns - 1), 0.0)
-    profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(-1, 3)
-    start, speed, length = np.split(profiles, 3, axis=1)
-    directions = [airframe.gust_direction(name) for name in gusts]
-    return Aircraft(
-        airframe.matrix_a(),
-        airframe.matrix_b(),
-        airframe.matrix_c(),
-        airframe.matrix_gravity(),
-        np.reshape(directions, (len(gusts), len(airframe.states))).T,
-        Gusts(start, speed * gust_on, length),
-        np.array(airframe.speed),
-    )
 
 
 # Signs and pairing
@@ -642,207 +454,3 @@ def _by_name(values: Mapping[str, float], names: Sequence[str], default: float) 
 
 
 # YAML
-
-
-PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./:-]*")  # a string that needs no quotes, unless it is a word such as true
-
-
-def yaml_flow(value: Any, precision: int = 6) -> str:
-    """A value in YAML's flow style. Floats have six digits and always a point, which YAML 1.1 requires of a float."""
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(yaml_flow(entry, precision) for entry in value)}]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key}: {yaml_flow(entry, precision)}" for key, entry in value.items()) + "}"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        digits, mark, exponent = f"{value:.{precision}g}".partition("e")
-        return (digits if "." in digits else digits + ".0") + mark + exponent
-    if isinstance(value, str) and not (PLAIN.fullmatch(value) and parse_yaml(value, "", "") == value):
-        return json.dumps(value, ensure_ascii=False)  # which is YAML too
-    return str(value)
-
-
-def yaml_template(text: str) -> Template:
-    """A template of a YAML file.
-
-    "{{ value | flow }}" is `yaml_flow`, "| digits(3)" a number with three digits, "| line" a text without a line end.
-    """
-    environment = Environment(trim_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined, autoescape=False)  # noqa: S701 - no HTML
-    environment.filters["flow"] = yaml_flow
-    environment.filters["line"] = printable
-    environment.filters["digits"] = lambda value, count: f"{value:.{count}g}"
-    return environment.from_string(text)
-
-
-CONTROLLER_YAML = yaml_template("""\
-{% macro listed(keys, indent) %}
-{% for key, rows in keys.items() %}
-{{ " " * indent }}{{ key }}:
-{%- if rows is mapping %}
-
-{{ listed(rows, indent + 2) }}
-{%- else %} {{ rows if rows is string else "[" ~ rows | join(",\n" ~ " " * (indent + 3 + key | length)) ~ "]" }}
-{% endif %}
-{% endfor %}
-{% endmacro %}
-# Gains for the airframe {{ airframe }} {{ origin }}.
-{%- if delay_margin is not none %} Predicted delay margin {{ "%.0f" | format(1e3 * delay_margin) }} ms.{% endif %}
-{%- if margins %}
-
-# {{ margins }}
-{%- endif %}
-
-/**/controller:
-  ros__parameters:
-{% for key, value, comment in parameters %}
-    {{ key }}: {{ value | flow }}{{ "  # " ~ comment if comment }}
-{% endfor %}
-{% for name, (comment, keys) in sections.items() %}
-    {{ name }}:  # an extension of the paper: {{ comment }}
-{{ listed(keys, 6) }}
-{%- endfor %}
-""")
-
-
-def _listed(values: FloatArray) -> str:
-    return ", ".join(f"{value:.3g}" for value in values)
-
-
-def as_yaml(selection: Selection, *, theorem: bool = False) -> str:
-    """The engineering gain set as the section `/**/controller` of a scenario file, with units and reasons in comments.
-
-    With `theorem` the gain set of Theorem 1 in place of the engineering gains.
-    """
-    as_instance(selection, Selection, "selection", "a Selection, as select_gains returns one")
-    assessed = selection.theorem if theorem else selection.engineering
-    controller = assessed.controller
-    study = selection.study
-    params = controller.law_params()
-    _, columns = law_order(study.airframe, controller)
-    responses = response(study, controller)
-    K = _listed(params.K)
-    bandwidth = _listed(params.K * responses)
-    slew = _listed(study.slew[columns] / params.input_scale)
-    comments = {
-        "rate": "Hz",
-        "outputs": "the fastest first: the last one has the smallest gain, as (22) has it",
-        "inputs": "",
-        "k_g": f"1/s; K = ({K}) by (22), bandwidths ({bandwidth}) rad/s",
-        "k_d": "1/s",
-        "Lambda": "1/s, a quarter of the bandwidths, or less for the phase margin",
-        "beta": f"units of y / s^2; {selection.setting.factor:g} x the ideal control's slew ({slew}), within 0.7 x rate limit",
-        "D": "signs of the leading minors of C B",
-        "input_scale": f"units of u s / units of y: {_shown_response(responses)} / abs(Omega_ii), Omega = C B",
-        "omega": f"abs(Omega_ii) in scaled inputs, the largest within +-{100 * study.uncertainty:g} %",
-        "sign": controller.sampled_sign()[0].name.lower() + " with this lag and delay",
-        "lag": "s, actuators",
-        "delay": "s, beyond sampling",
-        "softening": "1, width of the softened sign in total lags: wider for the phase margin",
-    }
-    if theorem:
-        comments |= {"Lambda": "1/s", "beta": "units of y / s^2; the least of (29) and (30)"}
-    has_observer = controller.observer is not None and controller.observer.part > 0.0  # else the observer of a learner, later
-    if has_observer:
-        unscaled = "units of u s / units of y; for a K of (22) that is above 1"
-        comments |= {
-            "Lambda": "1/s",
-            "beta": "units of y / s^2",
-            "omega": "abs(Omega_ii) in scaled inputs",
-            "input_scale": unscaled,
-        }
-    origin = "by Theorem 1" if theorem else "beside an observer" if has_observer else "by the engineering procedure"
-    return section_yaml(controller, study.airframe, assessed.margins, origin, comments)
-
-
-def section_yaml(
-    controller: ControllerConfig, airframe: Airframe, margins: LoopMargins | None, origin: str, comments: Mapping[str, str]
-) -> str:
-    """A controller as the section `/**/controller` of a scenario file; the description of a parameter without a comment."""
-    parameters = [
-        (key, value, comments.get(key, type(controller).model_fields[key].description))
-        for key, value in controller.model_dump(
-            exclude_defaults=True, exclude={"allocation", "feedforward", "observer", "schedule", "learn"}
-        ).items()
-    ]
-    return CONTROLLER_YAML.render(
-        airframe=airframe.name,
-        origin=origin,
-        delay_margin=None if margins is None else margins.delay,
-        margins=margins_sentence(controller, margins),
-        parameters=parameters,
-        sections=_sections(controller, airframe),
-    )
-
-
-def margins_sentence(controller: ControllerConfig, margins: LoopMargins | None) -> str:
-    """The margins of a loop in a sentence: nominal and worst phase margins; "" without a softened sign, or unstable."""
-    implicit = isinstance(controller, RiseDiConfig) and controller.sampled_sign()[0] is Sign.IMPLICIT
-    if margins is None or implicit or not margins.nominal.stable:
-        return ""
-    each = zip(margins.inputs, np.degrees(margins.nominal.phase).tolist(), strict=True)
-    phases = ", ".join(f"{name} {phase:.0f}" for name, phase in each)
-    largest = float(margins.nominal.sensitivity.max())
-    damping = float(margins.nominal.damping)
-    worst = "" if margins.worst is None else f"; worst of {margins.aircraft} {np.degrees(margins.worst.phase.min()):.0f} deg"
-    return f"Phase margins {phases} deg{worst}; largest sensitivity {largest:.2f}, damping {damping:.2f}."
-
-
-def _shown_response(responses: FloatArray) -> str:
-    """The factors of 1 / abs(Omega_ii): 1, or less in a channel that is too slow for a K of (22)."""
-    factors = [f"{value:.3g}" for value in responses]
-    return "1" if set(factors) == {"1"} else f"({', '.join(factors)})"
-
-
-def _sections(controller: ControllerConfig, airframe: Airframe) -> dict[str, tuple[str, dict[str, Any]]]:
-    """The sections allocation, feedforward and observer, if any: a comment, and each parameter in flow style."""
-    along = f"the input of {airframe.name} along y_m is added; SI, a line a state, lead in s"
-    corrects = "estimates correct the trim; SI, a line an estimate, of F a line an input; within, fade, margin in s"
-    distributes = "u = T v, v = effect u; SI, of T a line an effector, of effect a line an input of the law"
-    comments = {"allocation": distributes, "feedforward": along, "observer": corrects}
-    sections = {
-        name: (comment, _matrix_rows(section, len(controller.inputs)))
-        for name, comment in comments.items()
-        if (section := getattr(controller, name)) is not None
-    }
-    if isinstance(controller, RiseDiConfig) and (schedule := controller.schedule) is not None:
-        rows: dict[str, str | list[str]] = {"speed": yaml_flow(schedule.speed), "time": yaml_flow(schedule.time)}
-        for name, model in (("slow", schedule.slow), ("fast", schedule.fast)):
-            if model is not None:
-                values = (f"{key}: {yaml_flow(value, 10)}" for key, value in model.model_dump(exclude_none=True).items())
-                rows[name] = "{" + ",\n             ".join(values) + "}"
-        sections["schedule"] = ("input_scale, and the models of the sections above, follow the airspeed; m/s, s", rows)
-    if isinstance(controller, RiseDiConfig) and controller.learn is not None:
-        settings = controller.learn.model_dump(exclude_none=True)
-        rows = {key: yaml_flow(value) for key, value in settings.items()}
-        sections["learn"] = ("A and B are identified in flight, and feedforward and observer designed again; s", rows)
-    return sections
-
-
-def _columns_of(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, int]:
-    """The columns of each matrix of a section."""
-    if isinstance(section, VanesConfig):
-        return {"H": len(section.H) // len(section.channels), "L": m + 1}
-    if isinstance(section, AllocationConfig):
-        return {"T": m, "effect": len(section.effectors)}
-    n = len(section.states)
-    if isinstance(section, FeedforwardConfig):
-        return {"A": n, "B": m, "gravity": n}
-    return {"Phi": n, "Gamma": m, "L": m, "F": n}
-
-
-def _matrix_rows(section: AllocationConfig | FeedforwardConfig | ObserverConfig | VanesConfig, m: int) -> dict[str, Any]:
-    """Entries of each parameter in flow style, a matrix in rows; ten digits in an allocation and an observer."""
-    rows: dict[str, Any] = {}
-    columns_of = _columns_of(section, m)
-    for key, value in section.model_dump(exclude_none=True).items():
-        if isinstance(value, dict):
-            rows[key] = _matrix_rows(getattr(section, key), m)
-            continue
-        if not isinstance(value, tuple):
-            rows[key] = yaml_flow(value)
-            continue
-        columns = columns_of.get(key, len(value))
-        digits = 6 if isinstance(section, FeedforwardConfig) else 10
-        rows[key] = [yaml_flow(value[i : i + columns], digits)[1:-1] for i in range(0, len(value), columns)]
-    return rows

@@ -22,7 +22,6 @@ from aircraft_sim.turbulence import MODERATE, dryden
 from aircraft_sim.uncertainty import nominal_and_sampled
 from control_laws.nominal_model import NominalModel
 from control_laws.observer_design import (
-    ExtendedStateWeights,
     Names,
     ObserverDesign,
     ObserverModel,
@@ -36,6 +35,7 @@ from control_laws.observer_design import (
 from flight_analysis.closed_loop.loop_margins import law_order, loop_of
 from flight_core.parameters import ParameterError, require
 from flight_core.vectors import FloatArray
+from flight_design.gains.extended_state import extended_state_weights, integrator_model
 from flight_design.gains.gain_conditions import MIN_K, Condition, failing
 from flight_design.gains.gain_selection import with_feedforward
 from flight_design.gains.nominal import nominal_model
@@ -274,34 +274,6 @@ class AtSpeed(NamedTuple):
             "input_scale": tuple((np.array(controller.input_scale) * self.scale).tolist()),
         }
         return controller.model_copy(update=changed)
-
-
-EXTENDED_STATE_PRODUCTS: Mapping[str, tuple[float, ...]] = {
-    "q": (0.183, 0.0077, 0.665, 0.256),
-    "p": (0.603, 0.0102, 1.02, 0.098),
-    "r": (0.714, 0.0242, 0.098, 0.161),
-    "V": (1.31, 0.0242, 0.184, 0.667),
-}
-"""effort / T, drift T, rate_drift T and decay T with the total lag T, by output. They are those of a search on the `osprey`,
-T = 0.035 s and 0.115 s in V, with the cost of gusts and turbulence together: no other aircraft was in it."""
-
-DEFAULT_PRODUCTS = EXTENDED_STATE_PRODUCTS["p"]  # for an output that is not in EXTENDED_STATE_PRODUCTS
-
-
-def extended_state_weights(outputs: tuple[str, ...], T: FloatArray) -> ExtendedStateWeights:
-    """Weights of an extended-state observer from the total lags of the loop, (m,), s, by EXTENDED_STATE_PRODUCTS."""
-    products = np.array([EXTENDED_STATE_PRODUCTS.get(name, DEFAULT_PRODUCTS) for name in outputs]).T
-    return ExtendedStateWeights(products[0] * T, *(products[1:] / T))
-
-
-def integrator_model(controller: ControllerConfig, Omega: FloatArray) -> FeedforwardConfig:
-    """The model y_dot = Omega u of a feedforward, Omega (m, m) in the law's order; lead = lag + delay + half a period."""
-    return FeedforwardConfig(
-        states=controller.outputs,
-        A=(0.0,) * Omega.size,
-        B=tuple(Omega.ravel().tolist()),
-        lead=tuple(lag + controller.delay + 0.5 / controller.rate for lag in controller.lag),
-    )
 
 
 def with_extended_state_observer(

@@ -10,7 +10,8 @@ import numpy as np
 
 from flight_analysis.closed_loop.loop_margins import LinearLoop, law_order, linear_loop
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_selection import STEP, Selection, Study, select_gains
+from flight_design.gains.gain_selection import Selection, select_gains
+from flight_design.gains.ideal_control import STEP, Study
 from rise_di_controller.linear_loop import closed_loop, zero_order_hold
 
 TRADED_PHASE_MARGINS = (30.0, 40.0, 45.0, 60.0)  # deg

@@ -25,9 +25,10 @@ from flight_core.rates import NANOSECONDS
 from flight_core.tape import Signal, Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_design.gains import gain_selection
+from flight_design.gains import gain_selection, gain_yaml, ideal_control
 from flight_design.gains.gain_conditions import bandwidths
-from flight_design.gains.gain_selection import ChannelPairing, LoopSetting, Manoeuvre
+from flight_design.gains.gain_selection import LoopSetting
+from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre
 from flight_design.gains.requirement import REQUIREMENT, Candidate, Requirement, unmet, within_requirement
 from flight_design.identification.open_loop_fit import ChannelModel, fit_channel
 from flight_design.identification.response_identification import MIN_RATIO, Response, Spans
@@ -300,13 +301,13 @@ def flying_scenario(
 
     airframe = airframe_yaml(channel_map, pairing, channels, speed, "identified in flight")
     frame = Airframe.validate_mapping(yaml.safe_load(airframe), "airframe")
-    slew = gain_selection.study_airframe(frame, manoeuvre, samples=1).slew
+    slew = ideal_control.study_airframe(frame, manoeuvre, samples=1).slew
     none = channels._replace(damping=0.0 * channels.damping, stiffness=0.0 * channels.stiffness, zero=0.0 * channels.zero)
     integrators = Airframe.validate_mapping(
         yaml.safe_load(airframe_yaml(channel_map, pairing, none, speed, "none")), "airframe"
     )
     # the literal gain set alone needs more of the manoeuvre than the slew, and it is not used
-    studied = gain_selection.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
+    studied = ideal_control.study_airframe(integrators, manoeuvre._replace(duration=1.0), samples=1)
     studied = studied._replace(slew=np.maximum(slew, range_rate))
     setting = LoopSetting(base, RATE, lag, delay, {}, crossover_lag_products=products, requirement=needed)
     selection = gain_selection.select_gains(studied, setting)
@@ -315,7 +316,7 @@ def flying_scenario(
     model = airframe_yaml(channel_map, pairing, turning, speed, "identified in flight, without sideslip")
     flown = gain_selection.with_feedforward(flown, Airframe.validate_mapping(yaml.safe_load(model), "airframe"))
     heading = f"The aircraft behind the map {channel_map.name}, with gains from its identified response."
-    heading += f"\n# {gain_selection.margins_sentence(flown, margins)}"
+    heading += f"\n# {gain_yaml.margins_sentence(flown, margins)}"
     text = scenario_text(heading, airframe_file, manoeuvre.duration, commands, flown.model_dump(exclude_defaults=True))
     lacking = "" if margins is None else unmet(margins, needed, flown.outputs)
     return Flyable(flown, None if margins is None else margins.delay, lacking, airframe, text)

@@ -21,7 +21,7 @@ from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.files import comment
 from flight_core.parameters import require
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import (
     LEVELS,
     TRANSIENT,

@@ -30,8 +30,9 @@ from flight_core.rates import divide, nanoseconds
 from flight_core.tape import Tape
 from flight_core.units import GRAVITY
 from flight_core.vectors import FloatArray
-from flight_design.gains import gain_selection
-from flight_design.gains.gain_selection import ChannelPairing, LoopSetting, Manoeuvre, Selection, Study
+from flight_design.gains import gain_selection, gain_yaml, ideal_control
+from flight_design.gains.gain_selection import LoopSetting, Selection
+from flight_design.gains.ideal_control import ChannelPairing, Manoeuvre, Study
 from flight_design.gains.nominal import sizes
 from flight_design.gains.observer_selection import (
     gains_beside_sketch,
@@ -441,7 +442,7 @@ def _study(condition: FlightCondition, Omega: FloatArray, commands: Mapping[str,
         f"airframe {condition.title}",
     )
     manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, DURATION)
-    return gain_selection.study_airframe(airframe, manoeuvre, samples=SAMPLES)
+    return ideal_control.study_airframe(airframe, manoeuvre, samples=SAMPLES)
 
 
 def airspeed_bandwidth(authority: float, lag: float) -> float:
@@ -486,7 +487,7 @@ def _load(text: str) -> Scenario:
     return parse_scenario(text.encode(), Path("identified.yaml"))
 
 
-SCENARIO_YAML = gain_selection.yaml_template("""\
+SCENARIO_YAML = gain_yaml.yaml_template("""\
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
 #
@@ -594,5 +595,5 @@ def _text(
             "heading": {"start": [TURN_START], "value": [TURN]},
             "altitude": {"start": [CLIMB_START], "value": [condition.altitude + CLIMB]},
         },
-        controller=gain_selection.as_yaml(selection),
+        controller=gain_yaml.as_yaml(selection),
     )

@@ -20,7 +20,7 @@ from flight_analysis.closed_loop.learning_loop import Entry, LearnerResult
 from flight_core.parameters import ParameterError, require
 from flight_core.rates import nanoseconds, seconds
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.innovation_filters import DRIFT, TRANSIENT, Actuation, Recording
 from flight_design.identification.likelihood import HELD_OUT, KNOWN, MAX_DELAY_ERROR, PRIOR, Unknown
 from flight_design.identification.model_identification import Identification, Part, identify, with_entries

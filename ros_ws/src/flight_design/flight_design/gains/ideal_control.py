@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An airframe along a manoeuvre: the ideal control of the published airframe and of uncertain ones."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aircraft_sim import dynamics
+from aircraft_sim.airframe import Airframe
+from aircraft_sim.disturbance import Gusts
+from aircraft_sim.dynamics import Aircraft
+from aircraft_sim.sections import Gust
+from aircraft_sim.uncertainty import nominal_and_sampled
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.integrators import rk4
+from flight_core.parameters import require
+from flight_core.vectors import Array, FloatArray
+from flight_design.gains.airframe_properties import invariant_zeros, output_coordinates
+from reference_model import model
+from reference_model.command import command
+from reference_model.params import ReferenceModelConfig
+from rise_di_controller.feedforward import ZERO_REAL_PART
+
+STEP = 0.01
+"""s, step of the ideal control. It resolves a gust of one second and hidden modes up to 10 1/s to 1e-6 of their size."""
+
+
+class Manoeuvre(NamedTuple):
+    """The commands and gusts that the gains are selected for."""
+
+    reference: ReferenceModelConfig
+    gusts: dict[str, Gust]
+    duration: float  # s
+
+
+class ChannelPairing(NamedTuple):
+    """Outputs and inputs in the law's order, output i paired with input i."""
+
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+
+
+class Study(NamedTuple):
+    """An airframe along a manoeuvre: the nominal one first, then N - 1 uncertain ones; airframe's order, SI."""
+
+    airframe: Airframe
+    A: FloatArray  # (N, n, n)
+    B: FloatArray  # (N, n, m)
+    C: FloatArray  # (m, n)
+    gravity: FloatArray  # (n, n), the Jacobian of f at trim
+    u_dot: FloatArray  # (T, N, m) rate of the ideal control, units of u / s
+    slew: FloatArray  # (m,) largest abs(u_dot) of the nominal airframe
+    slew_undisturbed: FloatArray  # (m,) the same without gusts
+    stable: NDArray[np.bool_]  # (N,) whether no zero lies in the right half plane
+    uncertainty: float
+
+    @property
+    def Omega(self) -> FloatArray:  # noqa: N802 - the paper's name
+        """Omega = C B of the nominal airframe, shape (m, m), SI."""
+        return np.asarray(self.C @ self.B[0])
+
+
+def manoeuvre(scenario: Scenario, airframe: Airframe) -> Manoeuvre:
+    """The commands and gusts of a scenario for the channels and gust axes that an airframe has.
+
+    A coordinated turn stays if the airframe has both of its channels, at the airframe's own speed. Raises ParameterError for an
+    output without command in the scenario.
+    """
+    commands = scenario.reference_model
+    for name in airframe.outputs:
+        require(
+            name in commands.outputs,
+            f"{scenario.name}: reference_model.outputs",
+            ", ".join(commands.outputs),
+            f"{name} too: --scenario has them",
+        )
+    values = commands.model_dump(exclude_none=True)
+    if set(airframe.outputs) != set(commands.outputs):
+        require("second_order" in values, f"{scenario.name}: reference_model", "linear", "second_order to leave channels out")
+        rows = [commands.outputs.index(name) for name in airframe.outputs]
+        values["outputs"] = airframe.outputs
+        for key, row in values["second_order"].items():
+            values["second_order"][key] = [row[i] for i in rows]
+        for key in ("pulses", "sines"):
+            values[key] = {name: signal for name, signal in values[key].items() if name in airframe.outputs}
+    turn = commands.coordinated_turn
+    if turn is not None:
+        present = {turn.bank_rate, turn.turn_rate} <= set(airframe.outputs) and airframe.speed > 0.0
+        values["coordinated_turn"] = turn.model_dump() | {"speed": airframe.speed} if present else None
+    gusts = {name: gust for name, gust in scenario.aircraft.gusts.items() if name in airframe.gusts}
+    reference = ReferenceModelConfig.validate_mapping(values, "reference_model")
+    return Manoeuvre(reference, gusts, scenario.flight.duration)
+
+
+def study_airframe(
+    airframe: Airframe, manoeuvre: Manoeuvre, uncertainty: float = 0.3, samples: int = 100, seed: int = 1
+) -> Study:
+    """Rates of the ideal control along a manoeuvre, on the airframe as published and on uncertain ones.
+
+    The ideal control keeps y on y_m. With x = P y_m + N eta, eta the states beside the outputs (`output_coordinates`):
+
+        eta_dot = H' (I - B Omega^-1 C) (A x + f(x, t)) + H' B Omega^-1 y_m_dot         the zero dynamics, eta(0) = 0
+        u* = Omega^-1 (y_m_dot - C (A x + f)),  x_dot = A x + f + B u*
+        u*_dot = Omega^-1 (y_m_ddot - C (A x_dot + f_dot)),  f_dot along (1, x_dot)
+
+    Runge-Kutta in steps of 0.01 s; u*_dot is evaluated at the steps; only f_dot and u_m_dot are differences, central and over
+    1e-5 s. f is that of the nominal airframe. Raises ParameterError if Omega is singular or if the nominal airframe has a zero
+    in the right half plane: then Assumption 3 does not hold.
+    """
+    A, B = nominal_and_sampled(airframe, uncertainty, samples, seed)
+    zeros = [invariant_zeros(*pair, airframe.matrix_c()).real.max(initial=-math.inf) for pair in zip(A, B, strict=True)]
+    stable = np.array(zeros) <= ZERO_REAL_PART
+    require(bool(stable[0]), f"airframe {airframe.name}", f"a zero at {zeros[0]:.3g} 1/s", "none in the right half plane")
+    # The last column is the nominal airframe without gusts: their speed is 0 there.
+    A = np.concatenate([A, A[:1]])
+    B = np.concatenate([B, B[:1]])
+    aircraft = _columns(airframe, manoeuvre.gusts, len(A))
+    C = airframe.matrix_c()
+    n = len(airframe.states)
+    m = len(airframe.outputs)
+    P, N, H = output_coordinates(C)
+    Omega: FloatArray = np.einsum("ij,Njk->Nik", C, B)
+    require(float(np.abs(np.linalg.det(Omega)).min()) > 0.0, "Omega", "a singular C B", "inputs that move all outputs")
+    inverse = np.asarray(np.linalg.inv(Omega), dtype=np.float64)
+    project = np.asarray(H.T @ (np.eye(n) - B @ inverse @ C), dtype=np.float64)
+    follow = H.T @ B @ inverse
+    y_m, y_m_dot, y_m_ddot = _references(manoeuvre, airframe)
+
+    def times(matrices: FloatArray, columns: FloatArray) -> FloatArray:
+        return np.asarray(np.einsum("Nij,jN->iN", matrices, columns))
+
+    def state(k: int, eta: FloatArray) -> FloatArray:
+        return np.asarray((P @ y_m[k])[:, None] + N @ eta)
+
+    def drift(t: Any, x: FloatArray) -> FloatArray:
+        return np.asarray(times(A, x) + dynamics.f(t, x, aircraft))
+
+    def eta_dot(t: float, eta: Array, _: None, __: None) -> Array:
+        k = round(2.0 * t / STEP)
+        return times(project, drift(t, state(k, eta))) + (follow @ y_m_dot[k]).T
+
+    steps = (len(y_m) - 1) // 2
+    eta = np.zeros((n - m, len(A)))
+    u_dot = np.zeros((steps + 1, len(A), m))
+    near = 1e-5
+    for k in range(steps + 1):
+        t = k * STEP
+        x = state(2 * k, eta)
+        free = drift(t, x)
+        u = times(inverse, np.asarray(y_m_dot[2 * k][:, None] - C @ free, dtype=np.float64))
+        x_dot = free + times(B, u)
+        ahead, behind = (dynamics.f(t + step, x + step * x_dot, aircraft) for step in (near, -near))
+        drift_dot: FloatArray = times(A, x_dot) + (ahead - behind) / (2.0 * near)
+        u_dot[k] = times(inverse, y_m_ddot[2 * k][:, None] - C @ drift_dot).T
+        if k < steps and n > m:
+            eta = rk4(eta_dot, t, eta, None, None, STEP)
+    undisturbed, slew = (np.max(np.abs(u_dot[:, column]), axis=0) for column in (-1, 0))
+    return Study(airframe, A[:-1], B[:-1], C, airframe.matrix_gravity(), u_dot[:, :-1], slew, undisturbed, stable, uncertainty)
+
+
+def _references(manoeuvre: Manoeuvre, airframe: Airframe) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """y_m and its two derivatives every STEP / 2, for the stages of Runge-Kutta; airframe's order, each (2 T - 1, m)."""
+    matrices = manoeuvre.reference.model()
+    profile = manoeuvre.reference.profile()
+    near = 1e-5
+    step = model.stepper(STEP / 2.0, matrices)
+    t = STEP / 2.0 * np.arange(2 * round(manoeuvre.duration / STEP) + 1)
+    u_m = command(t, profile)
+    half_later = command(t + STEP / 4.0, profile)
+    u_m_dot = (command(t + near, profile) - command(t - near, profile)) / (2.0 * near)
+    x = np.zeros((len(t), len(matrices.A_m)))
+    for k, stages in enumerate(np.concatenate([u_m[:-1], half_later[:-1], u_m[1:]], axis=1)):
+        x[k + 1] = model.step(x[k], stages, step)
+    x_dot = model.x_m_dot(t, x.T, u_m.T, matrices)
+    x_ddot = model.x_m_dot(t, x_dot, u_m_dot.T, matrices)  # (2) differentiated
+    places = [manoeuvre.reference.outputs.index(name) for name in airframe.outputs]
+    y_m, y_m_dot, y_m_ddot = (model.output(z, matrices)[places].T for z in (x.T, x_dot, x_ddot))
+    return y_m, y_m_dot, y_m_ddot
+
+
+def _columns(airframe: Airframe, gusts: Mapping[str, Gust], columns: int) -> Aircraft:
+    """The aircraft with f for states in columns, shape (n, columns), the last column without gusts."""
+    gust_on = np.append(np.ones(columns - 1), 0.0)
+    profiles = np.array([(gust.start, gust.speed, gust.length) for gust in gusts.values()]).reshape(-1, 3)
+    start, speed, length = np.split(profiles, 3, axis=1)
+    directions = [airframe.gust_direction(name) for name in gusts]
+    return Aircraft(
+        airframe.matrix_a(),
+        airframe.matrix_b(),
+        airframe.matrix_c(),
+        airframe.matrix_gravity(),
+        np.reshape(directions, (len(gusts), len(airframe.states))).T,
+        Gusts(start, speed * gust_on, length),
+        np.array(airframe.speed),
+    )

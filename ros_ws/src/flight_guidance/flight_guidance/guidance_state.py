@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The words of guidance: modes, targets, parameters, and the inputs and the state of a step."""
+
+from collections.abc import Collection, Mapping
+from enum import IntEnum
+from typing import NamedTuple
+
+from flight_core.vectors import Scalar
+from flight_guidance.attitude import AttitudeParams
+from flight_guidance.lateral import (
+    PathParams,
+)
+from flight_guidance.reach import Authority
+from flight_guidance.vertical import (
+    VerticalParams,
+)
+from flight_guidance.wind import Wind
+from flight_guidance.zones import Fence
+
+LARGEST = 1e9
+"""Largest value of pose, y and target, SI. The squares of larger values overflow; the orbit of the moon is 4e8 m away."""
+
+
+class Mode(IntEnum):
+    """What guidance does."""
+
+    OFF = 0  # no u_m
+    ENGAGED = 1
+    DEAD_RECKONING = 2  # pose is stale: wings level, attitude from the rates of y
+    POSE_LOST = 3  # pose is stale for longer: rates are zero
+
+
+class Lateral(IntEnum):
+    """What the bank serves."""
+
+    PHI = 0
+    HEADING = 1
+    COURSE = 2
+    ORBIT = 3
+    ROUTE = 4
+
+
+class Vertical(IntEnum):
+    """What the pitch serves."""
+
+    THETA = 0
+    CLIMB = 1
+    ALTITUDE = 2
+    PROFILE = 3  # the altitude along the leg of the route
+
+
+class Target(NamedTuple):
+    """Commands by channel; the channels of the modes in force act."""
+
+    phi: float = 0.0  # rad
+    heading: float = 0.0  # rad from true north
+    course: float = 0.0  # rad from true north, over ground
+    north: float = 0.0  # m, centre of the orbit
+    east: float = 0.0  # m
+    radius: float = 0.0  # m, positive clockwise from above
+    leg: float = 0.0  # number of the leg of the route
+    theta: float = 0.0  # rad
+    climb: Scalar = 0.0  # m/s
+    altitude: Scalar = 0.0  # m
+    V: Scalar = 0.0  # airspeed, m/s, absolute
+    along: float = 0.0  # m along a line of the route from the start, where the aircraft joins the line
+    r: float = 0.0  # rad/s beside phi, more than the r of a coordinated turn
+
+
+TARGETS = Target._fields
+
+
+LATERAL: Mapping[str, Lateral] = {
+    **dict.fromkeys(("phi", "r"), Lateral.PHI),
+    "heading": Lateral.HEADING,
+    "course": Lateral.COURSE,
+    **dict.fromkeys(("north", "east", "radius"), Lateral.ORBIT),
+    **dict.fromkeys(("leg", "along"), Lateral.ROUTE),
+}
+
+
+VERTICAL: Mapping[str, Vertical] = {"theta": Vertical.THETA, "climb": Vertical.CLIMB, "altitude": Vertical.ALTITUDE}
+
+
+class Home(NamedTuple):
+    """Where an aircraft goes in the end."""
+
+    north: float = 0.0  # m
+    east: float = 0.0  # m
+    altitude: float | None = None  # m; None: the altitude of then
+    after_loss: bool = False  # whether the aircraft flies home when pose returns after a loss
+
+
+class Limits(NamedTuple):
+    """Limits of commands."""
+
+    bank: float  # rad
+    least_pitch: float  # rad
+    largest_pitch: float  # rad
+    floor: float  # m/s, of the airspeed
+    stall_speed: float  # m/s
+    radius: float  # m, least radius of an orbit
+    largest_speed: float  # m/s
+    lowest: float  # m, least altitude
+    highest: float  # m, largest altitude
+
+
+class GuidanceParams(NamedTuple):
+    """Parameters of the step."""
+
+    outputs: tuple[str, ...]  # order of u_m
+    period_ns: int
+    speed: float  # trim speed V0, m/s
+    k_chi: float  # of heading and course, 1/s
+    attitude: AttitudeParams
+    vertical: VerticalParams
+    path: PathParams
+    limits: Limits
+    slew: tuple[float, ...]  # largest derivatives of u_m
+    max_age_ns: int
+    hold_ns: int
+    turn_lag: float = 0.0  # s, of the turn behind the bank
+    fence: Fence | None = None
+    home: Home = Home()
+    link_timeout_ns: int = 0  # of the operator's link; 0: no limit
+    dead: tuple[str, ...] = ()  # outputs without an input with an effect: no command asks for them
+
+
+class Begin(IntEnum):
+    """Whether the filters begin at what is measured."""
+
+    NO = 0
+    AGAIN = 1  # modes and commands stay (bumpless transfer)
+    HOLD = 2  # with the heading, the altitude and the airspeed of now
+
+
+class Inputs(NamedTuple):
+    """What a step takes."""
+
+    t_ns: int
+    begin: Begin
+    pose: tuple[float, ...]  # the last pose, in the order of POSE
+    pose_age_ns: int
+    y: tuple[float, ...]  # the last y, in the order of u_m
+    commands: Mapping[str, float]  # commands that are new, by channel of Target; they name the modes
+    authority: Authority = Authority()  # of the inputs, as learned in flight
+
+
+class GuidanceState(NamedTuple):
+    """State after a step."""
+
+    t_ns: int
+    mode: Mode
+    lateral: Lateral
+    vertical: Vertical
+    target: Target
+    leg: int  # of the route
+    phi: float  # attitude, by dead reckoning while pose is stale, rad
+    theta: float
+    alpha: float  # estimated angle of attack, rad
+    alpha_trim: float  # the same at the start
+    slip: float  # what a sideslip takes from a turn, m/s^2
+    climb_c: float  # m/s
+    V_c: float  # m/s
+    u_m: tuple[float, ...]
+    joining: float = 0.0  # side of the circle onto the leg: 1 turns to the right, -1 to the left; 0 on the leg
+    wind: Wind = (0.0, 0.0)  # estimated, where the air moves to: north, east, m/s
+    fence: float = 0.0  # action of the fence: of `fence.Escape`
+    loitered: float = 0.0  # share of the turns or the wait of a loiter that is flown
+    psi: Scalar = 0.0  # estimated heading, rad
+
+
+class Commands(NamedTuple):
+    """Results of a step beside the state, for the log."""
+
+    phi_c: float = 0.0
+    theta_c: float = 0.0
+    xtrack: float = 0.0  # cross-track error, m, positive to the right of the path
+    to_go: float = 0.0  # m, to the end of the leg, or to the point where the aircraft joins the leg
+    track: float = 0.0  # course of the path at the nearest point, rad
+    missed: float = 0.0  # m, distance from the end of the leg that ended at this step; 0 where the leg was flown
+    clearance: float = LARGEST  # m, from the fence
+    predicted: float = LARGEST  # m, least clearance of the better turn away from the fence
+    bank_limited: bool = False
+    theta_limited: bool = False
+    climb_limited: bool = False
+    V_limited: bool = False
+    slew_limited: bool = False
+
+
+def bits(names: Collection[str]) -> int:
+    """The names of targets as the channel `given` of the log: bit k for TARGETS[k]."""
+    return sum(1 << k for k, name in enumerate(TARGETS) if name in names)
