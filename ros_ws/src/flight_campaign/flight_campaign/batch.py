@@ -209,22 +209,7 @@ def _fly(
     control_law: ControlLaw,
     timing: Timing,
 ) -> FleetResult:
-    def measure(now: LoopState, segment: Segments, sample: Sample) -> Measurements:
-        y, y_m, y_m_dot = sample
-        x = now.x.at[vehicle.outputs].set(y)
-        matrices = at(segment.t, fleet)
-        acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
-        moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
-        u_trim = segment.u_ff[:, None] + 0.0 * y
-        x_air = x - fleet.wind * segment.air[:, None]
-        vane = vane_m = None
-        if vehicle.vanes:
-            vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
-            vane_m = segment.vane_m[:, None] + 0.0 * vane
-        position = now.position[vehicle.inputs]
-        if vehicle.allocation is not None:
-            position = product(vehicle.allocation.effect, position)
-        return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
+    measure = partial(_measured, fleet=fleet, vehicle=vehicle)
 
     # Each branch calls `measure`: the compiler then removes the measurements that its law does not use.
     def engage(now: LoopState, *measured: Any) -> tuple[Any, Array, Array]:
@@ -267,6 +252,25 @@ def _fly(
     window = window_of(np.arange(ticks), timing.windows)
     end, _ = jax.lax.scan(tick, begin, (segments, None if mission is None else mission.action, window))
     return _result(end, ticks, period, mission, timing)
+
+
+def _measured(now: LoopState, segment: Segments, sample: Sample, fleet: Fleet, vehicle: Vehicle) -> Measurements:
+    """What a law takes at a tick."""
+    y, y_m, y_m_dot = sample
+    x = now.x.at[vehicle.outputs].set(y)
+    matrices = at(segment.t, fleet)
+    acting = _product(matrices.rate, [*now.x, *actuators.effect(segment.t, now.position, vehicle.actuators)])
+    moving = acting + fleet.wind * _product(matrices.forced_rate, segment.forcing_now)
+    u_trim = segment.u_ff[:, None] + 0.0 * y
+    x_air = x - fleet.wind * segment.air[:, None]
+    vane = vane_m = None
+    if vehicle.vanes:
+        vane = jnp.stack([x_air[place] for place in vehicle.vanes]) + segment.vane_error[:, None]
+        vane_m = segment.vane_m[:, None] + 0.0 * vane
+    position = now.position[vehicle.inputs]
+    if vehicle.allocation is not None:
+        position = product(vehicle.allocation.effect, position)
+    return Measurements(y, y_m, y_m_dot, u_trim, now.u, position, x, x_air, moving, vane, vane_m)
 
 
 def window_of(ticks: Array, windows: tuple[int, ...]) -> Array:

@@ -60,12 +60,8 @@ class Course(NamedTuple):
     steps: int  # of the integration from tick to tick
 
 
-def build_course(scenario: Scenario) -> Course:
-    """The course of a scenario, with the feedforward of the controller.
-
-    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u by a part of a tick,
-    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
-    """
+def _require_flyable(scenario: Scenario) -> None:
+    """Raise ParameterError for an aircraft or a controller beyond a campaign."""
     aircraft = scenario.aircraft
     controller = scenario.controller
     require(not aircraft.is_jsbsim, "airframe", aircraft.airframe, "an airframe with matrices: JSBSim flies one at a time")
@@ -77,6 +73,29 @@ def build_course(scenario: Scenario) -> Course:
     )
     fixed = aircraft.over_airspeed is None
     require(fixed, "aircraft.over_airspeed", aircraft.over_airspeed, "none: the aircraft of a campaign keep their trim speed")
+
+
+def _references(scenario: Scenario, ticks: int, tick_ns: int) -> tuple[FloatArray, FloatArray]:
+    """y_m and its derivative at the ticks, in the law's order, each (T, m)."""
+    reference = Reference(scenario.reference_model)
+    places = [scenario.reference_model.outputs.index(name) for name in scenario.controller.outputs]
+    y_m = np.zeros((ticks, len(places)))
+    y_m_dot = np.zeros_like(y_m)
+    for k in range(ticks):
+        y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
+        y_m_dot[k] = reference.rate()[places]
+    return y_m, y_m_dot
+
+
+def build_course(scenario: Scenario) -> Course:
+    """The course of a scenario, with the feedforward of the controller.
+
+    Raises ParameterError for a scenario beyond a campaign: an aircraft of JSBSim, a delay of y or u by a part of a tick,
+    dropouts of a y with a different rate than the ticks, or dropouts longer than the age limit; for vanes with faults.
+    """
+    aircraft = scenario.aircraft
+    controller = scenario.controller
+    _require_flyable(scenario)
     airframe = aircraft.load()[0]
     plant = aircraft.plant()
     tick_ns = period_ns(controller.rate, "controller.rate")
@@ -101,13 +120,7 @@ def build_course(scenario: Scenario) -> Course:
         error[k], drift = sensors.error(k * (tick_ns // sample_ns), drift, errors)
         noise[k] = error[k] - bias - drift.value
 
-    reference = Reference(scenario.reference_model)
-    y_m, y_m_dot = np.zeros((ticks, len(order))), np.zeros((ticks, len(order)))
-    places = [scenario.reference_model.outputs.index(name) for name in controller.outputs]
-    for k in range(ticks):
-        y_m[k] = reference.sample(k * tick_ns // reference.period_ns)[places]
-        y_m_dot[k] = reference.rate()[places]
-
+    y_m, y_m_dot = _references(scenario, ticks, tick_ns)
     arrives = [sensors.arrives(k, errors) for k in range(ticks)]
     phase, dt = _phases(ticks, late, seconds(tick_ns), scenario.controller.max_age, arrives)
     used = np.maximum(np.arange(ticks) - late, 0)

@@ -158,6 +158,24 @@ def swept_parameters(controller: ControllerConfig) -> list[str]:
     return [*(name for name, value in values if value.dtype == np.float64), "input_scale"]
 
 
+def _permitted_units(scenario: Scenario, units: Mapping[str, float]) -> dict[str, float]:
+    """The units of the score by output. Raises ParameterError for a unit beyond the scenario."""
+    outputs = scenario.controller.outputs
+    stated_units = dict(units)
+    for name, unit in stated_units.items():
+        require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
+        require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
+    require(
+        scenario.guidance is None or not stated_units,
+        "score",
+        "a unit",
+        "none: the score of a mission is its cross-track error",
+    )
+    if scenario.guidance is None:
+        score_units(outputs, scenario.aircraft.channels().outputs, stated_units)
+    return stated_units
+
+
 def define(
     scenario: Scenario,
     aircraft: int,
@@ -189,19 +207,7 @@ def define(
     published = scenario.vary(aircraft={"uncertainty": {}})  # each aircraft of the campaign has its own
     spread = scenario.aircraft.uncertainty.spread() if spread is None else spread
     spread = spread._replace(entries=equipment.expanded(spread.entries, scenario))
-    outputs = scenario.controller.outputs
-    stated_units = dict(units or {})
-    for name, unit in stated_units.items():
-        require(name in outputs, "score", repr(name), f"an output of the controller: {', '.join(outputs)}")
-        require(math.isfinite(unit) and unit > 0.0, f"score.{name}", f"{unit:g}", "a unit of rms error above 0, SI")
-    require(
-        scenario.guidance is None or not stated_units,
-        "score",
-        "a unit",
-        "none: the score of a mission is its cross-track error",
-    )
-    if scenario.guidance is None:
-        score_units(outputs, scenario.aircraft.channels().outputs, stated_units)
+    stated_units = _permitted_units(scenario, units or {})
     airframe_spread = spread._replace(entries=equipment.matrix_entries(spread.entries))
     sampled_matrices(load_airframe(scenario.aircraft.airframe), uncertainty, uncertainty, seed, 0, 1, airframe_spread)
     values = {

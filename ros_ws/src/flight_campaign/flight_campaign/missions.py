@@ -269,66 +269,72 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
     """The state after guidance at a tick, from x (n, N), and an arriving y in the law's order, (m, N)."""
     y = jnp.where(segment.phase == HOLD, state.y, y)
     state = state._replace(y=y)
-    pose, params = _pose(state, x, segment.t, mission), mission.guidance
+    pose = _pose(state, x, segment.t, mission)
     y_of = dict(zip(mission.outputs, y, strict=True))
-    speed = modes.true_airspeed(y_of["V"], params)
-    position, course = (pose["north"], pose["east"]), jnp.atan2(pose["v_east"], pose["v_north"])
+    speed = modes.true_airspeed(y_of["V"], mission.guidance)
+    course = jnp.atan2(pose["v_east"], pose["v_north"])
+    now = _GuidanceStep(state, mission, mission.guidance, pose, y_of, speed, (pose["north"], pose["east"]), course)
+    return jax.lax.switch(action, (lambda: state, now.begin, now.step))
 
-    def legs_at(numbers: Array) -> Legs:
-        return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], mission.legs)
 
-    def passed(leg: Legs, place: path.Point) -> Array:
+class _GuidanceStep(NamedTuple):
+    """A step of guidance of N missions: the state before, the pose, y, the airspeed, and position and course over ground."""
+
+    state: MissionState
+    mission: Mission
+    params: GuidanceParams
+    pose: dict[str, Array]
+    y_of: dict[str, Array]
+    speed: Array
+    position: path.Point
+    course: Array
+
+    def _legs_at(self, numbers: Array) -> Legs:
+        return jax.tree.map(lambda values: jnp.asarray(values)[..., numbers], self.mission.legs)
+
+    def _passed(self, leg: Legs, place: path.Point) -> Array:
         return leg.has_end & path.is_beyond((leg.end[0], leg.end[1]), leg.end_course, place)
 
-    def entered(leg: Legs, following: Legs, place: path.Point) -> Array:
-        return passed(leg, place) & (following.is_line | ~passed(following, place))
+    def _entered(self, leg: Legs, following: Legs, place: path.Point) -> Array:
+        return self._passed(leg, place) & (following.is_line | ~self._passed(following, place))
 
-    def joins(leg: Legs) -> Array:
+    def _joins(self, leg: Legs) -> Array:
         """Side of the circle onto a leg, 0 near the leg."""
         start = (leg.start[0], leg.start[1])
-        side = path.joining(start, leg.start_course, mission.radius, leg.near, position, course)
+        side = path.joining(start, leg.start_course, self.mission.radius, leg.near, self.position, self.course)
         return jnp.where(leg.has_end, jnp.where(leg.is_line, side, jnp.abs(side) * leg.turn), 0.0)
 
-    def onto(leg: Legs, place: path.Point) -> Array:
-        return path.joined((leg.start[0], leg.start[1]), leg.start_course, leg.near, place, course)
+    def _onto(self, leg: Legs, place: path.Point) -> Array:
+        return path.joined((leg.start[0], leg.start[1]), leg.start_course, leg.near, place, self.course)
 
-    def fly(before: GuidanceState, number: Array, joining: Array, missed: Array) -> MissionState:
-        leg, following, joins_leg = legs_at(number), legs_at(number + 1), joining != 0.0
+    def _fly(self, before: GuidanceState, number: Array, joining: Array, missed: Array) -> MissionState:
+        leg, following, joins_leg = self._legs_at(number), self._legs_at(number + 1), joining != 0.0
         origin, start = (leg.origin[0], leg.origin[1]), (leg.start[0], leg.start[1])
-        line, circle = path.line_error(origin, leg.track, position), path.circle_error(origin, leg.radius, position)
-        radius = jnp.where(joins_leg, joining, 1.0) * mission.radius
-        way = path.circle_error(path.joining_centre(start, leg.start_course, radius), radius, position)
+        line, circle = path.line_error(origin, leg.track, self.position), path.circle_error(origin, leg.radius, self.position)
+        radius = jnp.where(joins_leg, joining, 1.0) * self.mission.radius
+        way = path.circle_error(path.joining_centre(start, leg.start_course, radius), radius, self.position)
         on_leg = [jnp.where(leg.is_line, *pair) for pair in zip(line, circle, strict=True)]
         error = PathError(*(jnp.where(joins_leg, *pair) for pair in zip(way, on_leg, strict=True)))
 
         def begins(place: path.Point) -> Array:
-            return jnp.where(joins_leg, onto(leg, place), entered(leg, following, place))
+            return jnp.where(joins_leg, self._onto(leg, place), self._entered(leg, following, place))
 
         entry = jnp.where(joins_leg, leg.start_curvature, leg.entry)
         altitude, climb = (
-            jnp.where(joins_leg, *pair) for pair in zip((leg.from_altitude, 0.0), _profile(leg, pose), strict=True)
+            jnp.where(joins_leg, *pair) for pair in zip((leg.from_altitude, 0.0), _profile(leg, self.pose), strict=True)
         )
-        escape, home_altitude, homing = (
-            Escape(state.fence, False, state.clearance, 0.0, 0.0),
-            state.home_altitude,
-            state.fence != 0.0,
-        )
-        if params.fence is not None:
-            escape = last_safe_turn(params.fence, state.fence, modes.motion_of(before, pose, y_of, speed, params))
-            homing = escape.action != 0.0
-            home = targets.home(pose, params)
-            home_altitude = jnp.where(escape.begins, home["altitude"], state.home_altitude)
-            orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), position)
-            error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))
-            entry, altitude = jnp.where(homing, orbit.curvature, entry), jnp.where(homing, home_altitude, altitude)
+        escape, home_altitude, homing, error = self._within_fence(before, error)
+        if self.params.fence is not None:
+            entry = jnp.where(homing, error.curvature, entry)
+            altitude = jnp.where(homing, home_altitude, altitude)
         climb = jnp.where(homing, 0.0, climb)
-        wanted = modes.follow(error, entry, begins, before.slip, pose, speed, params)
-        wanted = modes.escaping_bank(escape, wanted, pose, speed, params)
+        wanted = modes.follow(error, entry, begins, before.slip, self.pose, self.speed, self.params)
+        wanted = modes.escaping_bank(escape, wanted, self.pose, self.speed, self.params)
         target = Target(altitude=altitude, climb=climb, V=jnp.where(joins_leg, leg.from_V, leg.V))
         flies = before._replace(mode=Mode.ENGAGED, lateral=Lateral.ROUTE, vertical=Vertical.PROFILE, target=target)
-        after, _ = modes.command(flies, pose, y_of, wanted, seconds(params.period_ns), params)
-        off, counts = pose["altitude"] - altitude, leg.has_end & ~joins_leg & ~homing
-        return state._replace(
+        after, _ = modes.command(flies, self.pose, self.y_of, wanted, seconds(self.params.period_ns), self.params)
+        off, counts = self.pose["altitude"] - altitude, leg.has_end & ~joins_leg & ~homing
+        return self.state._replace(
             u_m=jnp.stack(after.u_m),
             alpha=after.alpha,
             alpha_trim=after.alpha_trim,
@@ -338,39 +344,62 @@ def guide(state: MissionState, x: Array, y: Array, segment: Segments, action: Ar
             leg=number,
             joining=joining,
             air=jnp.stack(after.wind),
-            samples=state.samples + counts,
-            xtrack_max=jnp.maximum(state.xtrack_max, jnp.where(counts, jnp.abs(error.e), 0.0)),
-            xtrack_squares=state.xtrack_squares + jnp.where(counts, error.e**2, 0.0),
-            altitude_squares=state.altitude_squares + jnp.where(counts, off**2, 0.0),
-            phi_max=jnp.maximum(state.phi_max, jnp.abs(pose["phi"])),
-            missed=state.missed + missed,
+            samples=self.state.samples + counts,
+            xtrack_max=jnp.maximum(self.state.xtrack_max, jnp.where(counts, jnp.abs(error.e), 0.0)),
+            xtrack_squares=self.state.xtrack_squares + jnp.where(counts, error.e**2, 0.0),
+            altitude_squares=self.state.altitude_squares + jnp.where(counts, off**2, 0.0),
+            phi_max=jnp.maximum(self.state.phi_max, jnp.abs(self.pose["phi"])),
+            missed=self.state.missed + missed,
             fence=escape.action,
             home_altitude=home_altitude,
-            clearance=jnp.minimum(state.clearance, escape.clearance),
-            from_home=jnp.hypot(pose["north"] - params.home.north, pose["east"] - params.home.east),
+            clearance=jnp.minimum(self.state.clearance, escape.clearance),
+            from_home=jnp.hypot(self.pose["north"] - self.params.home.north, self.pose["east"] - self.params.home.east),
         )
 
-    def begin() -> MissionState:
-        return fly(modes.holding(0, pose, speed, params), 0 * state.leg, joins(legs_at(0 * state.leg)), 0.0 * state.missed)
-
-    def step() -> MissionState:
-        before = modes.holding(0, pose, speed, params)._replace(
-            alpha=state.alpha,
-            alpha_trim=state.alpha_trim,
-            slip=state.slip,
-            climb_c=state.climb_c,
-            V_c=state.V_c,
-            u_m=tuple(state.u_m),
-            wind=(state.air[0], state.air[1]),
+    def begin(self) -> MissionState:
+        return self._fly(
+            modes.holding(0, self.pose, self.speed, self.params),
+            0 * self.state.leg,
+            self._joins(self._legs_at(0 * self.state.leg)),
+            0.0 * self.state.missed,
         )
-        leg, joins_leg = legs_at(state.leg), state.joining != 0.0
-        ends = passed(leg, position) & ~joins_leg & (state.fence == 0.0)
-        missed = ends & (jnp.hypot(position[0] - leg.end[0], position[1] - leg.end[1]) > leg.near)
-        number = jnp.where(ends, state.leg + 1, state.leg)
-        still = jnp.where(joins_leg & ~onto(leg, position), state.joining, 0.0)
-        return fly(before, number, jnp.where(ends, joins(legs_at(number)), still), missed)
 
-    return jax.lax.switch(action, (lambda: state, begin, step))
+    def step(self) -> MissionState:
+        before = modes.holding(0, self.pose, self.speed, self.params)._replace(
+            alpha=self.state.alpha,
+            alpha_trim=self.state.alpha_trim,
+            slip=self.state.slip,
+            climb_c=self.state.climb_c,
+            V_c=self.state.V_c,
+            u_m=tuple(self.state.u_m),
+            wind=(self.state.air[0], self.state.air[1]),
+        )
+        leg, joins_leg = self._legs_at(self.state.leg), self.state.joining != 0.0
+        ends = self._passed(leg, self.position) & ~joins_leg & (self.state.fence == 0.0)
+        missed = ends & (jnp.hypot(self.position[0] - leg.end[0], self.position[1] - leg.end[1]) > leg.near)
+        number = jnp.where(ends, self.state.leg + 1, self.state.leg)
+        still = jnp.where(joins_leg & ~self._onto(leg, self.position), self.state.joining, 0.0)
+        return self._fly(before, number, jnp.where(ends, self._joins(self._legs_at(number)), still), missed)
+
+    def _within_fence(self, before: GuidanceState, error: PathError) -> tuple[Escape, Array, Array, PathError]:
+        """The action of the fence, the altitude of the flight home, whether the aircraft flies home, and the path error."""
+        escape, home_altitude, homing = (
+            Escape(self.state.fence, False, self.state.clearance, 0.0, 0.0),
+            self.state.home_altitude,
+            self.state.fence != 0.0,
+        )
+        if self.params.fence is not None:
+            escape = last_safe_turn(
+                self.params.fence,
+                self.state.fence,
+                modes.motion_of(before, self.pose, self.y_of, self.speed, self.params),
+            )
+            homing = escape.action != 0.0
+            home = targets.home(self.pose, self.params)
+            home_altitude = jnp.where(escape.begins, home["altitude"], self.state.home_altitude)
+            orbit = path.circle_error((home["north"], home["east"]), jnp.asarray(home["radius"]), self.position)
+            error = PathError(*(jnp.where(homing, *pair) for pair in zip(orbit, error, strict=True)))
+        return escape, home_altitude, homing, error
 
 
 def _profile(leg: Legs, pose: dict[str, Array]) -> tuple[Array, Array]:

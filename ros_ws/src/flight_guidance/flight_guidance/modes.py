@@ -161,6 +161,31 @@ def escaping_bank(escape: Escape, wanted: Scalar, pose: Mapping[str, Scalar], sp
     return xp.where(abs(escape.action) == RIGHT, escape.action * params.limits.bank, wanted)
 
 
+def _wanted_rates(
+    state: GuidanceState,
+    pose: Mapping[str, Scalar],
+    r: Scalar,
+    phi_c: Scalar,
+    theta_c: Scalar,
+    speed: Scalar,
+    params: GuidanceParams,
+) -> BodyRates:
+    """Body rates to the commanded attitude, rad/s; none after the loss of the pose, and none of a dead output."""
+    flies = state.mode is Mode.ENGAGED
+    attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
+    beta = pose["beta"] if flies else 0.0
+    flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
+    rates = body_rates(phi_c, theta_c, state.phi, state.theta, r, 0.0 if flat else beta, speed, attitude)
+    if flat:  # the sideslip is wanted
+        rates = rates._replace(r=rates.r + state.target.r)
+    if state.mode is Mode.POSE_LOST:
+        rates = BodyRates(0.0, 0.0, 0.0)
+    rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
+    if "p" in params.dead:
+        rates = rates._replace(r=yaw_for_bank(phi_c, state.phi, speed))
+    return rates
+
+
 def command(
     state: GuidanceState,
     pose: Mapping[str, Scalar],
@@ -198,17 +223,7 @@ def command(
     V_wanted = permitted_speed(V_asked, params)
     V_c = slewed(state.V_c, V_wanted, params.slew[params.outputs.index("V")], dt)
 
-    attitude = params.attitude._replace(n_alpha=1.0 / (state.alpha_trim + 0.05))
-    beta = pose["beta"] if flies else 0.0
-    flat = flies and state.lateral is Lateral.PHI and state.target.r != 0.0
-    rates = body_rates(phi_c, theta_c, state.phi, state.theta, y["r"], 0.0 if flat else beta, speed, attitude)
-    if flat:  # the sideslip is wanted
-        rates = rates._replace(r=rates.r + state.target.r)
-    if state.mode is Mode.POSE_LOST:
-        rates = BodyRates(0.0, 0.0, 0.0)
-    rates = rates._replace(**dict.fromkeys(params.dead, 0.0))
-    if "p" in params.dead:
-        rates = rates._replace(r=yaw_for_bank(phi_c, state.phi, speed))
+    rates = _wanted_rates(state, pose, y["r"], phi_c, theta_c, speed, params)
     wanted = {"V": V_c - params.speed, **rates._asdict()}
     u_m = tuple(
         wanted[name] if name == "V" else slewed(before, wanted[name], rate, dt)

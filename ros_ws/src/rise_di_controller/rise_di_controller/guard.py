@@ -142,6 +142,18 @@ def align(samples: Sequence[StampedVector], stamp_ns: int, reach_ns: int) -> Flo
     return before.value + fraction * (after.value - before.value)
 
 
+def _with_history(
+    state: ControllerState, stepped: ControllerState, y_m: FloatArray, dt: float, missed: int, guard: GuardParams
+) -> ControllerState:
+    """The state after a step of the law with the past ticks, missed ticks included."""
+    assert stepped.y is not None  # noqa: S101 - the step took a y
+    scale = getattr(stepped.law, "scale", None)
+    nominal = np.float64(seconds(guard.period_ns))
+    lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, nominal, scale),) * missed
+    last = PastTick(stepped.y.value - y_m, stepped.u - state.u_trim - stepped.u_ff, y_m, np.float64(dt), scale)
+    return stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
+
+
 def tick(
     state: ControllerState,
     now_ns: int,
@@ -210,10 +222,7 @@ def tick(
     if not _is_finite(stepped):
         return _engaged(state, y, inputs, vane, guard, law, vane_m_recorded), inputs
     if guard.history:
-        scale = getattr(after, "scale", None)
-        lost = (PastTick(None, state.u - state.u_trim - state.u_ff, state.y_m, np.float64(nominal), scale),) * missed
-        last = PastTick(y.value - reference, u - state.u_trim - u_ff, reference, np.float64(dt), scale)
-        stepped = stepped._replace(history=(*state.history, *lost, last)[-guard.history :])
+        stepped = _with_history(state, stepped, reference, dt, missed, guard)
     return stepped, inputs._replace(dt=dt)
 
 

@@ -119,13 +119,7 @@ def select_gains(
     )
     require(observer or model is None, "model", model, "observer beside it: it is the observer's model")
     margin = as_number(margin, "margin", 0.0, MAX_DELAY_MARGIN, "s")
-    ratios = as_numbers(speeds, "speeds", expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4")
-    require(
-        observer or not ratios, "speeds", speeds, "observer beside them: the bare law follows the airspeed by schedule alone"
-    )
-    pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
-    fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
-    require(fits, "speeds", speeds, f"{expected}, from {LEAST_SPEED:g} to {MOST_SPEED:g}")
+    pair = _two_speeds(speeds, observer=observer)
     known_model = frame if model is None else through_allocation(load_airframe(model), setting.base)
     selection = gain_selection.select_gains(study(frame, chosen, uncertainty, samples, seed), setting)
     if not observer:
@@ -133,6 +127,18 @@ def select_gains(
     needed = setting.requirement._replace(phase=min(setting.requirement.phase, OBSERVER_REQUIREMENT.phase))
     controller, origin = observed(selection.chosen, chosen, known_model, margin, needed, speeds=pair, progress=progress)
     return replace(selection, chosen=controller, origin=origin)
+
+
+def _two_speeds(speeds: ArrayLike, *, observer: bool) -> tuple[float, float] | None:
+    """The two parts of the trim speed; None for none. Raises ParameterError."""
+    ratios = as_numbers(speeds, "speeds", expected := "two parts of the trim speed, one below 1 and one above: 0.7,1.4")
+    require(
+        observer or not ratios, "speeds", speeds, "observer beside them: the bare law follows the airspeed by schedule alone"
+    )
+    pair = (ratios[0], ratios[1]) if len(ratios) == len(("slow", "fast")) else None
+    fits = not ratios or (pair is not None and LEAST_SPEED <= pair[0] < 1.0 < pair[1] <= MOST_SPEED)
+    require(fits, "speeds", speeds, f"{expected}, from {LEAST_SPEED:g} to {MOST_SPEED:g}")
+    return pair
 
 
 def check_gains(

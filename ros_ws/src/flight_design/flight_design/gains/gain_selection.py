@@ -10,7 +10,7 @@ scenario: conditions, stability and delay margin. `as_yaml` writes a gain set as
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -225,36 +225,7 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     rate_limit = _by_name(setting.rate_limit, channels.inputs, math.inf)
     spread = np.abs(np.einsum("Nii->Ni", (study.C @ study.B)[:, places][..., columns])).max(axis=0)
 
-    def controller(gains: GainSet, response: FloatArray, slower: FloatArray) -> RiseDiConfig:
-        scale = unit * response
-        base_inputs = setting.base.inputs
-        softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
-        has_limits = set(channels.inputs) <= set(base_inputs)
-        limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
-        values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
-            "rate": setting.rate,
-            "outputs": channels.outputs,
-            "inputs": channels.inputs,
-            "k_g": gains.k_g,
-            "k_d": gains.k_d.tolist(),
-            "Lambda": gains.Lambda.tolist(),
-            "beta": gains.beta.tolist(),
-            "D": D.astype(int).tolist(),
-            "input_scale": scale.tolist(),
-            "omega": (spread * scale).tolist(),
-            "sign": "auto",
-            "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
-            "delay": setting.delay,
-            "softening": softening if len(set(softening)) > 1 else softening[0],
-            "feedforward": None,
-            "observer": None,
-        }
-        for key, row in limits.items():
-            if row:
-                values[key] = [row[base_inputs.index(name)] for name in channels.inputs]
-        if setting.base.allocation is not None:
-            values["allocation"] = setting.base.allocation.ordered(base_inputs, channels.inputs).model_dump()
-        return RiseDiConfig.validate_mapping(values, "controller")
+    controller = partial(_controller, setting, channels, D, unit, spread)
 
     def engineering(slower: FloatArray, lower: FloatArray) -> Candidate[RiseDiConfig]:
         limits = slew[places] / unit, setting.factor, rate_limit / unit
@@ -279,6 +250,48 @@ def select_gains(study: Study, setting: LoopSetting) -> Selection:
     chosen = (within_requirement(engineering, setting.requirement) if behind_servos else first).controller
     chosen = with_feedforward(chosen, airframe) if setting.feedforward else chosen
     return Selection(study, setting, literal, chosen)
+
+
+def _controller(
+    setting: LoopSetting,
+    channels: ChannelPairing,
+    D: FloatArray,
+    unit: FloatArray,
+    spread: FloatArray,
+    gains: GainSet,
+    response: FloatArray,
+    slower: FloatArray,
+) -> RiseDiConfig:
+    """The controller with gains; the integral is `slower`, and abs(Omega_ii) is `response` in the scaled inputs."""
+    scale = unit * response
+    base_inputs = setting.base.inputs
+    softening = (SOFTENING * np.broadcast_to(slower, response.shape)).tolist()
+    has_limits = set(channels.inputs) <= set(base_inputs)
+    limits = {key: getattr(setting.base, key) for key in INPUT_LIMITS} if has_limits else {}
+    values = setting.base.model_dump(exclude=set(INPUT_LIMITS)) | {
+        "rate": setting.rate,
+        "outputs": channels.outputs,
+        "inputs": channels.inputs,
+        "k_g": gains.k_g,
+        "k_d": gains.k_d.tolist(),
+        "Lambda": gains.Lambda.tolist(),
+        "beta": gains.beta.tolist(),
+        "D": D.astype(int).tolist(),
+        "input_scale": scale.tolist(),
+        "omega": (spread * scale).tolist(),
+        "sign": "auto",
+        "lag": _by_name(setting.lag, channels.inputs, 0.0).tolist(),
+        "delay": setting.delay,
+        "softening": softening if len(set(softening)) > 1 else softening[0],
+        "feedforward": None,
+        "observer": None,
+    }
+    for key, row in limits.items():
+        if row:
+            values[key] = [row[base_inputs.index(name)] for name in channels.inputs]
+    if setting.base.allocation is not None:
+        values["allocation"] = setting.base.allocation.ordered(base_inputs, channels.inputs).model_dump()
+    return RiseDiConfig.validate_mapping(values, "controller")
 
 
 def with_feedforward(controller: Controller, airframe: Airframe) -> Controller:
