@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aircraft_sim.airframe import Airframe
 from flight_analysis.closed_loop.learning_loop import Entry
 from flight_core.vectors import FloatArray
-from flight_design.gains.gain_selection import ChannelPairing
+from flight_design.gains.ideal_control import ChannelPairing
 from flight_design.identification.likelihood import MAX_ERROR, MAX_FACTOR, PRIOR, Innovations, largest_error
 
 MAX_DEVIATION = 0.1  # of the best known effect of an input on each output: two deviations are then a fifth of the loop gain
