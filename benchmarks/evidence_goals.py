@@ -6,7 +6,7 @@ CAMPAIGN = "rise-di campaign --uncertainty 0.3 --seed 7 --set runs=FOLDER --json
 COMPARE = "rise-di compare osprey_servo --tuning gust,gust_turbulence,delay --json FILE --aircraft 200"
 RANDOM_FAULTS = "python -m benchmarks.random_faults --json FILE --count"
 LONG_FLIGHT = "python -m benchmarks.long_flight --json FILE"
-ATTACKS = ("security", "policy")
+ATTACKS = ("flight_ros/test_security.py", "flight_bringup/test_policy.py")
 SPEED = {"law": 10, "receiver": 10, "node": 10, "latency": 10, "ticks": 60, "flight": 10, "start": 10, "import": 10}
 SPEED |= {"lockstep": 30, "recorder": 30}  # s a figure
 
@@ -16,7 +16,7 @@ COMMANDS = {
 } | {
     "faults": "python -m benchmarks.faults --times 10 --json FILE",
     "random-faults": f"{RANDOM_FAULTS} 20 --lockstep 2",
-    "security": f"pytest -q {' '.join(f'tests/{folder}/test_{name}.py' for folder in ('ros', 'nodes') for name in ATTACKS)}",
+    "security": f"pytest -q {' '.join(f'tests/{folder}/{file}' for folder in ('ros', 'nodes') for file in ATTACKS)}",
     "fuzz": "pytest -q -n auto tests/fuzz",
     "fuzz-coverage": "python -m benchmarks.fuzz all --seconds 30",
     "campaign": "python -m benchmarks.campaign --json FILE",

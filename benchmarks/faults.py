@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The fault campaign of tests/ros/faults, several times in a row, as a table.
+"""The fault campaign of tests/ros/flight_bringup/faults, several times in a row, as a table.
 
     .venv/bin/python -m benchmarks.faults [--times 10] [--scenario osprey_observer] [--json FILE] [--only "killed or stopped"]
     .venv/bin/python -m benchmarks.faults --only roll-in --guided jsbsim_c172p_route    # another aircraft under guidance

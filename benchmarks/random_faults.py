@@ -5,11 +5,11 @@
     .venv/bin/python -m benchmarks.random_faults --count 1000 --lockstep 100 --seed 1 [--json FILE]
     .venv/bin/python -m benchmarks.random_faults --count 1 --seed 417    # one of them again
 
-It injects the cases of tests/ros/faults in real time, and those of failures of the past (tests/ros/faults/draws.py). A fault
-passes where the node that should detects it, u responds as docs/faults.md states, no process ends or raises, the flight is
-steady again, and the log holds every message that was received. Two at a time: all but the response of u.
-In lockstep, where faults of messages do not exist, a killed node ends the flight with its name, and a stopped one changes no
-byte of the log.
+It injects the cases of tests/ros/flight_bringup/faults in real time, and those of failures of the past
+(tests/ros/flight_bringup/faults/draws.py). A fault passes where the node that should detects it, u responds as docs/faults.md
+states, no process ends or raises, the flight is steady again, and the log holds every message that was received. Two at a time:
+all but the response of u. In lockstep, where faults of messages do not exist, a killed node ends the flight with its name, and
+a stopped one changes no byte of the log.
 """
 
 import json
@@ -20,7 +20,7 @@ from typing import Annotated
 
 import typer
 from benchmarks.faults import Row, run_campaign
-from tests.ros.faults.draws import FOUND
+from tests.ros.flight_bringup.faults.draws import FOUND
 
 
 def main(

@@ -41,7 +41,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort the quick tests to the end: no worker computes long after the others have ended."""
-    items.sort(key=lambda item: item.path.parent.name == "pure" and item.get_closest_marker("slow") is None)
+    items.sort(key=lambda item: "pure" in item.path.parts and item.get_closest_marker("slow") is None)
 
 
 @pytest.fixture(scope="session")

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fields of the message types that the channel maps use and that common_interfaces lacks, as their packages publish them.
 
-Only the fields that a map uses, from the definitions of the releases below. tests/nodes/test_published_messages.py compares
-them with the installed packages.
+Only the fields that a map uses, from the definitions of the releases below.
+tests/nodes/autopilot_bridge/test_published_messages.py compares them with the installed packages.
 """
 
 import re

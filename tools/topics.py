@@ -25,7 +25,7 @@ POLICY_COMMENT = """ SPDX-FileCopyrightText: RISE-DI contributors
      parameters, changes the controller's state or engages the bridge. Lockstep needs `alive/*`, `clock` and
      `recorded`. The bridge has the topics of all maps of the library: delete those of other autopilots. Add
      the topics of `recorder.topics` to the recorder. Guidance publishes `/tf` where tf2_msgs is installed.
-     `python -m tools.topics` writes this file, tests/ros/test_policy.py compares it with the nodes. """
+     `python -m tools.topics` writes this file, tests/ros/flight_bringup/test_policy.py compares it with the nodes. """
 
 IN_LOCKSTEP = NODES[:-1]  # all but the bridge
 MONITOR = "monitor"

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Lets pytest in the folder of a package, as `colcon test` starts it, run the files of tests/ that the package's mark names."""
+"""Lets pytest in the folder of a package, as `colcon test` starts it, run the tests of the package in tests/."""
 
 from pathlib import Path
 
@@ -11,9 +11,8 @@ TESTS = SOURCES.parents[1] / "tests"
 
 
 def files_of(package: str) -> list[Path]:
-    """The test files that are marked `pytest.mark.package("PACKAGE")`."""
-    mark = f'pytest.mark.package("{package}")'
-    return sorted(path for path in TESTS.rglob("test_*.py") if mark in path.read_text(encoding="utf-8"))
+    """The test files of a package: those of tests/*/PACKAGE."""
+    return sorted(TESTS.glob(f"*/{package}/**/test_*.py"))
 
 
 def pytest_configure(config: pytest.Config) -> None:

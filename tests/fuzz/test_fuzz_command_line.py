@@ -17,8 +17,6 @@ from tests.fuzz.targets import SEEDS
 
 from flight_cli import cli
 
-pytestmark = pytest.mark.package("flight_cli")
-
 
 class CommandResult(NamedTuple):
     """Exit status and output of a command."""

@@ -119,10 +119,10 @@ def test_packages_citation_and_changelog_have_one_version() -> None:
     assert versions == {cited[1]} == {newest[1]}
 
 
-def test_each_package_has_marked_tests() -> None:
-    """No mark names a package that does not exist."""
-    text = "".join(path.read_text(encoding="utf-8") for path in TESTS.rglob("test_*.py"))
-    assert set(re.findall(r'pytest\.mark\.package\("(\w+)"\)', text)) == {package.name for package in PACKAGES}
+def test_each_folder_of_tests_is_of_a_package() -> None:
+    levels = [TESTS / level for level in ("pure", "nodes", "ros")]
+    folders = {path.name for level in levels for path in level.iterdir() if any(path.rglob("test_*.py"))}
+    assert folders == {package.name for package in PACKAGES}
 
 
 def test_pytest_runs_the_tests_of_a_package() -> None:

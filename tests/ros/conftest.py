@@ -199,7 +199,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 
 def settable_clock(folder: Path) -> Path:
-    """A library that gives the processes that load it a system clock that can be set: tests/ros/faults/clock.c."""
+    """A library, of faults/clock.c, that gives the processes that load it a system clock that can be set."""
     compiler = shutil.which("cc")
     if compiler is None:
         pytest.skip("no C compiler for a clock that can be set")

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: RISE-DI contributors
 # SPDX-License-Identifier: Apache-2.0
-"""All private names of rclpy 7.1 that the stack uses; tests/ros/test_rclpy_private.py checks them."""
+"""All private names of rclpy 7.1 that the stack uses; tests/ros/flight_ros/test_rclpy_private.py checks them."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias

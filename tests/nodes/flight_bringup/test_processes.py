@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The processes of a flight, each a program of the test: what ended a flight is named, and a log has time to be closed."""
+
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from tests.ros.waiting import HANG, until
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_bringup import processes
+from flight_bringup.graph import NodeSpec
+from flight_bringup.processes import FlightProcesses, NotReadyError
+from flight_core.parameters import ParameterError
+
+SILENT_MONITOR: Any = SimpleNamespace(is_ready=lambda *_: False, is_matched=lambda *_: False)  # in place of a FlightMonitor
+
+
+@pytest.fixture
+def only_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A first stage of one process: the module `fake.main`, whose file the test writes."""
+    (tmp_path / "fake").mkdir()
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(processes, "FIRST_STAGE", (NodeSpec("fake", "controller"),))
+    monkeypatch.setattr(processes, "parameter_overrides", lambda *_, **__: {})
+    monkeypatch.setattr(processes, "READY_TIMEOUT", 3.0)
+    return tmp_path / "fake" / "main.py"
+
+
+def start_stage(scenario: Scenario, run: Path) -> None:
+    with FlightProcesses(scenario, run, SILENT_MONITOR, lockstep=False, one_process=False):
+        pass
+
+
+def test_log_line_does_not_start_flight(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+    code = "import time\nprint('[INFO] [1.0] [controller]: ready', flush=True)\ntime.sleep(60)\n"
+    only_stage.write_text(code, encoding="utf-8")
+    with pytest.raises(ParameterError, match="timed out waiting for controller: not ready after 3 s; see the logs in "):
+        start_stage(osprey_gust, tmp_path / "run")
+    assert "[controller]: ready" in (tmp_path / "run" / "log" / "controller.log").read_text(encoding="utf-8")
+
+
+def test_process_ending_while_others_wait_named_at_once(
+    only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "READY_TIMEOUT", HANG)
+    only_stage.write_text("import sys\nprint('error: no such airframe')\nsys.exit(2)\n", encoding="utf-8")
+    begin = time.monotonic()
+    with pytest.raises(ParameterError, match=r"^controller ended with status 2: no such airframe$"):
+        start_stage(osprey_gust, tmp_path / "run")
+    assert time.monotonic() - begin < HANG / 2
+
+
+@pytest.mark.parametrize(
+    ("end", "flew_never", "cause"),
+    [
+        ("import os\nos.kill(os.getpid(), 9)\n", True, "controller was killed by SIGKILL"),
+        ("", True, "controller was shut down"),
+        ("import sys\nsys.exit(1)\n", True, "controller ended with status 1: no output"),
+        (
+            "import sys\nprint('error: no such airframe')\nsys.exit(2)\n",
+            False,
+            "controller ended with status 2: no such airframe",
+        ),
+    ],
+    ids=["killed", "shut down", "exception", "bad input"],
+)
+def test_end_before_ready_is_bad_input_only_by_its_status(
+    end: str, flew_never: bool, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    """`rise-di fly` ends with status 3 for NotReadyError, and else with 2."""
+    only_stage.write_text(end, encoding="utf-8")
+    with pytest.raises(ParameterError, match=f"^{cause}$") as caught:
+        start_stage(osprey_gust, tmp_path / "run")
+    assert isinstance(caught.value, NotReadyError) is flew_never
+
+
+def test_process_that_ends_named_with_fatal_line_not_last_one(only_stage: Path, osprey_gust: Scenario, tmp_path: Path) -> None:
+    lines = "[FATAL] [1.0] [controller]: lost contact with aircraft", "[INFO] [1.1] [controller]: 3 messages in run"
+    only_stage.write_text(f"import sys\nprint({chr(10).join(lines)!r})\nsys.exit(3)\n", encoding="utf-8")
+    with pytest.raises(ParameterError, match=r"^controller ended with status 3: lost contact with aircraft$"):
+        start_stage(osprey_gust, tmp_path / "run")
+
+
+def test_flight_without_matched_nodes_never_begins(
+    osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "READY_TIMEOUT", 0.05)
+    given: list[float] = []
+    state = {"controller": {"ready"}, "aircraft": {"ready", "matched"}, "recorder": set[str]()}
+    monitor = SimpleNamespace(
+        is_ready=lambda name, _: "ready" in state[name], is_matched=lambda name, _: "matched" in state[name], start=given.append
+    )
+    flight = FlightProcesses(osprey_gust, tmp_path, monitor, lockstep=False, one_process=False)  # type: ignore[arg-type]
+    popen = SimpleNamespace(pid=1, poll=lambda: None)
+    flight.processes = [SimpleNamespace(node=NodeSpec("fake", name), popen=popen) for name in state]  # type: ignore[misc]
+    late = "controller has an input without a publisher; recorder not ready after 0.05 s"
+    assert flight.begin() == f"never flew: {late}"
+    assert given == []
+    state |= {name: {"ready", "matched"} for name in state}
+    assert flight.begin() == ""
+    assert given == [flight.start_time] == [pytest.approx(time.time() + 0.5, abs=0.4)]
+
+
+LOSES_CONTACT = "import sys\nprint('[FATAL] [1.0] [recorder]: lost contact with aircraft')\nsys.exit(3)\n"
+
+
+@pytest.mark.parametrize(
+    ("end", "cause"),
+    [
+        ("import os\nos.kill(os.getpid(), 9)\n", "aircraft was killed by SIGKILL"),
+        ("import sys\nprint('[FATAL] [1.0] [aircraft]: diverged')\nsys.exit(3)\n", "aircraft ended with status 3: diverged"),
+    ],
+    ids=("killed", "diverged"),
+)
+def test_cause_named_when_recorder_that_lost_contact_has_ended_too(
+    end: str, cause: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path
+) -> None:
+    only_stage.write_text(LOSES_CONTACT, encoding="utf-8")
+    (tmp_path / "cause").mkdir()
+    (tmp_path / "cause" / "main.py").write_text(end, encoding="utf-8")
+    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=True, one_process=False)
+    for node in (NodeSpec("fake", "recorder"), NodeSpec("cause", "aircraft")):
+        flight.processes.append(processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / f"{node.executable}.log"))
+    for process in flight.processes:
+        process.popen.wait()
+    assert flight.ended_early() == cause
+    flight.stop()
+
+
+CLOSES_SLOWLY = """
+import signal, time
+signal.signal(signal.SIGTERM, signal.default_int_handler)
+try:
+    print("up", flush=True)
+    time.sleep(60)
+except KeyboardInterrupt:
+    time.sleep(1.0)
+    print("closed")
+"""
+
+
+@pytest.mark.parametrize("executable", ["recorder", "one_process"])
+def test_process_that_closes_log_has_time_for_it(
+    executable: str, only_stage: Path, osprey_gust: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only_stage.write_text(CLOSES_SLOWLY, encoding="utf-8")
+    node = NodeSpec("fake", executable)
+    monkeypatch.setattr(processes, executable.upper(), node)
+    monkeypatch.setattr(processes, "STOP_TIMEOUT", 0.1)  # of the other nodes
+    flight = FlightProcesses(osprey_gust, tmp_path, SILENT_MONITOR, lockstep=False, one_process=False)
+    process = processes.NodeProcess(node, osprey_gust.path, {}, tmp_path / "node.log")
+    flight.processes.append(process)
+    until(lambda: "up" in process.lines, "the process is up")
+    flight.stop()
+    assert "closed" in process.lines

@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A receiver looks at size and publisher before it decodes, and refuses, counts and logs what does not fit."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.joint_states import JOINT_STATE, STORE, vector
+
+from flight_core.publisher_lock import PublisherLock
+from flight_core.vectors import ChannelError, StampedVector
+from flight_ros import messages
+from flight_ros.messages import MAX_SIZE, Decoder, Encoder, NamedDecoder, require_size
+from flight_ros.receiver import Receiver, Refusals
+from flight_ros.subscriptions import PolledSubscription, ReceivedMessage
+from flight_ros.topics import Y
+
+NAMES = ("q", "V")
+MAX_AGE, TAKEOVER = 100, 1000  # ns
+
+
+class Topic(PolledSubscription):
+    """A subscription without middleware. It is also the node that logs."""
+
+    def __init__(self) -> None:
+        self.topic, self.name = Y, "/y"
+        self.messages: list[bytes] = []
+        self.lines: list[tuple[str, str]] = []
+
+    def take(self, most: int | None = None) -> list[ReceivedMessage]:
+        """The messages, without metadata."""
+        taken, self.messages = self.messages[:most], self.messages[most or len(self.messages) :]
+        return [ReceivedMessage(message, 0, 0, 0) for message in taken]
+
+    def get_logger(self) -> Any:
+        """Itself."""
+        return self
+
+    def error(self, line: str) -> None:
+        """Keep a line."""
+        self.lines.append(("error", line))
+
+    def warning(self, line: str) -> None:
+        """Keep a line."""
+        self.lines.append(("warning", line))
+
+
+class Setup:
+    """A receiver with what it decoded and took."""
+
+    def __init__(self, *, locked: bool = True, max_age: int | None = None, max_size: int | None = None) -> None:
+        self.topic = Topic()
+        self.refusals = Refusals(self.topic)
+        self.decoded: list[bytes] = []
+        self.taken: list[StampedVector] = []
+        self._decoder = Decoder(NAMES)
+        lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER)) if locked else None
+        max_age_ns = None if max_age is None else lambda: max_age
+        self.receiver = Receiver(
+            self.topic, self.refusals, self.decode, self.take, lock=lock, max_age_ns=max_age_ns, max_size=max_size
+        )
+
+    def decode(self, raw: bytes) -> StampedVector | None:
+        """Decode a message and remember the bytes."""
+        self.decoded.append(raw)
+        return self._decoder.decode(raw)
+
+    def take(self, sample: StampedVector, now_ns: int) -> None:
+        """Take a sample with q of at most 1."""
+        if sample.value[0] > 1.0:
+            raise ChannelError("bounds", "beyond")
+        self.taken.append(sample)
+
+    def poll(self, *messages: bytes, now_ns: int = 0, limit: int | None = None) -> list[bool]:
+        """Poll after these messages have arrived."""
+        self.topic.messages += messages
+        return self.receiver.poll(now_ns, limit)
+
+
+def message(sender: str = "/aircraft#1", stamp_ns: int = 0, q: float = 0.5, names: tuple[str, ...] = NAMES) -> bytes:
+    return Encoder(names, sender).encode(stamp_ns, np.array([q, *np.zeros(len(names) - 1)]))
+
+
+def of_size(size: int, sender: str = "/aircraft#1") -> bytes:
+    """A message of as many channels as the size takes."""
+    raw = message(sender, names=tuple(f"c{k}" for k in range(size // 20)))
+    return raw + bytes(size - len(raw))
+
+
+def test_valid_sample_is_taken() -> None:
+    setup = Setup()
+    empty = Encoder((), "/aircraft#1").encode(0, np.zeros(0))
+    assert setup.poll(message(), empty) == [True, True]
+    assert [(sample.sender, sample.value.tolist()) for sample in setup.taken] == [("/aircraft#1", [0.5, 0.0])]
+    assert not setup.refusals.counts
+
+
+def test_poll_has_a_limit() -> None:
+    setup = Setup()
+    assert setup.poll(message(), message(), message(), limit=1) == [True]
+    assert setup.poll() == [True, True]
+
+
+@pytest.mark.parametrize("size", [MAX_SIZE + 1, 1_200_000])
+@pytest.mark.parametrize("sender", ["/aircraft#1", "/foreign"])
+def test_long_message_is_not_decoded(size: int, sender: str) -> None:
+    setup = Setup()
+    assert setup.poll(of_size(size, sender)) == [False]
+    assert setup.receiver.receive() == []
+    setup.topic.messages.append(of_size(size, sender))
+    assert setup.receiver.receive() == [None]  # in lockstep
+    assert setup.decoded == []
+    assert setup.refusals.counts == {"y: size": 2}
+    assert setup.topic.lines == [
+        ("warning", f"/y: sample refused: a message of {size} bytes, expected at most {MAX_SIZE}")
+    ]  # one line, for it is the same topic and reason
+
+
+def test_long_message_under_the_name_of_the_publisher_is_not_decoded() -> None:
+    """The longer, the dearer: 16 kB cost 22 times a right message. A publisher that timed out may have other channels."""
+    setup = Setup()
+    right, longer = message(), message(names=(*NAMES, "alpha"))
+    too_long = longer + bytes(len(longer) + 1)
+    assert setup.poll(right, longer, right, too_long, of_size(MAX_SIZE)) == [True, True, True, False, False]
+    assert len(setup.decoded) == 3
+    assert setup.refusals.counts == {"y: size": 2}
+    assert setup.topic.lines[0][1].endswith(f"bytes, expected at most {2 * len(longer)}")
+    assert setup.poll(too_long[:-1]) == [True]
+    wide = message(names=(*NAMES, *(f"c{k}" for k in range(40))))
+    assert setup.poll(wide, now_ns=MAX_AGE) == [False]
+    assert setup.poll(wide, now_ns=MAX_AGE + 1) == [True]
+
+
+def test_report_may_be_much_longer_than_the_one_before() -> None:
+    """A learner without a model says so in 300 bytes, and proposes 10,000 bytes half a timeout later."""
+    right, long = message(), message(names=(*NAMES, *(f"c{k}" for k in range(800))))
+    setup = Setup(max_size=len(long))
+    assert setup.poll(right, long, long + bytes(1)) == [True, True, False]
+
+
+def test_size_limit_is_inclusive() -> None:
+    require_size(bytes(MAX_SIZE))
+    with pytest.raises(ChannelError, match=f"a message of {MAX_SIZE + 1} bytes"):
+        require_size(bytes(MAX_SIZE + 1))
+
+
+@pytest.mark.parametrize("decoder", [Decoder(NAMES), NamedDecoder()])
+def test_no_client_decodes_long_message(decoder: Decoder | NamedDecoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command that waits for a topic has no receiver."""
+    monkeypatch.setattr(messages, "deserialize_message", None)
+    with pytest.raises(ChannelError, match="a message of 1200000 bytes"):
+        decoder.decode(of_size(1_200_000))
+
+
+def big_endian(sender: str) -> bytes:
+    """A message of NAMES by the big-endian encoding of CDR."""
+    made = STORE.deserialize_cdr(vector(0, NAMES, (0.5, 0.0), sender), JOINT_STATE)
+    return bytes(STORE.serialize_cdr(made, JOINT_STATE, little_endian=False))
+
+
+FOREIGN = [message("/foreign"), of_size(MAX_SIZE, "/foreign"), message("/foreign", names=("a",)), big_endian("/foreign")]
+
+
+@pytest.mark.parametrize("raw", FOREIGN)
+def test_conflicting_publisher_is_not_decoded(raw: bytes) -> None:
+    setup = Setup()
+    assert setup.poll(message(), raw) == [True, False]
+    assert len(setup.decoded) == 1
+    assert setup.refusals.counts == {"y: sender": 1}
+    sentence = "conflicting publisher /foreign ignored: already receiving from /aircraft#1"
+    assert setup.topic.lines == [("error", f"/y: sample refused: {sentence}")]
+    assert setup.refusals.last["/y"][1] == sentence
+    assert [setup.refusals.conflict(), setup.refusals.conflict()] == [f"/y: {sentence}", ""]
+    assert setup.poll(message("/foreign"), now_ns=TAKEOVER + 1) == [True]  # the first one has timed out
+
+
+def test_big_endian_publisher_is_taken() -> None:
+    setup = Setup()
+    assert setup.poll(big_endian("/aircraft#1"), message()) == [True, True]
+
+
+@pytest.mark.parametrize("encapsulation", [b"\x00\x02", b"\x00\x03", b"\x00\x07", b"\x00\x0b", b"\xff\xff"])
+def test_message_of_another_encoding_is_not_decoded(encapsulation: bytes) -> None:
+    """PL_CDR and XCDR2, whose publisher has another place."""
+    setup = Setup()
+    assert setup.poll(encapsulation + message()[2:]) == [False]
+    assert setup.decoded == []
+    assert setup.refusals.counts == {"y: malformed": 1}
+
+
+def test_without_lock_each_publisher_is_taken() -> None:
+    setup = Setup(locked=False)
+    assert setup.poll(message("/one"), message("/two")) == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("raw", "reason"),
+    [
+        (b"", "malformed"),
+        (message()[:30], "malformed"),
+        (message(names=("q", "x")), "name"),
+        (message(q=np.nan), "finite"),
+        (message(q=2.0), "bounds"),
+    ],
+)
+def test_invalid_message_does_not_lock(raw: bytes, reason: str) -> None:
+    setup = Setup()
+    assert setup.poll(raw) == [False]
+    assert setup.refusals.counts == {f"y: {reason}": 1}
+    assert setup.poll(message("/second")) == [True]
+
+
+@pytest.mark.parametrize(("stamp_ns", "reason"), [(-101, "old"), (101, "future"), (-100, ""), (100, "")])
+def test_stamps_are_limited_both_ways(stamp_ns: int, reason: str) -> None:
+    setup = Setup(max_age=MAX_AGE)
+    assert setup.poll(message(stamp_ns=stamp_ns)) == [not reason]
+    assert setup.refusals.counts == ({f"y: {reason}": 1} if reason else {})
+
+
+def test_received_sample_is_accepted_as_polled() -> None:
+    """Lockstep: all messages are decoded, then accepted at their instants."""
+    setup = Setup(max_age=MAX_AGE)
+    setup.topic.messages += [message(), b"", message("/foreign"), message(stamp_ns=500)]
+    samples = setup.receiver.receive()
+    assert [sample is None for sample in samples] == [False, True, False, False]
+    for sample in samples:
+        if sample is not None:
+            setup.receiver.accept(sample, 0)
+    assert len(setup.taken) == 1
+    assert setup.refusals.counts == {"y: malformed": 1, "y: sender": 1, "y: future": 1}

@@ -1,0 +1,57 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sockets that are open to the network are found, and a replayed u is refused."""
+
+import socket
+
+import psutil
+import pytest
+from sensor_msgs.msg import JointState
+from tests.nodes.aircraft_sim.test_aircraft import MAX_AGE, flying
+
+from aircraft_sim.node import AircraftNode
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_ros.transport import LOOPBACK_PROFILE, open_to_network
+
+
+class EarlierProcess(psutil.Process):
+    """As psutil has it before release 6."""
+
+    connections = psutil.Process.net_connections
+
+    @property
+    def net_connections(self) -> None:  # type: ignore[override]
+        """Raise AttributeError."""
+        raise AttributeError
+
+
+@pytest.mark.parametrize("process", [psutil.Process, EarlierProcess])
+def test_socket_on_all_interfaces_found_in_spite_of_loopback_profile(
+    process: type[psutil.Process], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(psutil, "Process", process)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOOPBACK_PROFILE))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as local:
+        opened.bind(("0.0.0.0", 0))  # noqa: S104 - on purpose, for nothing to read
+        local.bind(("127.0.0.1", 0))
+        found = open_to_network()
+        assert f"0.0.0.0:{opened.getsockname()[1]}" in found
+        assert not any(address.endswith(f":{local.getsockname()[1]}") for address in found)
+
+
+def test_replayed_u_refused_by_stamp(osprey_gust: Scenario) -> None:
+    """Also by a restarted aircraft, which has no memory of the last stamp."""
+    with flying(osprey_gust, max_age=MAX_AGE) as flight:
+        publisher = flight.world.publisher(JointState, "/u")
+        flight.fly(0.01)
+        _, recorded = flight.world.sent["/u"][0]
+        taken = len(flight.node.log.lines)
+        flight.world.run(0.1, lambda: publisher.publish(recorded))
+        assert flight.node.refusals.counts["u: old"] > 10
+        assert any("/u: sample refused: " in line for line in flight.node.log.lines[taken:])
+
+        flight.world.end(flight.node)
+        restarted = flight.world.start(AircraftNode)
+        flight.world.run(0.1, lambda: publisher.publish(recorded))
+        assert restarted.refusals.counts["u: old"] > 10
+        assert not any("receiving u from" in line for line in restarted.log.lines)

@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Dryden turbulence against the published spectra: lengths, intensities, filters, ensemble statistics, repeatability."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.linalg import expm
+from tests.builders import MS, aircraft_parameters, truth_of
+
+from aircraft_sim import plant, turbulence
+from aircraft_sim.disturbance import AXES
+from aircraft_sim.simulator import Simulator
+from aircraft_sim.turbulence import Dryden, Turbulence, dryden, filters
+from flight_core.vectors import FloatArray
+
+pytestmark = pytest.mark.slow
+
+FEET, KNOTS = 0.3048, 0.514444  # m, m/s
+V0 = 25.0
+SMALL = Dryden(np.array([60.0, 60.0, 25.0]), np.array([1.1, 1.1, 0.8]))  # about 60 ft above the ground in 15 kt
+ALL = (0, 1, 2)
+TURBULENCE = {"altitude": 30.0, "wind": 7.7}
+
+
+def spectrum(omega: FloatArray, axis: int, model: Dryden) -> FloatArray:
+    """The published spectrum, one-sided in omega, m^2/s^2 per rad/s: MIL-F-8785C, 3.7.1.2, in Omega = omega / V0."""
+    L, sigma, space = model.length[axis], model.sigma[axis], omega / V0
+    if axis == 0:
+        return np.asarray(sigma**2 * 2.0 * L / np.pi / (1.0 + (L * space) ** 2) / V0)
+    return np.asarray(sigma**2 * L / np.pi * (1.0 + 3.0 * (L * space) ** 2) / (1.0 + (L * space) ** 2) ** 2 / V0)
+
+
+def correlation(lag: FloatArray, axis: int, model: Dryden) -> FloatArray:
+    """Dryden's correlation at a distance d = V0 lag: sigma^2 exp(-d/L) along the flight, (1 - d/2L) times that across it."""
+    d = V0 * np.abs(lag) / model.length[axis]
+    return np.asarray(model.sigma[axis] ** 2 * np.exp(-d) * (1.0 if axis == 0 else 1.0 - d / 2.0))
+
+
+def ensemble(model: Dryden, dt: float, seeds: int, steps: int) -> FloatArray:
+    """Winds of many seeds at multiples of dt, shape (3, seeds, steps)."""
+    params = [filters(model, V0, dt, ALL, seed) for seed in range(seeds)]
+    z = np.array([turbulence.initial_state(filter_params) for filter_params in params]).T
+    numbers = np.array([turbulence.normals(0, steps, seed) for seed in range(seeds)])
+    winds = np.empty((3, seeds, steps))
+    for k in range(steps):
+        winds[:, :, k] = turbulence.wind(z, params[0])
+        z = turbulence.step(z, numbers[:, k].T, params[0])
+    return winds
+
+
+@pytest.mark.parametrize(
+    ("feet", "wind", "sigma", "lengths", "intensities"),
+    [
+        # c = 0.177 + 0.000823 h. At 1000 ft c = 1, and all lengths are 1000 ft, all intensities W_20 / 10.
+        (1000.0, 15.0, 0.0, (1000.0, 1000.0, 1000.0), (1.5, 1.5, 1.5)),
+        (100.0, 15.0, 0.0, (100.0 / 0.2593**1.2, 100.0 / 0.2593**1.2, 100.0), (1.5 / 0.2593**0.4, 1.5 / 0.2593**0.4, 1.5)),
+        (2000.0, 0.0, 5.0, (1750.0,) * 3, (5.0,) * 3),
+        (1500.0, 15.0, 5.0, (1375.0,) * 3, (3.25,) * 3),  # in the middle
+    ],
+)
+def test_lengths_and_intensities_are_those_published(
+    feet: float, wind: float, sigma: float, lengths: tuple[float, ...], intensities: tuple[float, ...]
+) -> None:
+    found = dryden(feet * FEET, wind * KNOTS, sigma * KNOTS)
+    assert found.length == pytest.approx(np.array(lengths) * FEET)
+    assert found.sigma == pytest.approx(np.array(intensities) * KNOTS)
+
+
+def continuous(model: Dryden) -> tuple[FloatArray, FloatArray]:
+    """F and G of the docstring's z_dot = F z + G n."""
+    a = V0 / model.length
+    F, G = np.zeros((5, 5)), np.zeros((5, 3))
+    for axis, first in enumerate((0, 1, 3)):
+        F[first, first], G[first, axis] = -a[axis], math.sqrt(2.0 * a[axis])
+    for first, rate in ((1, a[1]), (3, a[2])):
+        F[first + 1, first : first + 2] = rate, -rate
+    return F, G
+
+
+@pytest.mark.parametrize("axis", ALL, ids=AXES)
+def test_the_filters_have_the_published_spectra(axis: int) -> None:
+    F, G = continuous(SMALL)
+    output = filters(SMALL, V0, 0.01, ALL, 1).output
+    for omega in np.logspace(-2, 2, 9):
+        response = output[axis] @ np.linalg.solve(1j * omega * np.eye(5) - F, G)
+        # White noise of unit intensity has the one-sided spectrum 1/pi.
+        assert np.sum(np.abs(response) ** 2) / np.pi == pytest.approx(float(spectrum(omega, axis, SMALL)), rel=1e-12)
+
+
+@given(dt=st.floats(1e-6, 10.0), altitude=st.floats(3.048, 600.0))
+def test_step_is_exact_solution_of_filters(dt: float, altitude: float) -> None:
+    # Van Loan: exp([[-F, G G'], [0, F']] dt) holds exp(F dt) and the covariance. exp(-F dt) grows: at h = 5 the covariance has
+    # lost four digits of sixteen, so the comparison ends there.
+    model = dryden(altitude, 7.7, 1.5)
+    params = filters(model, V0, dt, ALL, 1)
+    transition, added = params.transition, params.spread @ params.spread.T
+    stationary = params.stationary @ params.stationary.T
+    assert transition @ stationary @ transition.T + added == pytest.approx(stationary, abs=1e-14)
+    if dt * V0 / model.length.min() < 5.0:
+        F, G = continuous(model)
+        double = expm(np.block([[-F, G @ G.T], [np.zeros((5, 5)), F.T]]) * dt)
+        assert transition == pytest.approx(expm(F * dt), rel=1e-9, abs=1e-14)
+        assert added == pytest.approx(double[5:, 5:].T @ double[:5, 5:], rel=1e-9, abs=1e-11)
+
+
+@pytest.mark.parametrize("axis", ALL, ids=AXES)
+def test_published_correlations_are_integrals_of_published_spectra(axis: int) -> None:
+    # The ensemble tests below use both: sigma^2 and the correlation are integrals of the spectrum over omega.
+    for lag in (0.0, 0.3, 2.0):
+        weight: dict[str, Any] = {"weight": "cos", "wvar": lag} if lag else {}
+        total = quad(lambda omega: float(spectrum(omega, axis, SMALL)), 0.0, np.inf, limit=500, **weight)[0]
+        assert total == pytest.approx(float(correlation(np.array(lag), axis, SMALL)), abs=1e-6)
+
+
+SEEDS, STEPS = 300, 1024
+
+
+@pytest.mark.equation("Assumption 2")
+def test_no_axis_is_differentiable_and_so_turbulence_lies_outside_theorem() -> None:
+    # With a bounded derivative the mean squares of increments are proportional to dt^2. Here they are proportional to dt: 2
+    # sigma^2 dt / T along the flight, 3 sigma^2 dt / T across it. The difference quotient grows without limit.
+    for axis, slope in enumerate((2.0, 3.0, 3.0)):
+        for dt in (1e-3, 1e-4, 1e-5):
+            increment = 2.0 * (correlation(np.array(0.0), axis, SMALL) - correlation(np.array(dt), axis, SMALL))
+            expected = slope * SMALL.sigma[axis] ** 2 * dt * V0 / SMALL.length[axis]
+            assert float(increment) == pytest.approx(expected, rel=2e-3)
+    fine = ensemble(SMALL, 1e-3, 100, 64)
+    mean = np.mean(np.diff(fine, axis=2) ** 2, axis=(1, 2)) / SMALL.sigma**2 * SMALL.length / (1e-3 * V0)
+    assert mean == pytest.approx([2.0, 3.0, 3.0], rel=0.1)  # 6300 nearly independent increments: 1.8 % standard deviation
+
+
+def test_numbers_of_step_k_do_not_depend_on_range() -> None:
+    whole = turbulence.normals(0, 300, 5)
+    for first, count in ((0, 1), (63, 2), (64, 64), (130, 99), (299, 1)):
+        assert (turbulence.normals(first, count, 5) == whole[first : first + count]).all()
+    assert (turbulence.normals(0, 300, 6) != whole).all()
+
+
+def test_turbulence_does_not_depend_on_how_flight_divided() -> None:
+    params, u = aircraft_parameters(turbulence=TURBULENCE).plant(), np.array([0.01, 0.1, 0.0, 0.0])
+    whole = plant.advance(0, plant.initial_state(params), u, 400 * MS, params)
+    cut = plant.initial_state(params)
+    for k in range(40):
+        cut = plant.advance(10 * k * MS, cut, u, 10 * MS, params)
+    assert cut.turbulence is not None
+    assert whole.turbulence is not None
+    assert cut.turbulence.tobytes() == whole.turbulence.tobytes()
+    assert cut.x == pytest.approx(whole.x, abs=1e-14)  # the instants are rounded differently
+    first, second = (Simulator(aircraft_parameters(turbulence=TURBULENCE)) for _ in range(2))
+    for number in range(20):
+        for simulator in (first, second):
+            simulator.sample(number, u)
+        assert first.truth().tobytes() == second.truth().tobytes()
+
+
+def test_truth_holds_wind_that_acts_from_now_on_and_f_includes_it() -> None:
+    gusts = {"vertical": {"start": 0.0, "speed": 2.0, "length": 2.5}}
+    parameters = aircraft_parameters(turbulence=TURBULENCE, gusts=gusts)
+    simulator, params = Simulator(parameters), parameters.plant()
+    air = params.turbulence
+    assert air is not None
+    z = turbulence.initial_state(air)
+    for number in range(3):
+        simulator.sample(number, np.zeros(4))
+        true = truth_of(simulator)
+        winds = dict(zip(parameters.sampled_airframe().gusts, turbulence.wind(z, air), strict=True))
+        gust = 1.0 - math.cos(math.pi * 0.01 * number * 25.0 / 2.5)
+        assert true["gust.lateral"] == winds["lateral"] != 0.0
+        assert true["gust.vertical"] == pytest.approx(winds["vertical"] + gust, rel=1e-12)
+        assert true["f.p"] == pytest.approx(3.13 / 25.0 * true["gust.lateral"], rel=1e-12)
+        for normal in turbulence.normals(5 * number, 5, 1):
+            z = turbulence.step(z, normal, air)
+
+
+def test_without_intensity_there_is_no_turbulence() -> None:
+    for calm in ({"altitude": 100.0, "wind": 0.0}, {"altitude": 400.0, "wind": 0.0, "sigma": 0.0}):
+        assert aircraft_parameters(turbulence=calm).plant().turbulence is None
+    light = {"altitude": 400.0, "wind": 0.0, "sigma": 0.1}
+    assert isinstance(aircraft_parameters(turbulence=light).plant().turbulence, Turbulence)

@@ -1,0 +1,530 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The MAVLink link over UDP, against a peer that is made with pymavlink alone."""
+
+import hashlib
+import re
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from tests.maps import named_map
+
+from autopilot_bridge.channel_map import set_field
+from autopilot_bridge.mavlink_link import COMPANION, Link, message_type
+from autopilot_bridge.params import ChannelMap, LinkConfig
+from flight_core.parameters import ParameterError
+from flight_core.vectors import ChannelError
+
+DENIED = 2  # MAV_RESULT_DENIED, which ArduPilot answers to a rate that it does not grant
+STATION_SILENCE = 5.0  # s
+SENDER = ("127.0.0.1", 14550)
+PATIENCE = 5.0  # s, a guard: what is awaited takes some ms
+
+
+class Peer:
+    """An autopilot's end of a link: it answers requests of rates, and grants at most 40 Hz."""
+
+    def __init__(self, port: int, system: int = 1, phrase: str = "", component: int = 1, kind: str = "udpout") -> None:
+        self.connection: Any = mavutil.mavlink_connection(
+            f"{kind}:127.0.0.1:{port}", source_system=system, source_component=component, dialect="ardupilotmega"
+        )
+        # Of MAVLink 2 from the begin: the parser that pymavlink makes at the first packet of MAVLink 2 has no passphrase.
+        self.connection.mav = mavlink.MAVLink(self.connection, srcSystem=system, srcComponent=component)
+        self.connection.mav.robust_parsing, self.connection.first_byte = True, False
+        if phrase:
+            self.connection.setup_signing(hashlib.sha256(phrase.encode()).digest())
+        self.requested: dict[int, float] = {}  # Hz by message
+
+    def beat(self) -> None:
+        """A heartbeat, armed and in MANUAL."""
+        time.sleep(0.01)
+        self.connection.mav.heartbeat_send(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4)
+
+    def attitude(self, pitchspeed: float, since_boot: float) -> None:
+        """An ATTITUDE, rad/s, with the time since boot, s."""
+        self.connection.mav.attitude_send(round(1e3 * since_boot), 0.0, 0.0, 0.0, 0.0, pitchspeed, 0.0)
+
+    def received(self) -> list[Any]:
+        """All that has come and was not taken yet."""
+        return list(iter(self.connection.recv_msg, None))
+
+    def answer(self) -> Any:
+        """The next message, after an answer where it is a request."""
+        message = self.connection.recv_match(blocking=True, timeout=0.05)
+        if message is not None and message.get_type() == "COMMAND_LONG":
+            self.requested[int(message.param1)] = 1e6 / message.param2
+            result = 0 if 1e6 / message.param2 <= 40.0 else DENIED
+            self.connection.mav.command_ack_send(message.command, result)
+        return message
+
+
+class Ends(NamedTuple):
+    """Makes a link that listens on a free port, and peers of it."""
+
+    link: Callable[..., tuple[Link, int]]
+    peer: Callable[..., Peer]
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    links: list[Link] = []
+    peers: list[Peer] = []
+
+    def make(
+        passphrase_file: str | None = None,
+        kind: str = "udpin",
+        at: int = 0,
+        parameters: Sequence[str] = (),
+        **rates: float,
+    ) -> tuple[Link, int]:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            port = at or free.getsockname()[1]
+        url = f"{kind}:127.0.0.1:{port}"
+        config = LinkConfig(url=url, rates=rates, passphrase_file=passphrase_file, station_silence=STATION_SILENCE)
+        links.append(Link(config, parameters))
+        return links[-1], port
+
+    def peer(port: int, **options: Any) -> Peer:
+        peers.append(Peer(port, **options))
+        return peers[-1]
+
+    yield Ends(make, peer)
+    for made in links:
+        made.close()
+    for end in peers:
+        end.connection.close()
+
+
+BEAT = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 3, 128, 0, 4, 3)
+
+
+def received(message: Any, system: int = 1, component: int = 1) -> Any:
+    """A message as it is decoded after its way over a link."""
+    packed = message.pack(mavlink.MAVLink(None, srcSystem=system, srcComponent=component))
+    return mavlink.MAVLink(None).parse_char(packed)
+
+
+class Clock:
+    """A monotonic clock that the test sets, s."""
+
+    now = 1000.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: made.now)
+    return made
+
+
+def until(condition: Callable[[], object], each: Callable[[], object]) -> None:
+    """Call `each` until the condition holds."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        each()
+
+
+def test_rates_are_requested_one_by_one_and_a_denied_one_is_named(ends: Ends) -> None:
+    made, port = ends.link(ATTITUDE=50.0, VFR_HUD=20.0)
+    made.start()
+    peer = ends.peer(port)
+    peer.beat()
+    until(lambda: made.problem("ATTITUDE") and len(peer.requested) == 2, peer.answer)
+    assert peer.requested == {
+        mavlink.MAVLINK_MSG_ID_ATTITUDE: pytest.approx(50.0),
+        mavlink.MAVLINK_MSG_ID_VFR_HUD: pytest.approx(20.0),
+    }
+    assert made.problem() == ("the autopilot denied 50 Hz of ATTITUDE (MAV_RESULT 2): ArduPilot grants 0.8 SCHED_LOOP_RATE")
+    assert made.problem("VFR_HUD") == ""
+
+
+def test_messages_of_the_autopilot_arrive_with_their_instant_and_those_of_others_do_not(ends: Ends) -> None:
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    before = time.time_ns()
+    ends.peer(port, system=2).connection.mav.attitude_send(1, 0.9, 0.9, 0.9, 0.9, 0.9, 0.9)
+    peer = ends.peer(port)
+
+    def send() -> None:
+        peer.beat()
+        peer.connection.mav.attitude_send(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+
+    until(lambda: queue, send)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.5)] * len(queue)
+    assert before <= queue[0].received_ns <= time.time_ns()
+    assert made.conflict == ""
+
+
+def test_override_reaches_the_autopilot_and_leaves_other_channels(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    peer = ends.peer(port)
+    peer.beat()
+    message = message_type("RC_CHANNELS_OVERRIDE")()
+    for path, value in {**named_map("ardupilot_mavlink").messages["override"].values, "chan2_raw": 1612.4}.items():
+        set_field(message, path, value)
+    taken: list[Any] = []
+
+    def take() -> None:
+        made.send(message)
+        if (received := peer.answer()) is not None and received.get_type() == "RC_CHANNELS_OVERRIDE":
+            taken.append(received)
+
+    until(lambda: taken, take)
+    sent = taken[0]
+    assert (sent.get_srcSystem(), sent.target_system, sent.target_component) == (255, 1, 1)
+    assert [getattr(sent, f"chan{n}_raw") for n in (1, 2, 5, 9)] == [0, 1612, 65535, 0]  # released, set, as is, as is
+
+
+def test_second_sender_is_conflict_is_not_taken_and_gets_nothing(ends: Ends) -> None:
+    """One autopilot is flown, as on a topic. Another one may be a second aircraft, or a program of this host."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot.attitude(0.1, since_boot=50.0)
+    until(lambda: queue, autopilot.received)
+    second.attitude(0.9, since_boot=50.0)  # also with the right time since boot
+    until(lambda: made.conflict, autopilot.received)
+    locked, foreign = (end.connection.port.getsockname()[1] for end in (autopilot, second))
+    assert made.conflict == (
+        f"a second sender, 127.0.0.1:{foreign}, sends as the autopilot: 127.0.0.1:{locked} was first and is taken alone"
+    )
+    assert made.conflict in made.problem()
+    autopilot.attitude(0.1, since_boot=50.1)
+    until(lambda: len(queue) == 2, autopilot.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    overrides: list[Any] = []
+
+    def send() -> None:
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        overrides.extend(message for message in autopilot.received() if message.get_type() == "RC_CHANNELS_OVERRIDE")
+
+    until(lambda: len(overrides) >= 5, send)
+    assert second.received() == []  # neither overrides nor heartbeats nor requests
+
+
+def test_next_sender_gets_the_messages_once_the_first_one_is_silent(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.SILENCE", 0.05)  # s
+    made, port = ends.link(HEARTBEAT=5.0)
+    made.start()
+    first, second = ends.peer(port), ends.peer(port)
+    until(first.received, first.beat)
+    until(second.received, second.beat)
+    first.received()
+    sent: list[Any] = []
+
+    def send() -> None:
+        second.beat()
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        sent.extend(second.received())
+
+    until(lambda: "RC_CHANNELS_OVERRIDE" in [message.get_type() for message in sent], send)
+    assert first.received() == []
+
+
+def test_conflict_of_second_sender_ends_after_its_last_message(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, port = ends.link()
+    made.start()
+    autopilot, second = ends.peer(port), ends.peer(port)
+    autopilot.beat()
+    until(lambda: made.conflict, second.beat)
+    now = time.monotonic
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: now() + 3.1)
+    assert made.conflict == ""
+
+
+def test_second_clock_behind_the_address_of_the_autopilot_is_conflict(ends: Ends) -> None:
+    """Two autopilots with one number behind a router have one address, and times since boot of their own."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    router = ends.peer(port)
+    for pitchspeed, since_boot in ((0.1, 100.0), (0.9, 40.0), (0.1, 100.1), (0.9, 400.0), (0.1, 100.2)):
+        router.attitude(pitchspeed, since_boot)
+    until(lambda: len(queue) == 3, router.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 3
+    assert made.conflict.endswith(" jumps: a second autopilot sends there, or it has started again")
+
+
+def test_messages_of_other_components_of_the_system_are_not_taken(ends: Ends) -> None:
+    """A gimbal (component 154) and a companion computer (191) send an ATTITUDE too, of themselves, on the link or beside it."""
+    made, port = ends.link()
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot = ends.peer(port)
+    autopilot.attitude(0.1, since_boot=50.0)
+    for component in (154, 191, 0):
+        routed = mavlink.MAVLink(autopilot.connection, srcSystem=1, srcComponent=component)
+        routed.attitude_send(50_000, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
+        ends.peer(port, component=component).attitude(0.9, since_boot=50.0)
+    autopilot.attitude(0.1, since_boot=50.1)  # of the packets to one socket the last one is read last
+    until(lambda: len(queue) == 2, autopilot.received)
+    assert [received.message.pitchspeed for received in queue] == [pytest.approx(0.1)] * 2
+    assert made.conflict == ""
+
+
+def test_link_over_tcp_receives_and_sends(ends: Ends) -> None:
+    autopilot = ends.peer(0, kind="tcpin")
+    made, _ = ends.link(kind="tcp", at=autopilot.connection.listen.getsockname()[1])
+    queue = made.listen("ATTITUDE")
+    made.start()
+    autopilot.received()  # accepts the call
+    autopilot.attitude(0.1, since_boot=50.0)
+    until(lambda: queue, autopilot.received)
+    assert queue[0].message.pitchspeed == pytest.approx(0.1)
+    received: list[Any] = []
+
+    def send() -> None:
+        made.send(message_type("RC_CHANNELS_OVERRIDE")())
+        received.extend(message.get_type() for message in autopilot.received())
+
+    until(lambda: "RC_CHANNELS_OVERRIDE" in received, send)
+
+
+def test_second_sender_with_the_number_of_the_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    other = ends.peer(port, system=255)
+    until(lambda: made.conflict, other.beat)
+    assert "another sender" in made.conflict
+    assert "system 255 too" in made.conflict
+
+
+@pytest.mark.parametrize("name", ["RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"])
+def test_joystick_of_a_ground_station_with_the_number_of_the_bridge_is_conflict(ends: Ends, name: str) -> None:
+    made, _ = ends.link()
+    made._take(
+        received(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3), system=255, component=190), SENDER, 0
+    )
+    assert made.conflict == ""  # the station itself, whose failsafe FS_GCS_ENABL of the autopilot watches
+    sticks = {
+        "RC_CHANNELS_OVERRIDE": mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
+        "MANUAL_CONTROL": mavlink.MAVLink_manual_control_message(1, 0, 0, 0, 0, 0),
+    }
+    made._take(received(sticks[name], system=255, component=190), SENDER, 0)
+    assert "has system 255 too" in made.conflict
+    assert "switch the joystick of a ground station off" in made.conflict
+
+
+def test_other_bridge_is_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    second = ends.peer(port, system=1)
+    second.connection.mav.srcComponent = COMPANION
+    until(lambda: made.conflict, second.beat)
+    assert made.conflict == f"another bridge is on udpin:127.0.0.1:{port}: end it"
+
+
+def test_bridge_is_no_ground_station_but_by_the_messages_of_its_map(ends: Ends) -> None:
+    """ArduPilot counts messages of its ground station for FS_GCS_ENABL: a dry run, which sends none of the map, has none."""
+    made, port = ends.link(parameters=("RC_OVERRIDE_TIME",), ATTITUDE=40.0)
+    made.start()
+    peer, messages = ends.peer(port), list[Any]()
+
+    def take() -> None:
+        peer.beat()
+        messages.extend(message for message in [peer.answer()] if message is not None)
+
+    until(lambda: {"HEARTBEAT", "COMMAND_LONG", "PARAM_REQUEST_READ"} <= {message.get_type() for message in messages}, take)
+    senders = {(message.get_srcSystem(), message.get_srcComponent()) for message in messages}
+    assert senders == {(1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER4)}
+    beat = next(message for message in messages if message.get_type() == "HEARTBEAT")
+    assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
+    made.send(message_type("RC_CHANNELS_OVERRIDE")())
+    messages.clear()
+    until(lambda: any(message.get_type() == "RC_CHANNELS_OVERRIDE" for message in messages), take)
+    override = next(message for message in messages if message.get_type() == "RC_CHANNELS_OVERRIDE")
+    assert override.get_srcSystem() == 255
+    messages.clear()
+    until(lambda: any(message.get_type() == "HEARTBEAT" for message in messages), take)
+    assert {message.get_srcSystem() for message in messages if message.get_type() == "HEARTBEAT"} == {1}  # also after it
+
+
+def test_parameter_is_read_and_an_autopilot_that_starts_again_is_asked_again(ends: Ends, clock: Clock) -> None:
+    made, _ = ends.link(parameters=("RC_OVERRIDE_TIME",))
+    value = mavlink.MAVLink_param_value_message(b"RC_OVERRIDE_TIME", 0.5, mavlink.MAV_PARAM_TYPE_REAL32, 1, 0)
+    made._take(received(value, system=2), SENDER, 0)
+    assert made.parameters == {}  # of another autopilot
+    made._take(received(value), SENDER, 0)
+    assert made.parameters == {"RC_OVERRIDE_TIME": 0.5}
+    clock.now += 4.0
+    made._take(received(BEAT), SENDER, 0)
+    assert made.parameters == {}
+
+
+def test_rate_that_is_taken_refuses_and_ends_an_engagement_with_rate_cause_and_mend(ends: Ends, clock: Clock) -> None:
+    made, _ = ends.link(ATTITUDE=40.0)
+    attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+
+    def come(seconds: float, hz: float) -> None:
+        for _ in range(round(seconds * hz)):
+            clock.now += 1.0 / hz
+            made._take(attitude, SENDER, 0)
+            made._request(clock.now)
+
+    come(1.0, 40.0)
+    assert made.refusal() == "the rate of ATTITUDE is not known yet"
+    come(2.0, 40.0)
+    assert (made.refusal(), made.lost()) == ("", "")
+    made._to_request.clear()
+    made._requested = None  # granted
+    come(5.0, 4.0)
+    rate = "ATTITUDE comes at 4 Hz, requested are 40 Hz"
+    assert made.refusal().startswith(f"{rate}; requested again; a ground station on this link requests rates of its own")
+    assert made.refusal().endswith("give the bridge a port of its own")
+    assert made.lost() == f"{rate}; for 2 s"
+    assert made._to_request == {"ATTITUDE": 40.0}
+    assert made._requested is not None
+    come(3.0, 40.0)
+    assert made.lost() == ""
+    assert made.refusal().startswith("ATTITUDE came at 4 Hz")
+    come(20.0, 40.0)
+    assert made.refusal() == ""
+
+
+def test_denied_rate_that_comes_all_the_same_is_no_problem(ends: Ends, clock: Clock) -> None:
+    """A request of 50 Hz is denied, and the 40 Hz of an earlier one stay: 80 % of it."""
+    made, _ = ends.link(ATTITUDE=50.0)
+    attitude = received(mavlink.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    made._take(attitude, SENDER, 0)
+    made._requested = "ATTITUDE", clock.now
+    made._take(received(mavlink.MAVLink_command_ack_message(511, DENIED)), SENDER, 0)
+    assert made.problem().startswith("the autopilot denied 50 Hz of ATTITUDE")
+    for _ in range(120):
+        clock.now += 0.025
+        made._take(attitude, SENDER, 0)
+        made._rates.step(clock.now)
+    assert made.problem() == ""
+
+
+def test_ground_station_that_falls_silent_ends_the_engagement(ends: Ends, clock: Clock) -> None:
+    """Overrides hide its silence from the autopilot. One that was never heard is not missed."""
+    made, _ = ends.link()
+    made._take(received(BEAT), SENDER, 0)
+    clock.now += 60.0
+    assert made.lost() == ""
+    assert "no such station is heard: it acts after each release" in made.station()
+    station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    made._take(received(station, system=250, component=190), SENDER, 0)
+    clock.now += 60.0
+    assert made.lost() == ""  # of another number: the autopilot does not watch it either
+    made._take(received(station, system=255, component=190), SENDER, 0)
+    assert "ground station 255: station 255, which is heard, ends the engagement by 5 s of silence" in made.station()
+    clock.now += 4.9
+    assert made.lost() == ""
+    clock.now += 0.2
+    assert made.lost() == "ground station 255 is silent for 5 s"
+    made._take(received(station, system=255, component=190), SENDER, 0)
+    assert made.lost() == ""
+
+
+def test_ground_station_with_a_number_of_its_own_is_told_and_no_conflict(ends: Ends) -> None:
+    made, port = ends.link()
+    made.start()
+    station = ends.peer(port, system=254)
+    until(lambda: made.stations, lambda: station.connection.mav.heartbeat_send(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4))
+    assert made.stations == {254}
+    assert made.conflict == ""
+
+
+def test_autopilot_that_signs_is_flown_with_its_passphrase_and_refused_without(ends: Ends, tmp_path: Path) -> None:
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    other = ends.peer(port, phrase="another")
+    until(lambda: made._refused, other.beat)
+    assert not queue
+    peer = ends.peer(port, phrase="a phrase")
+    until(lambda: queue, peer.beat)
+    taken: list[Any] = []  # the autopilot refuses what has no valid signature
+
+    def take() -> None:
+        peer.beat()
+        taken.extend(message for message in [peer.answer()] if message is not None)
+
+    until(lambda: taken, take)
+    assert taken[0].get_signed()
+
+    unsigned, port = ends.link()
+    unsigned.start()
+    until(lambda: unsigned.conflict, ends.peer(port, phrase="a phrase").beat)
+    assert unsigned.conflict == "the autopilot signs its messages and drops others: set link.passphrase_file in the map"
+
+
+def test_autopilot_whose_clock_begins_again_is_not_told_to_have_another_passphrase(ends: Ends, tmp_path: Path) -> None:
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    peer = ends.peer(port, phrase="a phrase")
+    until(lambda: queue, peer.beat)
+    signing = peer.connection.mav.signing
+    signing.timestamp -= 600 * 100_000  # of 10 us each
+    until(lambda: made._refused, peer.beat)
+    assert re.match(r"messages with the right passphrase come, signed (59|60)\d s before the last ones", made._refused)
+    assert "the autopilot has started again without the time" in made._refused
+    ends.peer(port, phrase="another").beat()
+    until(lambda: "the passphrase differs" in made._refused, ends.peer(port, phrase="another").beat)
+
+
+def test_passphrase_holds_in_a_process_that_has_not_seen_mavlink_2(
+    ends: Ends, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A connection of pymavlink begins with MAVLink 1, which has no signatures, unless an earlier one has set this variable."""
+    monkeypatch.delenv("MAVLINK20", raising=False)
+    (tmp_path / "passphrase").write_text("a phrase\n", encoding="utf-8")
+    made, port = ends.link(passphrase_file=str(tmp_path / "passphrase"))
+    queue = made.listen("HEARTBEAT")
+    made.start()
+    until(lambda: made._refused, ends.peer(port).beat)
+    assert not queue
+
+
+def test_silence_of_the_autopilot_is_told(ends: Ends, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, port = ends.link()
+    now = time.monotonic
+    monkeypatch.setattr("autopilot_bridge.mavlink_link.time.monotonic", lambda: now() + 4.0)
+    assert made.problem() == f"no message of system 1 over udpin:127.0.0.1:{port} for 3 s"
+
+
+@pytest.mark.parametrize(("name", "key"), [("ardupilot", "mode"), ("ardupilot_mavlink", "param2")])
+def test_map_of_ardupilot_asks_for_loiter_after_a_release_that_no_pilot_requested(name: str, key: str) -> None:
+    """The numbers of the modes are those that pymavlink has of ArduPlane, MAV_CMD those of common.xml."""
+    row = named_map(name).messages["mode_after"]
+    assert row.when == "failsafe"
+    assert row.values[key] == {mode: number for number, mode in mavutil.mode_mapping_apm.items()}["LOITER"]
+    if name == "ardupilot_mavlink":
+        assert row.values["command"] == mavlink.MAV_CMD_DO_SET_MODE
+        assert row.values["param1"] == mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+def test_wrong_map_or_message_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match="found no message ALTITUD, expected one of the dialect ardupilotmega"):
+        message_type("ALTITUD")
+    with pytest.raises(ChannelError, match="chan1_raw cannot be 70000"):
+        set_field(message_type("RC_CHANNELS_OVERRIDE")(), "chan1_raw", 70000.0)
+    content = named_map("ardupilot_mavlink").model_dump()
+    for changes, sentence in (
+        ({"link": None}, "link: found none, expected one, for outputs.q of type mavlink/msg/ATTITUDE"),
+        ({"link": {**content["link"], "url": "serial"}}, "link.url: found 'serial'"),
+        ({"link": {**content["link"], "rates": {"ATTITUD": 40.0}}}, r"link\.rates\.ATTITUD: found a message"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            ChannelMap.validate_mapping(content | changes, "map")
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # pymavlink leaves its socket open
+def test_address_that_cannot_be_opened_is_one_sentence() -> None:
+    with pytest.raises(ParameterError, match=r"link\.url: found udpin:192\.0\.2\.1:14550, which cannot be opened"):
+        Link(LinkConfig(url="udpin:192.0.2.1:14550"))  # an address of documentation, RFC 5737

@@ -1,0 +1,291 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The account of a flight: every command says what a log lacks, and no figure stands for more than was recorded."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from tests.damaged import DAMAGES, damage
+from tests.recordings import EPOCH
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.metrics import error_metrics, sample_times
+from flight_analysis.report.account import (
+    Account,
+    TopicAccount,
+    account,
+    final_outcome,
+)
+from flight_analysis.report.run_folder import read_flight
+from flight_analysis.report.summary import command_results, pulse_edges, taken_over
+from flight_bringup.fly import fly_and_report
+from flight_cli.replay import replay
+from flight_cli.report import report
+from flight_core.outcome import STATUS_INCOMPLETE
+from flight_core.parameters import ParameterError
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Process, Recording, Signal, Tape
+from flight_log.clock import StampClock
+from flight_log.flight_processes import Span, flight_processes
+from flight_log.rosbag2_metadata import METADATA, bag_files
+from flight_view.flight import Flight
+
+pytestmark = pytest.mark.slow
+
+TOPICS = ("y", "y_m", "u", "internals", "truth", "pose")
+TABLES = ("errors", "inputs", "ticks")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The log of a flight of two seconds in one process, with the first command of the scenario."""
+    scenario = find_scenario("osprey_gust").vary(flight={"duration": 2.0})
+    return fly_and_report(scenario, tmp_path_factory.mktemp("runs")).mcap
+
+
+@pytest.fixture(scope="module")
+def figures(whole: Path) -> dict[str, Any]:
+    """The summary of the whole log."""
+    return read_flight(whole.parent).summary
+
+
+def replayed(log: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What `rise-di replay --json` prints."""
+    with pytest.raises(typer.Exit) as end:
+        replay(log, as_json=True)
+    assert end.value.exit_code in {0, 1, STATUS_INCOMPLETE}
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
+
+
+def test_whole_log_lacks_nothing(whole: Path, figures: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """The expected counts by hand: 500 Hz, 100 Hz and 50 Hz over two seconds, both ends included."""
+    assert (figures["outcome"], figures["notes"], figures["account"]["lacks"]) == ("completed", [], [])
+    counts = {name: topic["expected"] for name, topic in figures["account"]["topics"].items()}
+    assert counts == {"y": 1001, "y_m": 1001, "truth": 1001, "u": 201, "internals": 201, "pose": 101}
+    assert [taken_over(figures, table) for table in TABLES] == ["", "", ""]
+    result = replayed(whole, capsys)
+    assert (result["checked"], result["ticks"], result["expected"], result["notes"]) == (201, 201, 201, [])
+
+
+@pytest.mark.parametrize("since", [0, EPOCH], ids=["flight time", "time of day"])
+@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize("topic", TOPICS)
+def test_every_command_says_what_log_lacks(
+    topic: str,
+    name: str,
+    since: int,
+    whole: Path,
+    figures: dict[str, Any],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    log = damage(whole, tmp_path / "damaged" / "damaged_0.mcap", f"/{topic}", DAMAGES[name], from_ns=since)
+    if topic in {"y", "y_m"} and name == "stamps are zero":
+        with pytest.raises(ParameterError, match=f"found no sample of {topic} with a stamp, expected a flight with y and y_m"):
+            read_flight(log)
+        return
+    summary = read_flight(log).summary
+    assert summary["outcome"].startswith(f"completed, log incomplete: {topic} ")
+    for table in TABLES:
+        if json.dumps(summary[table]) != json.dumps(figures[table]):
+            assert taken_over(summary, table).startswith(", over ")
+    flight = Flight(log)
+    while flight.update():
+        pass
+    flight.counted()
+    assert any(topic in sentence for sentence in flight.faults())
+    if since or (topic == "internals" and "zero" in name):
+        return  # a replay takes its time, and needs the times of the ticks
+    result = replayed(log, capsys)
+    assert any(note.startswith(f"the log lacks {topic} ") for note in result["notes"])
+    if topic in {"u", "internals"}:
+        assert result["checked"] < result["expected"] == 201
+
+
+def test_report_prints_part_beside_figures(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/truth", DAMAGES["ends at a third"])
+    with pytest.raises(typer.Exit) as end:
+        report([log], csv=tmp_path / "run.csv", png=tmp_path / "run.png")
+    assert end.value.exit_code == STATUS_INCOMPLETE
+    output = " ".join(capsys.readouterr().out.split())
+    assert "Tracking error (true error), 2.0 s flown, over 33 % of truth" in output
+    assert "outcome: completed, log incomplete: truth 333 of 1001 samples, ends at t = 0.664 of 2.000 s" in output
+    assert "over 33 % of truth" in (log.parent / "report.html").read_text(encoding="utf-8")
+
+
+def test_replay_claims_no_tick_without_its_u(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = damage(whole, tmp_path / "run" / "run_0.mcap", "/u", DAMAGES["ends at a third"])
+    with pytest.raises(typer.Exit):
+        replay(log)
+    output = capsys.readouterr().out
+    assert output.startswith("67 of 201 ticks checked, every bit equal\n")
+    assert "note: 134 ticks have no sample on the topic u: what was sent is not compared" in output
+
+
+@pytest.mark.parametrize(
+    ("begin", "outcome"), [(0.5, "completed"), (1.9, "never flew: the first u came at t = 1.900 of 2.000 s")]
+)
+def test_flight_counts_from_its_first_u(begin: float, outcome: str, tape: Tape, osprey_gust: Scenario) -> None:
+    """As of a controller that takes a y after many that were too old."""
+    late = {name: tape[name] for name in ("y", "y_m", "truth")} | {"u": tape["u"].where(tape.time("u") >= begin)}
+    assert final_outcome("completed", account(Tape(late, duration=2.0), osprey_gust)).startswith(outcome)
+
+
+@pytest.mark.parametrize(
+    ("of_y", "lost", "lacks"),
+    [("without", 0, True), ("with", 0, True), ("without", 1, True), ("after", 0, False)],
+    ids=["log ends with y and pose", "pose alone is missing", "messages were lost", "pose goes on after the end"],
+)
+def test_samples_that_busy_host_withheld_are_no_lack_of_log(
+    of_y: str, lost: int, lacks: bool, tape: Tape, osprey_gust: Scenario
+) -> None:
+    """The last 0.1 s of a flight in real time, where the numbers of the messages tell whether the pose was sent."""
+    begin_ns, until = NANOSECONDS * 1_795_000_000, 1.8 if of_y == "after" else 2.0
+    withheld = ("y", "truth", "pose") if of_y == "without" else ("pose",)
+    signals = {}
+    for name in ("y", "y_m", "u", "truth", "pose"):
+        t = tape.time(name)
+        of = tape[name].where((t < 1.7) | (t > until)) if name in withheld else tape[name]
+        signals[name] = replace(of, stamp_ns=of.stamp_ns - tape.start_ns + begin_ns)
+    recording = {name: Recording(0, lost=lost) for name in signals}
+    lacking = account(Tape(signals, begin_ns, duration=1.8, recording=recording), osprey_gust).lacks
+    assert any(lack.startswith("pose ") for lack in lacking) == lacks
+
+
+def test_missing_part_of_bag_is_named(whole: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(whole.parent, tmp_path / "run")
+    metadata = (run / METADATA).read_text(encoding="utf-8")
+    name = bag_files(run)[0].name
+    (run / METADATA).write_text(
+        metadata.replace(f"relative_file_paths:\n  - {name}", f"relative_file_paths:\n  - {name}\n  - part_1.mcap"),
+        encoding="utf-8",
+    )
+    assert "part_1.mcap" in (run / METADATA).read_text(encoding="utf-8")
+    summary = read_flight(run).summary
+    assert summary["notes"][0].startswith("part_1.mcap: named in metadata.yaml and missing")
+    assert summary["outcome"] == "completed, log incomplete: part_1.mcap: named in metadata.yaml and missing"
+
+
+@pytest.mark.parametrize(
+    ("found", "expected", "whole"),
+    [
+        (96, 97, True),
+        (95, 97, False),
+        (1, 2, True),
+        (0, 1, False),
+    ],
+)
+def test_one_missing_sample_is_no_lack_of_short_topic(found: int, expected: int, whole: bool) -> None:
+    """99 %, or all but one: the last tick of a flight may come after its end."""
+    topic = TopicAccount(expected, found, 0.0, 0.97, 0.01, 0.5, 0, 0, 0.0, 0, 0)
+    assert topic.holds(found) == whole
+    assert (Account(0.97, {"u": topic}, ()).over("u") == "") == whole
+
+
+def stamps(*parts: range) -> Iterator[Any]:
+    """Stamps of 100 Hz in ns by their numbers."""
+    yield from (np.array(part, dtype=np.int64) * (NANOSECONDS // 100) for part in parts)
+
+
+def test_stray_messages_are_no_step_of_clock() -> None:
+    """A second publisher with old stamps beside the first; a step is of successive messages."""
+    first, second = stamps(range(1000, 1200), range(200))
+    stamp_ns = np.stack([first, second], axis=1).ravel()
+    clock = StampClock()
+    keep, count = clock.usable(stamp_ns, np.repeat(first, 2), more=False, end=True)
+    assert keep.all()
+    assert (count, clock.recording().step_ns) == (400, 0)
+
+
+@pytest.mark.parametrize("damaged", [[0], [40], [199], [40, 41, 42]])
+@pytest.mark.parametrize("by", [-5 * NANOSECONDS, 2**62], ids=["back", "forth"])
+def test_samples_with_damaged_stamps_are_left_out_alone(damaged: list[int], by: int) -> None:
+    """The clock goes on behind them: the samples after a damaged stamp stay."""
+    (log_ns,) = stamps(range(1000, 1200))
+    stamp_ns = log_ns.copy()
+    stamp_ns[damaged] += by
+    clock = StampClock()
+    keep, _ = clock.usable(stamp_ns, log_ns, more=False, end=True)
+    assert np.flatnonzero(~keep).tolist() == damaged
+    assert (clock.recording().unset, clock.recording().step_ns) == (len(damaged), 0)
+
+
+def test_first_sample_that_a_busy_recorder_stored_late_before_a_pause_stays() -> None:
+    """Stored 0.6 s after its stamp; the next one comes 1.2 s later and is stored at once."""
+    (log_ns,) = stamps(range(1000, 1200))
+    stamp_ns = log_ns.copy()
+    stamp_ns[0] = log_ns[1] - 12 * NANOSECONDS // 10
+    log_ns[0] = stamp_ns[0] + 6 * NANOSECONDS // 10
+    clock = StampClock()
+    keep, _ = clock.usable(stamp_ns, log_ns, more=False, end=True)
+    assert keep.all()
+    assert clock.recording().unset == 0
+
+
+def test_clock_step_is_found_across_batches() -> None:
+    stamp_ns = np.concatenate([*stamps(range(1000, 1100), range(900, 1000))])
+    log_ns = np.concatenate([*stamps(range(1000, 1200))])
+    clock, taken, usable = StampClock(), 0, 0
+    while taken < len(stamp_ns):
+        end = min(taken + 15, len(stamp_ns))
+        more = end < len(stamp_ns)
+        keep, count = clock.usable(stamp_ns[taken:end], log_ns[taken:end], more=more, end=not more)
+        taken, usable = taken + count, usable + int(keep.sum())
+    of = clock.recording()
+    assert (usable, of.found, of.left_out, of.step_ns) == (100, 200, 100, -199 * NANOSECONDS // 100)
+
+
+def test_channel_of_scenario_that_y_does_not_have_is_a_lack(tape: Tape, osprey_gust: Scenario) -> None:
+    y = tape["y"]
+    other = Signal(y.stamp_ns, ("pitch_rate", *y.names[1:]), y.values)
+    assert account(replace(tape, signals={**tape.signals, "y": other}), osprey_gust).lacks == (f"{y.names[0]} of y",)
+
+
+def test_samples_before_the_flight_stand_for_none_of_the_flight(tape: Tape, osprey_gust: Scenario) -> None:
+    early = replace(tape["u"], stamp_ns=tape["u"].stamp_ns - 1000 * NANOSECONDS)
+    of = account(replace(tape, signals={**tape.signals, "u": early}, scenario=osprey_gust), osprey_gust)
+    assert of.topics["u"].found == 0
+
+
+def test_rms_is_weighted_by_time() -> None:
+    """Of a second with e = 3, nine tenths are missing after a second with e = 1: by hand sqrt((1 + 9) / 2)."""
+    t = np.concatenate([np.arange(0.0, 1.0, 0.001), np.arange(1.0, 2.0, 0.01)])
+    e = np.where(t < 1.0, 1.0, 3.0)
+    times = sample_times(np.round(t * 1e9).astype(np.int64))
+    assert error_metrics(e, times).rms == pytest.approx(5.0**0.5, rel=5e-3)
+    assert error_metrics(e).rms < 1.4
+
+
+def test_process_has_ready_time_of_its_own_start() -> None:
+    """A controller that was killed and started again, of two aircraft, beside a recorder without samples."""
+    second = NANOSECONDS
+    ready = [("/recorder", 1), ("/one/controller", 2), ("/controller", 3 * second), ("/controller", 40 * second)]
+    spans = {
+        "/controller#9": Span(10 * second, 30 * second, 2000),
+        "/controller#4": Span(41 * second, 60 * second, 1900),
+        "": Span(0, 1, 2),  # of ros2 topic pub
+    }
+    assert flight_processes(spans, ready, "") == {
+        "/controller#9": Process(3 * second, 10 * second, 30 * second, 2000),
+        "/controller#4": Process(40 * second, 41 * second, 60 * second, 1900),
+        "/recorder": Process(1, None, None),
+        "a publisher without a name": Process(None, 0, 1, 2),
+    }
+    assert flight_processes({"": Span(0, 1, 2)}, [], "") == {}  # in one process
+
+
+def test_summary_counts_commands_of_flight(figures: dict[str, Any]) -> None:
+    """The first edge of the scenario is at 2.0 s, the end of the flight."""
+    edges = pulse_edges(find_scenario("osprey_gust"))
+    assert figures["account"]["commands"] == {"given": len(edges), "flown": 1, "targets": 0, "taken": 0}
+    assert command_results(figures) == f"1 of {len(edges)} commands flown"
+    assert figures["account"]["processes"] == {}  # of a flight in one process

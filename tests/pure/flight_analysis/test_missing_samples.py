@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which missing samples of a log are a lack: a topic alone is excused by what its own sensor drops, and a silence is named."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report.account import account
+from flight_core.rates import NANOSECONDS
+from flight_core.tape import Signal, Tape
+
+RATES = {"y": 100, "y_m": 100, "truth": 100, "u": 100, "internals": 100, "pose": 50}  # Hz
+OF_AIRCRAFT = ("y", "y_m", "truth", "pose")  # no mode of the flight interrupts these
+Kept = NDArray[np.bool_]
+
+
+def scenario(**aircraft: object) -> Scenario:
+    """The default scenario at 100 Hz, whose pose is at 50 Hz, with these values of the aircraft."""
+    return find_scenario("osprey_gust").vary(
+        aircraft={"rate": 100.0, "step": 0.01, **aircraft}, reference_model={"rate": 100.0}, controller={"rate": 100.0}
+    )
+
+
+def lacks(flown: Scenario, duration: int, kept: Mapping[str, Kept]) -> tuple[str, ...]:
+    """What the log of a flight of whole seconds lacks; `kept`: which samples of a topic it has, (N,), all of the others."""
+    signals = {}
+    for name, rate in RATES.items():
+        stamp_ns = np.arange(duration * rate + 1) * (NANOSECONDS // rate)
+        names = {"y": flown.controller.outputs, "y_m": flown.controller.outputs, "u": flown.controller.inputs}.get(name, ("a",))
+        signal = Signal(stamp_ns, tuple(names), np.zeros((len(stamp_ns), len(names))))
+        signals[name] = signal.where(kept[name]) if name in kept else signal
+    return account(Tape(signals, duration=float(duration)), flown).lacks
+
+
+def dropped(name: str, duration: int, share: float) -> Kept:
+    """Samples that stay of a topic that loses a share at random, never the last one."""
+    kept = np.random.default_rng(1).random(duration * RATES[name] + 1) >= share
+    kept[-1] = True
+    return kept
+
+
+def silent(name: str, duration: int, begin: float, end: float) -> Kept:
+    """Samples that stay of a topic without a sample between two instants."""
+    t = np.arange(duration * RATES[name] + 1) / RATES[name]
+    return np.asarray((t <= begin) | (t >= end))
+
+
+@pytest.mark.parametrize(
+    "share",
+    [
+        0.3,
+    ],
+)
+def test_samples_that_the_sensor_of_y_drops_are_no_lack(share: float) -> None:
+    """And more than that are: half as many again is above four deviations of their number."""
+    flown = scenario(sensors={"dropout": share})
+    assert lacks(flown, 60, {"y": dropped("y", 60, share)}) == ()
+    assert lacks(flown, 60, {"y": dropped("y", 60, 1.5 * share)})[0].startswith("y ")
+
+
+@pytest.mark.parametrize(
+    "share",
+    [
+        0.3,
+    ],
+)
+@pytest.mark.parametrize("name", [name for name in RATES if name != "y"])
+def test_what_the_sensor_of_y_drops_excuses_no_other_topic(name: str, share: float) -> None:
+    """Half of what y may lose is missing of another topic."""
+    flown = scenario(sensors={"dropout": share})
+    kept = dropped(name, 60, share / 2.0)
+    expected = 60 * RATES[name] + 1
+    assert lacks(flown, 60, {name: kept}) == (f"{name} {kept.sum()} of {expected} samples",)
+
+
+@pytest.mark.parametrize("late", ["sensors", "pose"])
+@pytest.mark.parametrize("name", OF_AIRCRAFT)
+def test_delay_of_a_sensor_excuses_the_end_of_its_topic_alone(name: str, late: str) -> None:
+    """0.5 s of 20 s: more than the hundredth that a topic may lack."""
+    flown = scenario(**{late: {"delay": 0.5}})
+    excused = {"sensors": "y", "pose": "pose"}[late]
+    found = lacks(flown, 20, {topic: silent(topic, 20, 19.5, 21.0) for topic in (excused, name)})
+    expected = 20 * RATES[name] + 1
+    missing = RATES[name] // 2
+    whole = f"{name} {expected - missing} of {expected} samples, ends at t = 19.500 of 20.000 s"
+    assert found == (() if name == excused else (whole,))
+
+
+@pytest.mark.parametrize("length", [1.1, 19.0])
+@pytest.mark.parametrize("duration", [60, 600], ids=["short flight", "long flight"])
+@pytest.mark.parametrize("name", OF_AIRCRAFT)
+def test_silence_of_a_steady_topic_is_named_by_its_times(name: str, duration: int, length: float) -> None:
+    """Of the long flight also a silence that leaves more than 99 % of the samples."""
+    found = lacks(scenario(), duration, {name: silent(name, duration, 30.0, 30.0 + length)})
+    assert len(found) == 1
+    assert found[0].startswith(f"{name} ")
+    assert found[0].endswith(f"no sample from t = 30.000 to {30.0 + length:.3f} s")
+
+
+@pytest.mark.parametrize(("end", "named"), [(598.0, True), (598.9, True), (599.1, False)])
+@pytest.mark.parametrize("name", ["y", "truth"])
+def test_topic_that_ends_a_second_early_is_named(name: str, end: float, named: bool) -> None:
+    """Of a long flight, where the share of the missing samples is below a hundredth."""
+    found = lacks(scenario(), 600, {name: silent(name, 600, end, 601.0)})
+    assert [lack.endswith(f"ends at t = {end:.3f} of 600.000 s") for lack in found] == [True] * named

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures, MAT-files, tables and LaTeX for a paper, read back with independent readers."""
+
+import csv
+import re
+import xml.etree.ElementTree as ET
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import yaml
+from tests.conftest import REPOSITORY
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.report.paper import write_figure, write_mat, write_tables
+from flight_analysis.report.summary import RecordedFlight, summarise
+from flight_core.parameters import ParameterError
+
+
+@pytest.fixture(scope="module")
+def flight(osprey_gust: Scenario) -> RecordedFlight:
+    scenario = osprey_gust.vary(flight={"duration": 3.0})
+    tape = simulate(scenario)
+    return RecordedFlight("run", scenario, tape, summarise(tape, scenario))
+
+
+def test_pdf_has_the_width_and_vectors(flight: RecordedFlight, tmp_path: Path) -> None:
+    """88 mm are 249.4 points of 1/72 inch. Paths are operators l and S in the stream; there is no image, no Type 3 font."""
+    write_figure(tmp_path / "fig.pdf", [flight], "88mm", "q,V")
+    content = (tmp_path / "fig.pdf").read_bytes()
+    assert content.startswith(b"%PDF-")
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", content)
+    assert box is not None
+    assert float(box[1]) == pytest.approx(88.0 / 25.4 * 72.0, abs=0.1)
+    streams = [
+        zlib.decompress(part) for part in re.findall(rb"/FlateDecode.*?stream\r?\n(.*?)\r?\nendstream", content, re.DOTALL)
+    ]
+    assert max(stream.count(b" l\n") for stream in streams) > 100
+    assert b"/Subtype /Image" not in content
+    assert b"/Type3" not in content
+
+
+def test_svg_keeps_text_and_rows(flight: RecordedFlight, tmp_path: Path) -> None:
+    write_figure(tmp_path / "fig.svg", [flight], "180mm", ["V", "e.q", "elevator"])
+    root = ET.parse(tmp_path / "fig.svg").getroot()
+    text = " ".join("".join(node.itertext()) for node in root.iter("{http://www.w3.org/2000/svg}text"))
+    assert float(root.attrib["width"].removesuffix("pt")) == pytest.approx(180.0 / 25.4 * 72.0, abs=0.1)
+    for label in ("V (m/s)", "e of q (mrad/s)", "elevator (deg)", "t (s)", "y_m"):
+        assert label in text
+    first = (tmp_path / "fig.svg").read_bytes()
+    write_figure(tmp_path / "fig.svg", [flight], "180mm", ["V", "e.q", "elevator"])
+    assert (tmp_path / "fig.svg").read_bytes() == first
+
+
+@pytest.mark.parametrize(
+    ("name", "width", "channels", "words"),
+    [
+        ("fig.gif", "88mm", "", "figure: found fig.gif, expected a name that ends in .pdf"),
+        ("fig.pdf", "8mm", "", "width: found 8mm, expected 30 mm to 1 m"),
+        ("fig.pdf", "88mm", "q,alfa", "channels: found 'alfa'"),
+    ],
+)
+def test_wrong_figure_is_told(flight: RecordedFlight, tmp_path: Path, name: str, width: str, channels: str, words: str) -> None:
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        write_figure(tmp_path / name, [flight], width, channels)
+    assert not list(tmp_path.iterdir())
+
+
+def test_mat_file_has_a_structure_a_topic(flight: RecordedFlight, tmp_path: Path) -> None:
+    write_mat(tmp_path / "run.mat", [flight])
+    read = scipy.io.loadmat(tmp_path / "run.mat", simplify_cells=True)
+    np.testing.assert_array_equal(read["y"]["q"], flight.tape["y"]["q"])
+    np.testing.assert_array_equal(read["u"]["stamp_ns"], flight.tape["u"].stamp_ns)
+    np.testing.assert_allclose(np.diff(read["u"]["t"]), 0.01, atol=1e-9)
+    np.testing.assert_array_equal(read["internals"]["Pi_q"], flight.tape["internals"]["Pi.q"])
+    assert read["info"]["channels"]["internals"]["Pi_q"] == "Pi.q"
+    assert read["info"]["outcome"] == "completed"
+    names = [
+        *(key for key in read if not key.startswith("__")),
+        *(name for topic in ("y", "u", "internals") for name in read[topic]),
+    ]
+    assert all(re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,62}", name) for name in names)
+
+
+def test_table_a_topic_has_no_empty_cell(flight: RecordedFlight, tmp_path: Path) -> None:
+    write_tables(tmp_path / "tables", [flight])
+    assert {path.stem for path in (tmp_path / "tables").iterdir()} == set(flight.tape.signals)
+    for topic in ("y", "u"):
+        with (tmp_path / "tables" / f"{topic}.csv").open(newline="", encoding="utf-8") as stream:
+            rows = list(csv.DictReader(stream))
+        assert len(rows) == len(flight.tape[topic].stamp_ns)
+        assert all(value for row in rows for value in row.values())
+        name = flight.tape[topic].names[0]
+        assert [float(row[name]) for row in rows] == flight.tape[topic][name].tolist()
+
+
+def test_citation_names_the_paper_and_invents_nothing() -> None:
+    citation = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
+    (paper,) = citation["references"]
+    assert paper["title"].startswith("A Robust Dynamic Inversion Technique")
+    assert [author["family-names"] for author in paper["authors"]] == ["Tanyer", "Tatlicioglu", "Zergeroglu"]
+    assert "doi" not in paper
+    assert "take them from your copy" in (REPOSITORY / "README.md").read_text(encoding="utf-8")

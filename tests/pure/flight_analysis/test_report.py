@@ -1,0 +1,263 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The report: its figures, shaded intervals, tables and events, and the size of the page."""
+
+import base64
+import hashlib
+import re
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from plotly.offline import get_plotlyjs
+from tests.plots import drawn
+from tests.recordings import EPOCH, MS, signal
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report import comparison, figures, html, plotting
+from flight_analysis.report.html import write_page
+from flight_analysis.report.plotting import Figure, PlotContext, SampleStore
+from flight_analysis.report.summary import DisplayUnit, RecordedFlight, summarise
+from flight_analysis.report.tables import events
+from flight_core.modes import Mode
+from flight_core.outcome import COMPLETED
+from flight_core.tape import Signal, Tape
+from flight_core.vectors import FloatArray
+from rise_di_controller.internals import Saturation
+
+pytestmark = pytest.mark.slow
+
+OUTPUTS, INPUTS = ("q", "V", "p", "r"), ("elevator", "aileron", "rudder", "thrust")
+OF_LOOP = ("Bode plot of the loop", "Nyquist plot of the loop")  # headings on every page with a linear loop
+DEG = np.pi / 180.0
+
+
+@pytest.fixture(scope="module")
+def servo() -> Scenario:
+    return find_scenario("osprey_servo")
+
+
+def held(count: int = 101, /, **channels: Any) -> Signal:
+    """Channels at 100 Hz, of which most hold a value; `__` in a name stands for a dot."""
+    return signal([10.0 * k for k in range(count)], **{name.replace("__", "."): value for name, value in channels.items()})
+
+
+def ticks(count: int = 101, /, **channels: Any) -> Signal:
+    """Internals of a controller at 100 Hz that was on time and never saturated, except in the channels given."""
+    limited = {f"limited.{name}": Saturation.NO for name in INPUTS}
+    integrals = {f"{group}.{name}": 0.0 for group in ("integral_e", "Pi") for name in OUTPUTS}
+    return held(count, **({"mode": Mode.ENGAGED, "dt": 0.01, "late": 0.0, "age": 0.0} | limited | integrals | channels))
+
+
+def flight(count: int = 101, **signals: Signal) -> Tape:
+    """A flight at 100 Hz whose outputs are zero, with the signals given."""
+    zero = held(count, **dict.fromkeys(OUTPUTS, 0.0))
+    return Tape({"y": zero, "y_m": zero, **signals}, EPOCH)
+
+
+@pytest.fixture
+def complete() -> Tape:
+    """A flight with all signals of a simulation."""
+    states = dict.fromkeys(("x__q", "x__V", "x__p", "x__r", "actuator__elevator"), 0.0)
+    truth = held(**states, gust__vertical=2.0, noise__q=1e-3)
+    return flight(u=held(**dict.fromkeys(INPUTS, 0.1)), internals=ticks(late=1e-3), truth=truth)
+
+
+def context(tape: Tape, units: dict[str, DisplayUnit] | None = None) -> PlotContext:
+    return figures.plot_context(tape, units or {}, {})
+
+
+def traces(figure: Figure | None, name: str) -> list[Any]:
+    return [trace for trace in drawn(figure).data if trace.name == name]
+
+
+def titles(figure: Figure | None) -> list[str]:
+    """Titles of the rows from top to bottom."""
+    return [axis.title.text for axis in drawn(figure).select_yaxes()]
+
+
+def page_of(tmp_path: Path, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> str:
+    path = tmp_path / "report.html"
+    write_page(path, [recorded("run", scenario, tape, outcome)])
+    return path.read_text(encoding="utf-8")
+
+
+def recorded(name: str, scenario: Scenario, tape: Tape, outcome: str = COMPLETED) -> RecordedFlight:
+    return RecordedFlight(name, scenario, tape, summarise(tape, scenario, outcome))
+
+
+def headings(page: str) -> list[str]:
+    return [part.partition("</h2>")[0] for part in page.split("<h2>")[1:]]
+
+
+def test_a_simulated_flight_has_every_figure(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+    assert headings(page_of(tmp_path, servo, complete)) == [
+        "Output y over the reference y_m",
+        "Tracking error e = y - y_m",
+        "Input u and the actuators",
+        "Wind",
+        "States",
+        "Integrals of the law",
+        "Error of the sensors",
+        "Spectrum of u",
+        "Ticks of the controller",
+        "Timing of the ticks",
+        *OF_LOOP,
+    ]
+
+
+def test_flight_of_one_sample_has_report(tmp_path: Path, servo: Scenario) -> None:
+    one = flight(1, u=held(1, **dict.fromkeys(INPUTS, 0.0)), internals=ticks(1), truth=held(1, x__q=0.0))
+    assert len(headings(page_of(tmp_path, servo, one))) == 5 + len(OF_LOOP)  # y, e, u, states, integrals: no wind, no late tick
+
+
+def test_page_of_minute_of_noise_is_below_five_megabytes(tmp_path: Path, servo: Scenario) -> None:
+    # White noise on all channels at the rates of the scenario hardly compresses. plotly itself takes 0.5 MB. Measured 4.2 MB.
+    random = np.random.default_rng(1)
+
+    def noise(rate: int, *names: str) -> Signal:
+        stamps = EPOCH + np.arange(60 * rate + 1, dtype=np.int64) * (1000 * MS // rate)
+        return Signal(stamps, names, random.standard_normal((len(stamps), len(names))))
+
+    states = ["V", "alpha", "q", "theta", "beta", "p", "r", "phi"]
+    groups = {"x": states, "gust": ["a", "b", "c"], "actuator": INPUTS, "noise": OUTPUTS}
+    signals = {"y": noise(500, *OUTPUTS), "y_m": noise(500, *OUTPUTS), "u": noise(100, *INPUTS)}
+    signals["truth"] = noise(500, *(f"{group}.{name}" for group, names in groups.items() for name in names))
+    page = page_of(tmp_path, servo, Tape(signals, EPOCH))
+    assert len(page) < 5e6
+    assert 'src="http' not in page
+
+
+def test_text_of_a_log_is_escaped(tmp_path: Path, servo: Scenario) -> None:
+    page = page_of(tmp_path, servo, flight(), outcome="ended: <script>alert(1)</script>")
+    assert "ended: &lt;script&gt;alert(1)&lt;/script&gt;" in page
+    assert "<script>alert" not in page
+
+
+def test_every_colour_of_page_has_dark_counterpart(tmp_path: Path, servo: Scenario, complete: Tape) -> None:
+    # Colours of modes, saturations and gusts serve light and dark pages alike.
+    shared = {*figures.MODE_COLOURS.values(), *figures.SATURATION_COLOURS.values(), figures.GUST}
+    specifications = re.findall(r'<script type="application/json">(.*?)</script>', page_of(tmp_path, servo, complete))
+    used = set(re.findall(r"#[0-9a-f]{6}", " ".join(specifications)))
+    assert used - shared <= set(plotting.DARK | figures.DARK | comparison.DARK)
+    assert len(used) > 5
+
+
+def test_each_event_listed_once_in_order_of_start() -> None:
+    modes = ((20, "ENGAGED"), (10, "HOLD"), (20, "ENGAGED"), (5, "HOLD"), (5, "RAMP"), (41, "ENGAGED"))
+    mode = [Mode[name] for count, name in modes for _ in range(count)]
+    rate = [Saturation.NO] * 2 + [Saturation.RATE] * 3 + [Saturation.NO] * 90 + [Saturation.RATE] + [Saturation.NO] * 5
+    tape = flight(internals=ticks(mode=mode, limited__thrust=rate))
+    listed = events(tape, {"lateral": (0.9, 2.0), "vertical": (5.0, 6.0)})
+    assert [(event.name, round(event.start, 3), round(event.stop, 3), event.extent) for event in listed] == [
+        ("thrust saturated: rate", 0.02, 0.95, "4 of 101 ticks"),
+        ("hold", 0.2, 0.55, "0.15 s, 2 times"),  # 0.2 s to 0.3 s and 0.5 s to 0.55 s
+        ("ramp", 0.55, 0.6, "0.05 s"),
+        ("lateral gust", 0.9, 1.0, "0.10 s"),  # the flight ends during it, before the other gust
+    ]
+
+
+def test_every_mode_but_engaged_is_interval_with_name() -> None:
+    assert set(figures.MODE_COLOURS) == set(Mode) - {Mode.ENGAGED}
+    assert set(figures.SATURATION_COLOURS) == set(Saturation) - {Saturation.NO}
+    modes = [mode for mode in Mode for _ in range(10)]
+    intervals = figures.mode_intervals(flight(60, internals=ticks(60, mode=modes)))
+    assert {interval.label: (round(interval.start, 3), round(interval.stop, 3)) for interval in intervals} == {
+        "waiting": (0.0, 0.1), "hold": (0.2, 0.3), "ramp": (0.3, 0.4), "trim": (0.4, 0.5), "inactive": (0.5, 0.59),
+    }  # fmt: skip
+
+
+def test_spectrum_of_commanded_sine_has_peak_there() -> None:
+    u = held(1001, elevator=np.sin(2.0 * np.pi * 5.0 * np.arange(1001) / 100.0), thrust=0.0)
+    units = {"elevator": DisplayUnit("deg", 1 / DEG)}
+    figure = figures.spectrum_figure({"u": (flight(u=u), 10 * MS)}, {"u": figures.PLANT}, units)
+    assert titles(figure) == ["elevator (deg/√Hz)", "thrust (/√Hz)"]
+    elevator = drawn(figure).data[0]
+    assert elevator.x[np.argmax(elevator.y)] == pytest.approx(5.0, abs=0.2)
+    assert figures.spectrum_figure({"u": (flight(u=u.until(EPOCH + 100 * MS)), 10 * MS)}, {}, {}) is None  # eleven samples
+
+
+@pytest.fixture(scope="module")
+def pair(servo: Scenario) -> list[RecordedFlight]:
+    """Two flights: the second has half the error in q, and no p."""
+    y_m = signal([0, 1000], **dict.fromkeys(OUTPUTS, 1.0))
+    first = flight(y=signal([0, 1000], q=1.2, V=1.0, p=1.0, r=1.0), y_m=y_m)
+    second = flight(y=signal([0, 1000], r=1.0, V=1.0, q=1.1), y_m=y_m)
+    return [recorded("a", servo, first), recorded("b", servo, second)]
+
+
+def test_metrics_of_several_flights_compared_by_channel_name(pair: list[RecordedFlight]) -> None:
+    compared = {table.caption: {row.name: row for row in table.rows} for table in comparison.error_tables(pair)}
+    assert list(compared) == ["q (mrad/s)", "V (m/s)", "p (mrad/s)", "r (mrad/s)"]
+    whole = compared["q (mrad/s)"]["rms whole"]
+    assert whole.texts == ("200", "100")
+    assert whole.ratios == pytest.approx((1.0, 0.5))
+    assert compared["p (mrad/s)"]["rms whole"].texts == ("0.00", "-")
+    assert compared["p (mrad/s)"]["rms whole"].ratios == (None, None)  # no ratio to 0
+    assert "rms gust" not in compared["q (mrad/s)"]  # neither flight had one
+
+
+def test_a_comparison_is_a_page(tmp_path: Path, pair: list[RecordedFlight]) -> None:
+    write_page(tmp_path / "comparison.html", pair)
+    page = (tmp_path / "comparison.html").read_text(encoding="utf-8")
+    assert "2 flights compared" in page
+    assert '<td class="better">&times;0.500</td>' in page
+    assert headings(page) == ["Tracking error", "Output y over the reference y_m", "Tracking error e = y - y_m"]
+
+
+def test_curve_is_broken_at_gap_and_u_held() -> None:
+    stamps = [10.0 * k for k in range(101) if not 30 <= k < 60]
+    gapped, u = (signal(stamps, **dict.fromkeys(names, 1.0)) for names in (OUTPUTS, INPUTS))
+    tape = flight(y=gapped, u=u)
+    y: FloatArray = traces(figures.tracking_figure(context(tape)), "y")[0].y
+    assert np.flatnonzero(np.isnan(y)).tolist() == [30]
+    assert not np.isnan(traces(figures.input_figure(context(tape), {}), "u")[0].y).any()
+
+
+def unpacked(text: str, kind: str) -> FloatArray:
+    """Unpack samples as the page's script does."""
+    shuffled = np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype=np.uint8)
+    return np.ascontiguousarray(shuffled.reshape(np.dtype(kind).itemsize, -1).T).view(kind)[:, 0]
+
+
+def test_all_samples_of_long_curves_stored_once() -> None:
+    count = 5000
+    stamps = EPOCH + np.arange(count, dtype=np.int64) * 2 * MS
+    y = Signal(stamps, OUTPUTS, np.random.default_rng(1).standard_normal((count, 4)))
+    shared = context(Tape({"y": y, "y_m": Signal(stamps, OUTPUTS, np.zeros((count, 4)))}, EPOCH - 7))
+    found = [*drawn(figures.tracking_figure(shared)).data, *drawn(figures.error_figure(shared)).data]
+    q = [trace for trace in found if trace.yaxis == "y"]
+    assert [trace.y for trace in q] == [None] * 3
+    instants = np.cumsum(unpacked(shared.samples.packed[q[1].meta["t"]], "<f8"))
+    assert instants.tolist() == (stamps - EPOCH + 7).tolist()  # to the nanosecond
+    steps = unpacked(shared.samples.packed[q[1].meta["v"]], "<u4")
+    stored = np.cumsum(steps, dtype=np.uint32).view(np.float32)
+    np.testing.assert_allclose(stored, y["q"], rtol=2.0**-15.9)  # MANTISSA, and float32
+    assert q[1].meta["v"] == q[2].meta["v"]  # y_m is 0, so e equals y
+    assert len(shared.samples.packed) == 1 + 4 + 1  # one time, four y, and the zeros of all y_m
+
+
+def test_page_has_extremes_of_bins_of_very_long_curve(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an hour the page had 141 MB. Bins of four samples, with a gap in the third."""
+    monkeypatch.setattr(plotting, "MAX_STORED", 6)
+    stamps = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100, 101], dtype=np.int64)
+    values = np.array([1.0, 5.0, 0.0, 2.0, 7.0, 9.0, 8.0, 6.0, 3.0, 4.0, 5.0])
+    shared = PlotContext(Tape({}), {}, [], 1.0, SampleStore())
+    t, v = (shared.samples.packed[name] for name in plotting.stored(shared, Signal(stamps, ("q",), values[:, None]), "q", 1.0))
+    assert np.cumsum(unpacked(t, "<f8")).tolist() == [0, 2, 4, 6, 8, 100]
+    drawn = np.cumsum(unpacked(v, "<u4"), dtype=np.uint32).view(np.float32)
+    np.testing.assert_array_equal(drawn, [5.0, 0.0, 9.0, 6.0, 3.0, np.nan])
+
+
+def test_vendored_plotly_is_that_of_hash_and_of_release_of_python_package() -> None:
+    vendor = Path(html.__file__).parent / "vendor"
+    bundle = (vendor / "plotly-basic.min.js").read_bytes()
+    assert hashlib.sha256(bundle).hexdigest() in (vendor / "README.md").read_text(encoding="utf-8")
+    release = re.compile(r"plotly\.js (?:\(.*\) )?v(\S+)")
+    ours, theirs = (release.search(text[:200]) for text in (bundle.decode(), get_plotlyjs()))
+    assert ours is not None
+    assert theirs is not None
+    assert ours[1] == theirs[1]

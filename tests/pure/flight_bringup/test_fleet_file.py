@@ -1,0 +1,97 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Files of fleets: what each aircraft flies, and what is refused."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from typer.testing import CliRunner
+
+from flight_bringup.fleet import Fleet, Flown, read_fleet
+from flight_cli import fleet
+from flight_cli.cli import application
+from flight_core.parameters import ParameterError
+
+FLEET = """
+duration: 3.0
+set: {aircraft: {wind: [2.0, -1.0], turbulence: {seed: 7}}}
+aircraft:
+  uav1: {}
+  uav2: {start: {north: 50.0, heading: 0.5}, delay: 1.5, set: {controller: {k_g: 2.5}}}
+  uav3: {route: there.yaml}
+"""
+FLEET_OF_TWO = "aircraft: {one: {}, two: {}}"
+
+
+def fleet_file(folder: Path, text: str) -> Path:
+    file = folder / "fleet.yaml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_aircraft_share_what_fleet_sets_and_keep_what_is_their_own(tmp_path: Path) -> None:
+    (tmp_path / "there.yaml").write_text("route: [[0, 400, 10], [400, 400, 10]]\n", encoding="utf-8")
+    first, second, third = read_fleet(fleet_file(tmp_path, FLEET)).members
+    for member in (first, second, third):
+        assert member.scenario.aircraft.wind == (2.0, -1.0)
+        assert member.scenario.aircraft.turbulence is not None
+        assert (member.scenario.aircraft.turbulence.seed, member.scenario.aircraft.turbulence.wind) == (
+            7,
+            7.7,
+        )  # of osprey_route
+        assert member.scenario.flight.duration == 3.0
+    assert (second.delay, second.scenario.aircraft.start.north, second.scenario.aircraft.start.heading) == (1.5, 50.0, 0.5)
+    assert first.scenario.rise_di().k_g != second.scenario.rise_di().k_g == 2.5
+    assert third.scenario.guidance is not None
+    assert third.scenario.guidance.route is not None
+    assert third.scenario.guidance.route.east == (400.0, 400.0)
+
+
+@pytest.mark.parametrize("node", ["/blue/controller#2", "/stray#2", "/green/stray#2"])
+def test_samples_of_node_outside_of_aircraft_are_counted(node: str) -> None:
+    def of(*nodes: str) -> dict[str, Any]:
+        return {"account": {"processes": {name: {"samples": 3} for name in nodes}}}
+
+    own, blue = "/red/controller#1", of("/blue/controller#2")
+    assert fleet.foreign_samples({"red": of(own), "blue": blue}) == ["samples from outside of the aircraft: 0 of 6"]
+    assert fleet.foreign_samples({"red": of(own, node), "blue": blue}) == ["red: 3 samples from outside of /red"]
+
+
+@pytest.fixture
+def without_ros(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    for name in ("require_package", "require_ros_environment"):
+        monkeypatch.setattr(fleet, name, lambda *words: None)
+    return monkeypatch
+
+
+@pytest.mark.parametrize("words", [["fly"], ["fly", "osprey_gust", "--in-process"]])
+def test_interrupt_before_flight_leaves_no_folder(words: list[str], without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def interrupted(*runs: Path, **options: Any) -> NoReturn:
+        assert all(run.is_dir() for run in runs)
+        raise KeyboardInterrupt
+
+    without_ros.setattr("flight_cli.watch.watched", interrupted)
+    file = [str(fleet_file(tmp_path, FLEET_OF_TWO))] if words == ["fly"] else []
+    arguments = [*words, *file, "--watch", "--set", f"runs={tmp_path / 'runs'}"]
+    assert CliRunner().invoke(application([words[0]]), arguments).exit_code == 130
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_interrupt_of_reports_shows_what_was_flown(without_ros: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def flown(of: Fleet, runs: Sequence[Path], progress: object) -> list[Flown]:
+        return [Flown(member, run, "completed") for member, run in zip(of.members, runs, strict=True)]
+
+    def reported(run: Path, outcome: str) -> NoReturn:
+        raise ParameterError("no sample") if "-one-" in run.name else KeyboardInterrupt
+
+    without_ros.setattr(fleet, "fly_fleet", flown)
+    without_ros.setattr(fleet, "write_report", reported)
+    arguments = ["fly", str(fleet_file(tmp_path, FLEET_OF_TWO)), "--set", f"runs={tmp_path / 'runs'}", "--json"]
+    result = CliRunner().invoke(application(["fly"]), arguments)
+    assert result.exit_code == 130
+    outcomes = {name: summary["outcome"] for name, summary in json.loads(result.output).items()}
+    assert outcomes["one"] == "never flew: no sample"
+    assert outcomes["two"] == "completed, no report: rise-di report writes it"

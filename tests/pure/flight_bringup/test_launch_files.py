@@ -1,0 +1,355 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The launch files with a stand-in for `launch` (tests/launch_stand_in.py).
+
+Checked: the arguments, the start order of the processes by their `node_state`, their parameters, and the effect of their end.
+"""
+
+import runpy
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pytest
+import typer
+import yaml
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import KeyValue
+from tests import launch_stand_in as stand_in
+from tests.conftest import REPOSITORY
+from tests.launch_stand_in import ExecuteProcess, LaunchContext, Node, OpaqueFunction, ProcessExited, TimerAction
+from tests.maps import MAP_FILES
+
+from autopilot_bridge.params import LIBRARY, BridgeConfig, load_map
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario, parse_scenario_sections
+from flight_analysis.closed_loop.simulate import simulate
+from flight_cli.cli import COMMANDS, application
+from flight_core.environment import PROFILE_VARIABLE
+from flight_core.parameters import Config, ParameterError
+from flight_core.rates import NANOSECONDS, nanoseconds
+from flight_log.bag import LogAttachments
+from flight_log.tape_writer import write_run
+from flight_ros.messages import stamp_of
+from flight_ros.topics import NodeState
+from flight_ros.transport import DISCOVERY_VARIABLE
+
+app = application([*COMMANDS])
+FILES = sorted((REPOSITORY / "ros_ws" / "src" / "flight_bringup" / "launch").glob("*.launch.py"))
+INSTALLED = REPOSITORY / "ros_ws" / "install"
+NODES: dict[str, type[Config]] = {name: schema for name, schema in SCHEMAS.items() if name != "flight"}
+NODES["bridge"] = BridgeConfig
+SHARED = "flight_bringup.launch.stages"
+PID = 0  # of a process of this launch
+T = TypeVar("T")
+Case = tuple[list[Any], LaunchContext, tuple[str, ...], tuple[str, ...]]
+
+
+@pytest.fixture(autouse=True)
+def launch(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The stand-in in the place of launch, also for the shared code of the launch files."""
+    for name in (PROFILE_VARIABLE, DISCOVERY_VARIABLE):
+        monkeypatch.setenv(name, "")  # restored afterwards
+        monkeypatch.delenv(name)
+    for name, module in stand_in.modules().items():
+        monkeypatch.setitem(sys.modules, name, module)
+    monkeypatch.delitem(sys.modules, SHARED, raising=False)
+    yield
+    sys.modules.pop(SHARED, None)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def process() -> Iterator[None]:
+    global PID  # noqa: PLW0603 - one process for all tests
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as child:
+        PID = child.pid
+        yield
+        child.terminate()
+
+
+def described(name: str) -> Sequence[Any]:
+    path = next(file for file in FILES if file.name == f"{name}.launch.py")
+    entities: Sequence[Any] = runpy.run_path(str(path))["generate_launch_description"]().entities
+    return entities
+
+
+def started(name: str, pushed: str = "", **given: object) -> tuple[list[Any], LaunchContext]:
+    """The actions of a launch with arguments, and its context. `pushed` is the namespace of a launch file that includes it."""
+    entities = described(name)
+    declared = {argument.name: argument.default_value for argument in every(stand_in.DeclareLaunchArgument, entities)}
+    assert given.keys() <= declared.keys()
+    context = LaunchContext(**{key: value for key, value in declared.items() if value is not None})
+    context.launch_configurations.update({key: str(value) for key, value in given.items()})
+    if pushed:
+        context.launch_configurations["ros_namespace"] = pushed
+    (preparation,) = every(OpaqueFunction, entities)
+    return list(preparation.function(context) or ()), context
+
+
+def nodes(actions: Sequence[Any]) -> dict[str, Node]:
+    """The nodes among actions, by their executables."""
+    return {node.executable: node for node in every(Node, actions)}
+
+
+def overrides(node: Node) -> dict[str, Any]:
+    """The parameters of a node beside its section of the scenario."""
+    values: dict[str, Any] = node.parameters[1]
+    return values
+
+
+def publish(
+    actions: Sequence[Any], context: LaunchContext, key: str, state: str = "ready", topic: str = "/node_state"
+) -> list[Any]:
+    """The actions that follow a message on `node_state`."""
+    context.ros_node.subscriptions[topic](KeyValue(key=key, value=state))
+    return context.handle(actions)
+
+
+def all_ready(actions: Sequence[Any], context: LaunchContext, namespace: str = "") -> list[Any]:
+    """The actions once all nodes are ready; none before, and none for a second message."""
+    topic = f"{namespace}/node_state"
+    *others, last = (f"{namespace}/{name}#{PID}" for name in nodes(actions))
+    for key in others:
+        assert publish(actions, context, key, topic=topic) == []
+        assert publish(actions, context, key, topic=topic) == []
+    follow = publish(actions, context, last, topic=topic)
+    assert publish(actions, context, last, topic=topic) == []
+    return follow
+
+
+def ends(actions: Sequence[Any]) -> bool:
+    return bool(every(stand_in.Shutdown, actions))
+
+
+def every(kind: type[T], actions: Sequence[Any]) -> list[T]:
+    return [action for action in actions if isinstance(action, kind)]
+
+
+@pytest.fixture
+def short(osprey_gust: Scenario, tmp_path: Path) -> Path:
+    """A recorded flight of half a second."""
+    tape = simulate(osprey_gust.vary(flight={"duration": 0.5}))
+    return write_run(tape, tmp_path / "log", LogAttachments(osprey_gust.path)).parent
+
+
+CASES: tuple[tuple[str, dict[str, str], tuple[str, ...], tuple[str, ...]], ...] = (
+    ("fly", {}, ("recorder", "controller"), ("aircraft", "reference_model")),
+    ("fly", {"lockstep": "true"}, ("recorder", "controller"), ("aircraft", "reference_model")),
+    ("bridge", {"map": "ardupilot"}, ("recorder", "controller"), ("bridge", "reference_model")),
+    ("bridge", {"map": "px4", "recorder": "false"}, ("controller",), ("bridge", "reference_model")),
+    ("replay", {}, ("controller",), ()),
+    ("replay", {"recorder": "true", "lockstep": "true"}, ("recorder", "controller"), ()),
+    ("replay", {"controller": "false", "aircraft": "true"}, ("aircraft",), ()),
+    ("replay", {"map": "ardupilot", "reference_model": "true"}, ("controller", "reference_model", "bridge"), ()),
+)
+
+
+def test_every_launch_file_installed_and_tested_here() -> None:
+    names = [path.name.removesuffix(".launch.py") for path in FILES]
+    assert set(names) == {"fleet", *(name for name, *_ in CASES)}
+    for path in FILES:
+        assert (INSTALLED / "flight_bringup" / "share" / "flight_bringup" / "launch" / path.name).is_file()
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_every_argument_described_and_default_is_one_of_choices(path: Path) -> None:
+    arguments = every(stand_in.DeclareLaunchArgument, described(path.name.removesuffix(".launch.py")))
+    assert len({argument.name for argument in arguments}) == len(arguments) > 2
+    for argument in arguments:
+        assert argument.description, argument.name
+        if argument.choices is not None:
+            assert argument.default_value in argument.choices, argument.name
+        else:
+            assert argument.default_value not in {"true", "false"}, f"{argument.name} needs choices"
+
+
+def test_fleet_is_a_process_and_its_end_ends_launch(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.yaml"
+    file.write_text("{composed: true, aircraft: {uav1: {}}}", encoding="utf-8")
+    (fleet,), context = started("fleet", fleet=file, duration="3.0", watch="true")
+    assert [str(word) for word in fleet.cmd[1:]] == ["fly", str(file), "--set", "runs=runs", "--duration", "3.0", "--watch"]
+    assert ends(fleet.on_exit(ProcessExited("fleet", 0), context))
+    with pytest.raises(RuntimeError, match="the fleet ended with status 3"):
+        fleet.on_exit(ProcessExited("fleet", 3), context)
+    file.write_text("aircraft: {1a: {}}", encoding="utf-8")
+    with pytest.raises(ParameterError, match="found '1a'"):
+        started("fleet", fleet=file)
+
+
+@pytest.fixture(params=CASES, ids=lambda case: "-".join((case[0], *case[1])))
+def case(request: pytest.FixtureRequest, short: Path, tmp_path: Path) -> Case:
+    """A launch: its actions, its context, and the nodes expected in its first and its second stage."""
+    name, given, first, then = request.param
+    log = {"run": str(short)} if name == "replay" else {}
+    return (*started(name, **given, **log, runs=tmp_path / "runs"), first, then)
+
+
+def test_nodes_start_in_order_with_parameters_that_they_have(case: Case) -> None:
+    actions, context, first, then = case
+    follow = all_ready(actions, context)
+    assert tuple(nodes(actions)) == first
+    assert tuple(nodes(follow)) == then
+    assert context.launch_configurations["launch-prefix"].endswith("setpriv --pdeathsig TERM")
+    for executable, node in {**nodes(actions), **nodes(follow)}.items():
+        assert (INSTALLED / node.package / "lib" / node.package / executable).is_file()
+        assert node.namespace == stand_in.LaunchConfiguration("namespace")
+        assert node.exec_name == executable
+        file, given_to_node = node.parameters
+        section = {} if executable == "bridge" else parse_scenario_sections(Path(file).read_bytes(), Path(file))[executable]
+        NODES[executable].validate_mapping(section | given_to_node, executable)
+
+
+def test_end_of_any_node_ends_launch_with_error(case: Case, tmp_path: Path) -> None:
+    actions, context, first, _ = case
+    left = [file.read_text(encoding="utf-8") for file in tmp_path.glob("runs/*/outcome")]
+    assert left == (["interrupted"] if "recorder" in first else [])  # the outcome of Ctrl-C
+    for executable, node in {**nodes(actions), **nodes(all_ready(actions, context))}.items():
+        assert node.on_exit is not None
+        for status in (0, 3, -9):
+            context.is_shutdown = False
+            with pytest.raises(RuntimeError, match=f"{executable}-1 ended before the flight did"):
+                node.on_exit(ProcessExited(f"{executable}-1", status), context)
+            if "recorder" in first:
+                assert (
+                    next(tmp_path.glob("runs/*/outcome")).read_text(encoding="utf-8").startswith(f"{executable}-1 ended before")
+                )
+            context.is_shutdown = True
+            assert node.on_exit(ProcessExited(f"{executable}-1", status), context) is None
+
+
+def test_node_of_first_stage_that_is_never_ready_ends_launch(case: Case, tmp_path: Path) -> None:
+    actions, context, first, _ = case
+    timer = every(TimerAction, actions)[-1]
+    assert timer.period == 20.0
+    (require_ready,) = every(OpaqueFunction, timer.actions)
+    for executable in first[:-1]:
+        publish(actions, context, f"/{executable}#{PID}")
+    with pytest.raises(RuntimeError, match=f"^never flew: {first[-1]} not ready after 20 s$"):
+        require_ready.function(context)
+    left = [file.read_text(encoding="utf-8") for file in tmp_path.glob("runs/*/outcome")]
+    assert left == ([f"never flew: {first[-1]} not ready after 20 s"] if "recorder" in first else [])
+    publish(actions, context, f"/{first[-1]}#{PID}")
+    assert require_ready.function(context) is None
+
+
+def flown_to(context: LaunchContext, actions: Sequence[Any], instant: float) -> list[Any]:
+    """The actions that follow when the log holds y, y_m and u up to an instant, s of the system clock."""
+    sec, nanosec = divmod(nanoseconds(instant), NANOSECONDS)
+    context.ros_node.subscriptions["/recorded"](Time(sec=sec, nanosec=nanosec))
+    return context.handle(actions)
+
+
+FLYING = ("recorder", "controller", "aircraft", "reference_model")
+
+
+def all_matched(follow: Sequence[Any], context: LaunchContext, names: Sequence[str] = FLYING) -> list[Any]:
+    """The actions once these nodes are matched; a node may be flying before this launch has discovered it."""
+    states = {"aircraft": NodeState.FLYING}
+    return [
+        action for name in names for action in publish(follow, context, f"/{name}#{PID}", states.get(name, NodeState.MATCHED))
+    ]
+
+
+def test_flight_begins_once_all_are_matched_and_ends_once_log_holds_it(tmp_path: Path) -> None:
+    actions, context = started("fly", duration=5, runs=tmp_path)
+    follow = all_ready(actions, context)
+    assert overrides(nodes(follow)["reference_model"])["start_time"] == -1.0
+    assert not any(ends(timer.actions) for timer in every(TimerAction, follow))
+    assert not all_matched(follow, context, FLYING[:-1])
+    assert not flown_to(context, follow, time.time() + 5.0)
+    assert context.ros_node.published == []
+    timers = every(TimerAction, all_matched(follow, context, FLYING[-1:]))
+    ((topic, message),) = context.ros_node.published
+    start = stamp_of(message) / NANOSECONDS
+    assert topic == "/start"
+    assert start == pytest.approx(time.time() + 0.5, abs=0.4)  # half a second in which `start` reaches the nodes
+    assert not flown_to(context, follow, start + 4.9)
+    (give_up,) = every(OpaqueFunction, timers[-1].actions)
+    with pytest.raises(RuntimeError, match=r"^ended early: the log holds y, y_m and u up to t = 4\.900 of 5 s$"):
+        give_up.function(context)
+    flown = flown_to(context, follow, start + 5.0)
+    assert ends(flown)
+    (leave,) = every(OpaqueFunction, flown)
+    leave.function(context)
+    assert (next(tmp_path.glob("*-osprey_servo")) / "outcome").read_text(encoding="utf-8") == "completed"
+
+
+def test_rosbag2_is_not_for_lockstep(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="recorder: found rosbag2 in lockstep, expected true"):
+        started("fly", recorder="rosbag2", lockstep="true", runs=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bridge_is_dry_run_by_default_and_topics_recorded(tmp_path: Path) -> None:
+    actions, context = started("bridge", map="ardupilot", runs=tmp_path)
+    bridge = overrides(nodes(all_ready(actions, context))["bridge"])
+    assert bridge == {"map": str(LIBRARY / "ardupilot.yaml"), "dry_run": True}
+    recorder = overrides(nodes(actions)["recorder"])
+    assert set(load_map("ardupilot").topics) <= set(recorder["topics"])
+    assert "bridge/would_send" in recorder["topics"]
+    assert bridge["map"] in recorder["attach"]
+    slow = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"
+    follow = all_ready(*started("bridge", map=str(MAP_FILES["ardupilot_2024"]), scenario=slow, dry_run="false", runs=tmp_path))
+    assert overrides(nodes(follow)["bridge"])["dry_run"] is False
+    assert not every(TimerAction, follow)  # until Ctrl-C
+
+
+def test_bridge_with_flipped_sign_refused_before_anything_starts(tmp_path: Path) -> None:
+    content = yaml.safe_load((LIBRARY / "ardupilot.yaml").read_text(encoding="utf-8"))
+    content["inputs"]["rudder"] = {**content["inputs"]["rudder"], "sign": -1}
+    (tmp_path / "flipped.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    with pytest.raises(ParameterError, match="D of r and rudder is -1, the controller has \\+1"):
+        started("bridge", map=tmp_path / "flipped.yaml", runs=tmp_path)
+    assert not list(tmp_path.glob("*-osprey_servo"))
+
+
+def test_limits_beyond_those_of_map_refused_before_anything_sent(tmp_path: Path) -> None:
+    """The bridge clips u, which the anti-windup of the law does not know."""
+    scenario = REPOSITORY / "tests" / "ros" / "slow_autopilot.yaml"  # thrust from -0.4 to 0.4, the map from -0.2 to 0.3
+    sentence = r"controller\.lower: found -0\.4, expected at least -0\.2, the lower limit of thrust in the map ardupilot"
+    with pytest.raises(ParameterError, match=sentence):
+        started("bridge", map="ardupilot", scenario=scenario, dry_run="false", runs=tmp_path)
+    with pytest.raises(ParameterError, match=r"osprey_servo: controller\.lower: found -0\.5"):
+        started("bridge", map="ardupilot", dry_run="false", runs=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def player(actions: Sequence[Any]) -> ExecuteProcess:
+    (process,) = every(ExecuteProcess, actions)
+    return process
+
+
+def options(process: ExecuteProcess) -> dict[str, Any]:
+    """The options of `rise-di play` on its command line."""
+    executable, command, *words = process.cmd
+    assert executable == stand_in.ExecutableInPackage(package="flight_cli", executable="rise-di")
+    assert (INSTALLED / executable.package / "lib" / executable.package / executable.executable).is_file()
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    with group.commands[command].make_context(command, [*words]) as context:
+        return dict(context.params)
+
+
+@pytest.mark.parametrize(
+    ("given", "topics"),
+    [
+        ({}, "/pose,/truth,/y,/y_m"),  # the controller publishes u and internals
+        ({"controller": "false", "aircraft": "true"}, "/internals,/u,/y_m"),
+        ({"map": "ardupilot"}, "/truth,/y_m"),  # y is the bridge's
+        ({"topics": "y,y_m"}, "y,y_m"),
+    ],
+    ids=str,
+)
+def test_topics_without_a_publisher_are_played(given: dict[str, str], topics: str, short: Path, osprey_gust: Scenario) -> None:
+    actions, context = started("replay", run=short, scenario=osprey_gust.path, **given)
+    values = options(player(all_ready(actions, context, "/one" if "namespace" in given else "")))
+    assert values["topics"] == topics
+    assert values["run"] == short
+    assert (values["rate"], values["start"], values["loop"], str(values["stamps"])) == (1.0, 0.0, False, "now")
+
+
+def test_lockstep_is_for_the_controller_alone(short: Path) -> None:
+    with pytest.raises(ParameterError, match="lockstep: found true with aircraft, expected controller and recorder alone"):
+        started("replay", run=short, lockstep="true", aircraft="true")

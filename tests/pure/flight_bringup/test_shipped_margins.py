@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Margins of scenarios that ship and of examples: behind servos the requirement holds, or the first line says why not."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.conftest import REPOSITORY
+from tests.other_laws import example_installed
+
+from flight_analysis.closed_loop.loop_margins import margins
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from rise_di_controller.law import Sign
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+pytestmark = pytest.mark.slow
+
+CONTROLLER = "/**/controller"
+EXAMPLES = [path for path in sorted(REPOSITORY.glob("examples/*/*.yaml")) if CONTROLLER in path.read_text(encoding="utf-8")]
+FILES = [*sorted(LIBRARY.glob("*.yaml")), *EXAMPLES]
+STATED = ("An ideal loop", "Margins below the requirement")  # how a first line names a loop without the margins
+NOMINAL, OBSERVED, WORST, SENSITIVITY = 40.0, 35.0, 30.0, 2.0  # deg, deg with an observer, deg of the worst of 200, 1
+AIRCRAFT, UNCERTAINTY = 200, 0.3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _example(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with example_installed(tmp_path_factory.mktemp("installed")):
+        yield
+
+
+def first_line(path: Path) -> str:
+    """The first line of comment below the header of the licence."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comments = (line.removeprefix("#").strip() for line in lines if line.startswith("#"))
+    return next(line for line in comments if line and not line.startswith("SPDX"))
+
+
+def has_softened_loop(scenario: Scenario) -> bool:
+    controller = scenario.controller
+    return not isinstance(controller, RiseDiConfig) or controller.sampled_sign()[0] is Sign.SOFT
+
+
+def test_every_file_is_found() -> None:
+    assert {"osprey_servo", "osprey_observer", "jsbsim_f16", "scenario", "osprey_pid"} <= {path.stem for path in FILES}
+
+
+@pytest.mark.parametrize("path", FILES, ids=[f"{path.parent.name}_{path.stem}" for path in FILES])
+def test_margins_of_what_ships(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(REPOSITORY)  # the examples name their airframes from there
+    scenario, line = find_scenario(str(path)), first_line(path)
+    if not has_softened_loop(scenario):
+        assert line.startswith(STATED[0]), line
+        return
+    of = margins(scenario, AIRCRAFT, UNCERTAINTY)
+    assert of.worst is not None
+    nominal, worst = (math.degrees(margins_of.phase.min()) for margins_of in (of.nominal, of.worst))
+    needed = NOMINAL if scenario.controller.observer is None else OBSERVED
+    meets = nominal >= needed and worst >= WORST and of.nominal.sensitivity.max() <= SENSITIVITY
+    found = f"{nominal:.1f} deg, worst {worst:.1f} deg, S {of.nominal.sensitivity.max():.2f}"
+    assert meets != line.startswith(STATED[1]), found

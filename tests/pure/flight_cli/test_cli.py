@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: exit status, sentences, files."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import typer
+from tests.conftest import REPOSITORY
+from typer.testing import CliRunner
+
+from flight_analysis.closed_loop.replay import recorded_scenario
+from flight_analysis.closed_loop.scenario import SCHEMAS, Scenario
+from flight_analysis.closed_loop.scenario_library import LIBRARY, find_scenario
+from flight_cli.cli import COMMANDS, application
+from flight_cli.words import GONE
+from flight_core.parameters import ParameterError
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+pytestmark = pytest.mark.slow
+
+
+def rise_di(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "flight_cli.cli", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    where = tmp_path_factory.mktemp("fly")
+    return where, rise_di("fly", "osprey_gust", "--in-process", "--duration", "4", cwd=where)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+def test_full_disk_behind_standard_output_is_one_sentence() -> None:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        command = [sys.executable, "-m", "flight_cli.cli", "--help"]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    sentence = "error: output: cannot be written (No space left on device), expected a disk with space\n"
+    assert (result.returncode, result.stderr) == (1, sentence)
+
+
+def test_flight_ends_with_table_log_and_report(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    where, shown = flown
+    assert shown.returncode == 0, shown.stderr
+    run = (where / "runs" / "latest").resolve()
+    assert {path.name for path in run.iterdir()} == {
+        "metadata.yaml", "report.html", "osprey_gust.yaml", "summary.json", f"{run.name}_0.mcap",
+        "airframe.yaml", "parameters.yaml", "provenance.yaml",
+    }  # fmt: skip
+    assert "q (mrad/s)" in shown.stdout
+    assert f"runs/{run.name}/report.html" in shown.stdout
+    assert "Traceback" not in shown.stderr
+
+
+def test_summary_holds_what_was_flown(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    summary = json.loads((flown[0] / "runs" / "latest" / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["scenario"], summary["outcome"], summary["duration"]) == ("osprey_gust", "completed", 4.0)
+    assert summary["errors"]["q"]["gust"] == {"rms": None, "max": None}  # the gusts come later
+    assert 0 < summary["errors"]["q"]["calm"]["rms"] < 1e-3
+    assert (summary["ticks"]["ticks"], summary["ticks"]["without_new_y"]) == (401, 0)
+
+
+def test_report_is_one_page_that_needs_no_network(flown: tuple[Path, subprocess.CompletedProcess[str]]) -> None:
+    page = (flown[0] / "runs" / "latest" / "report.html").read_text(encoding="utf-8")
+    assert 'src="http' not in page
+    assert "gust: from the entry of a gust to 1 s after its end" in page
+    assert "periods without a new y" in page
+    assert page.index("Tracking error") < page.index("Output y over the reference y_m")
+
+
+def test_json_is_all_that_is_printed(tmp_path: Path) -> None:
+    shown = rise_di("fly", "--in-process", "--duration", "1", "--json", cwd=tmp_path)
+    assert json.loads(shown.stdout)["duration"] == 1.0
+    assert shown.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["fly", "nowhere"], "error: scenario: found 'nowhere', expected one of"),
+        (["fly", "--duration", "-1"], "error: flight.duration: found -1.0, expected greater than 0"),
+        (["fly", "--set", "wind.sigma=1"], "error: --set: found 'wind.sigma=1', expected a parameter of the scenario and"),
+        (["fly", "--set", "controller.k_g"], "error: --set: found 'controller.k_g', expected a parameter of the scenario and"),
+        (["report", "nowhere"], "error: nowhere: found no such file or folder"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_status_2(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+    shown = rise_di(*arguments, cwd=tmp_path)
+    assert shown.returncode == 2
+    assert shown.stderr.startswith(sentence)
+    assert len(shown.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_flight_with_set_parameters_has_them_in_its_log(tmp_path: Path) -> None:
+    settings = ("--set", "controller.k_g=2.5", "--set", "controller.learn.window=40", "--set", "flight.duration=0.2")
+    shown = rise_di("fly", "osprey_learn", "--in-process", *settings, cwd=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    flown = recorded_scenario(tmp_path / "runs" / "latest")
+    expected = find_scenario("osprey_learn").rise_di().learn
+    assert expected is not None
+    assert (flown.flight.duration, flown.rise_di().k_g) == (0.2, 2.5)
+    assert flown.rise_di().learn == expected.model_copy(update={"window": 40.0})
+
+
+def test_help_names_every_option() -> None:
+    shown = CliRunner().invoke(application(["fly"]), ["fly", "--help"])
+    for option in ("--duration", "--in-process", "--set", "--json"):
+        assert option in shown.stdout
+
+
+def test_scenario_file_may_lie_anywhere_and_wrong_sign_ends_flight_when_it_diverges(
+    tmp_path: Path, osprey_gust: Scenario
+) -> None:
+    text = osprey_gust.path.read_text(encoding="utf-8")
+    (tmp_path / "mine.yaml").write_text(text.replace("D: [1, 1, 1, 1]", "D: [-1, 1, 1, 1]"), encoding="utf-8")
+    flown = rise_di("fly", "mine.yaml", "--in-process", cwd=tmp_path)
+    assert flown.returncode == 3
+    assert "outcome: diverged at t = " in flown.stdout
+    assert (tmp_path / "runs" / "latest").resolve().name.endswith("-mine")
+
+
+def test_command_whose_python_package_is_missing_says_what_installs_it(tmp_path: Path) -> None:
+    (tmp_path / "jax.py").write_text("raise ModuleNotFoundError('No module named jax', name='jax')", encoding="utf-8")
+    shown = rise_di("campaign", "osprey_servo", "--aircraft", "1", cwd=tmp_path)  # -m puts the working folder first
+    assert shown.returncode == 2
+    sentence = "error: rise-di campaign: found no Python package jax, expected it: make setup-all"
+    assert shown.stderr.splitlines()[-1] == sentence
+    assert "Traceback" not in shown.stderr
+
+
+@pytest.mark.parametrize("command", ["campaign", "compare", "benchmark"])
+def test_device_that_jax_lacks_is_one_sentence_without_a_folder(command: str, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "flight_cli.cli", command, "osprey_servo", "--aircraft", "1"]
+    environment = {**os.environ, "JAX_PLATFORMS": "nonsense"}
+    shown = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert shown.returncode == 2
+    assert shown.stderr.splitlines()[-1].startswith("error: JAX_PLATFORMS: found 'nonsense' (")
+    assert "Traceback" not in shown.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_of_runs_that_is_not_utf_8_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust", "--in-process", "--duration", "0.1", "--set"]
+    shown = subprocess.run([*map(os.fsencode, words), b"runs=r\xff"], cwd=tmp_path, capture_output=True, check=False)
+    assert shown.returncode == 2
+    assert re.fullmatch(rb"error: --set runs: found .*udcff', expected a folder with a name in UTF-8.*\n", shown.stderr)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_version_is_that_of_the_package(tmp_path: Path) -> None:
+    assert rise_di("--version", cwd=tmp_path).stdout == f"rise-di {version('rise-di')}\n"
+
+
+def options_of(name: str) -> set[str]:
+    """The options of a command; its settings are one, --set."""
+    command = typer.main.get_command(application([name])).commands[name]  # type: ignore[attr-defined]
+    return {each.opts[0].split()[0] for each in command.params if each.param_type_name == "option"}
+
+
+def test_commands_and_options_are_few() -> None:
+    assert len(COMMANDS) <= 20
+    assert {name: found for name in COMMANDS if len(found := options_of(name)) > 10} == {}
+
+
+@pytest.mark.parametrize("words", GONE)
+def test_name_that_is_gone_is_one_sentence_with_the_new_one(words: str) -> None:
+    name = words.partition(" ")[0]
+    result = CliRunner().invoke(application(COMMANDS), words.split())
+    assert str(result.exception).endswith(f"expected {GONE[words]}")
+    assert isinstance(result.exception, ParameterError)
+    new = next((word for word in GONE[words].split() if word in COMMANDS), name)
+    assert set(re.findall(r"--[a-z-]+", GONE[words])) <= options_of(new)
+
+
+def test_option_that_became_a_setting_names_it() -> None:
+    result = CliRunner().invoke(application(["gains"]), ["gains", "osprey", "--y-rate", "50"])
+    assert str(result.exception) == "--y-rate: found an option that is gone, expected --set y_rate"
+    unknown = CliRunner().invoke(application(["export"]), ["export", "osprey_servo", "--set", "rate=50"])
+    assert str(unknown.exception) == "--set: found 'rate=50', expected one of no settings"
+
+
+def test_scenarios_are_listed_with_their_sentence_aircraft_and_law() -> None:
+    listed = json.loads(CliRunner().invoke(application(["scenarios"]), ["scenarios", "--json"]).output)
+    assert [row["name"] for row in listed] == sorted(path.stem for path in LIBRARY.glob("*.yaml"))
+    (servo,) = (row for row in listed if row["name"] == "osprey_servo")
+    assert (servo["aircraft"], servo["law"]) == ("osprey", "rise_di")
+    assert servo["flies"].startswith("Commands on every channel and two gusts")
+    shown = CliRunner().invoke(application(["scenarios"]), ["scenarios", "osprey_gust"])
+    assert "osprey_gust" in shown.output
+    assert "osprey_route" not in shown.output
+
+
+def test_every_command_of_help_has_help_of_own(tmp_path: Path) -> None:
+    for name in COMMANDS:
+        shown = CliRunner().invoke(application([name]), [name, "--help"], prog_name="rise-di")
+        assert shown.exit_code == 0, name
+        assert f"Usage: rise-di {name}" in shown.stdout
+    listed = rise_di("--help", cwd=tmp_path).stdout
+    assert all(name in listed for name in COMMANDS)
+
+
+def test_interrupt_inside_destructor_ends_command_without_traceback() -> None:
+    code = """
+import signal, time
+from flight_cli import cli
+
+class Interrupting:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def command(prog_name):
+    Interrupting()
+    time.sleep(60.0)
+
+cli.application = lambda words: command
+cli.main()
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
+
+
+def test_keys_of_the_first_page_are_keys_of_a_scenario() -> None:
+    page = (REPOSITORY / "docs" / "get-started.md").read_text(encoding="utf-8")
+    keys = re.findall(r"^\| `(\w+\.\w+)` \|", page.partition("15 keys")[2], re.MULTILINE)
+    assert len(keys) == 15
+    for key in keys:
+        section, _, name = key.partition(".")
+        models = [SCHEMAS[section], RiseDiConfig] if section == "controller" else [SCHEMAS[section]]
+        assert any(name in model.model_fields for model in models), key  # type: ignore[attr-defined]

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`rise-di report`: one run or several, as page, figure, table and JSON."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.report import run_folder
+from flight_analysis.report.run_folder import new_run, read_flight, write_report
+from flight_analysis.report.summary import empty_summary
+from flight_bringup.fly import fly_in_process
+from flight_cli.report import report
+from flight_core.parameters import ParameterError
+from flight_log.engagements import Engagement
+from flight_log.tape_reader import read_run
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two flights of two seconds, of different scenarios."""
+    folder, runs = tmp_path_factory.mktemp("runs"), []
+    for name in ("osprey_gust", "osprey_servo"):
+        scenario = find_scenario(name).vary(flight={"duration": 2.0})
+        run = new_run(scenario, folder)
+        write_report(run, fly_in_process(scenario, run, lambda t, output: None))
+        runs.append(run)
+    return runs
+
+
+def test_one_run_as_figure_tables_and_json(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    png, csv, parquet = (tmp_path / f"run.{suffix}" for suffix in ("png", "csv", "parquet"))
+    report(runs[:1], png=png, csv=csv, parquet=parquet, as_json=True)
+    assert json.loads(capsys.readouterr().out) == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8"))
+    assert png.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    assert csv.read_bytes()[:8] == b"stamp_ns"
+    assert parquet.read_bytes()[:4] == b"PAR1"
+
+
+def test_engagement_shorter_than_sample_leaves_figures_of_flight(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = read_run(run)
+    instant = int(log.tape["y"].stamp_ns[5]) + 1  # between two samples
+    monkeypatch.setattr(run_folder, "read_run", lambda *_: log._replace(engagements=[Engagement(instant, instant + 1, "lost")]))
+    summary = read_flight(run, "completed").summary
+    assert summary["duration"] > 1.0
+    assert summary["notes"][0].endswith("s: lost")
+    assert summary["notes"][1] == "the figures are of the whole flight: no y while engaged"
+
+
+def test_two_runs_are_compared(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = (runs[0] / "report.html").read_bytes()
+    report(runs, html=Path("two.html"))
+    output = capsys.readouterr().out
+    assert "2 flights compared" in (tmp_path / "two.html").read_text(encoding="utf-8")
+    assert f"1: {runs[0].name}, completed" in output
+    assert "settling" not in output  # the terminal shows errors only
+    assert output.splitlines()[-1] == "report:  two.html"
+    assert (runs[0] / "report.html").read_bytes() == before
+    report(runs, as_json=True)
+    assert [report["scenario"] for report in json.loads(capsys.readouterr().out)] == ["osprey_gust", "osprey_servo"]
+    assert (runs[0].parent / "comparison.html").is_file()
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        "html",
+        "csv",
+    ],
+)
+def test_file_that_cannot_be_written_is_one_sentence(runs: list[Path], option: str) -> None:
+    nowhere: dict[str, Any] = {option: Path("/proc/none/file")}
+    with pytest.raises(ParameterError, match=f"^--{option}: /proc/none/file cannot be written "):
+        report(runs[:1], **nowhere)
+
+
+def test_flight_without_samples_has_summary_with_same_keys(runs: list[Path]) -> None:
+    empty = empty_summary(find_scenario("osprey_gust"), "no progress")
+    assert empty.keys() == json.loads((runs[0] / "summary.json").read_text(encoding="utf-8")).keys()

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The publisher lock of a topic, and the samples that a controller uses while y_m is delayed."""
+
+import numpy as np
+import pytest
+
+from flight_analysis.closed_loop.scenario import Scenario
+from flight_core.modes import Mode
+from flight_core.publisher_lock import PublisherLock
+from flight_core.rates import nanoseconds
+from flight_core.vectors import ChannelError, StampedVector
+from rise_di_controller.controller import Controller
+
+MAX_AGE, TAKEOVER = 100, 1000
+
+
+def locked(*senders: tuple[str, int]) -> PublisherLock:
+    """A lock after samples of these publishers at these instants."""
+    lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
+    for sender, now_ns in senders:
+        lock.check(sender, now_ns)
+        lock.refresh(sender, now_ns)
+    return lock
+
+
+def test_conflicting_publisher_ignored_until_timeout() -> None:
+    """Samples of a second publisher are ignored until the first publisher times out."""
+    lock = locked(("/aircraft#1", 0), ("/aircraft#1", 90))
+    for publisher in ("/aircraft#2", "/foreign", ""):
+        sentence = f"conflicting publisher {publisher} ignored: already receiving from /aircraft#1"
+        with pytest.raises(ChannelError, match=sentence) as ignored:
+            lock.check(publisher, 190)
+        assert ignored.value.reason == "sender"
+    lock.check("/aircraft#1", 10_000)  # the locked publisher itself, after any time
+
+
+def test_restarted_node_takes_over_earlier() -> None:
+    """A restarted node takes over after the age limit, a different node later."""
+    lock = locked(("/aircraft#1", 0))
+    lock.check("/aircraft#2", MAX_AGE + 1)
+    with pytest.raises(ChannelError):
+        lock.check("/foreign", TAKEOVER)
+    lock.check("/foreign", TAKEOVER + 1)
+    assert lock.timed_out(MAX_AGE + 1, MAX_AGE)
+    assert not lock.timed_out(MAX_AGE, MAX_AGE)
+
+
+def test_overrun_of_receiver_is_no_silence_of_publisher() -> None:
+    lock = locked(("/aircraft#1", 0))
+    lock.overran(5000)
+    now_ns = 5000 + TAKEOVER
+    with pytest.raises(ChannelError, match="already receiving from /aircraft#1"):
+        lock.check("/foreign", now_ns)
+    lock.check("/foreign", now_ns + 1)
+    assert lock.timed_out(now_ns, MAX_AGE)  # its sample is old, whatever the reason
+    lock.refresh("/aircraft#1", now_ns)
+    lock.check("/foreign", now_ns + TAKEOVER + 1)  # an overrun counts once
+
+
+def test_a_change_of_publisher_is_returned_once() -> None:
+    lock = PublisherLock(lambda: (MAX_AGE, TAKEOVER))
+    assert lock.timed_out(0, MAX_AGE)
+    assert lock.refresh("/aircraft#1", 0)
+    assert not lock.refresh("/aircraft#1", 1)
+    assert lock.refresh("/aircraft#2", 2)
+
+
+@pytest.mark.parametrize(("late", "modes"), [(0.05, {Mode.ENGAGED}), (0.15, {Mode.ENGAGED, Mode.HOLD, Mode.RAMP})])
+def test_delayed_reference_awaited_up_to_age_limit(late: float, modes: set[Mode], osprey_gust: Scenario) -> None:
+    """Y and y_m at 100 Hz. From 1 s on y_m has a delay, once below the age limit of 0.1 s and once above it."""
+    controller, period_ns = Controller(osprey_gust.controller), 10_000_000
+    visited, stamps = set(), []
+    for k in range(200):
+        now_ns = k * period_ns
+        controller.take_y(StampedVector(now_ns, np.zeros(4)), now_ns)
+        delay_ns = nanoseconds(late) if k >= 100 else 0
+        if k < 100 or now_ns - delay_ns >= 100 * period_ns:
+            controller.take_y_m(StampedVector(now_ns - delay_ns, np.zeros(4)), now_ns)
+        output = controller.tick(now_ns)
+        visited.add(controller.mode)
+        if output is not None and controller.mode is Mode.ENGAGED:
+            stamps.append(output.stamp_ns)
+    assert visited == modes
+    assert stamps == sorted(set(stamps))
+    if late < 0.1:  # each y is used in order, as late as its y_m, which may be extrapolated by one period
+        assert 199 * period_ns - stamps[-1] == nanoseconds(late) - period_ns

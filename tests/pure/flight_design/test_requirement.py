@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Margins as a requirement: gains whose measured margins meet it, checked by python-control, and what a margin costs."""
+
+import math
+import re
+from functools import cache
+from pathlib import Path
+
+import control
+import numpy as np
+import pytest
+import typer
+import yaml
+from typer.testing import CliRunner, Result
+
+from aircraft_sim.airframe import Airframe
+from flight_analysis.closed_loop.loop_margins import LinearLoop, margins
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_analysis.closed_loop.simulate import simulate
+from flight_analysis.metrics import best_error, error_metrics
+from flight_cli.gains import gains as gains_command
+from flight_cli.words import Command
+from flight_core.parameters import ParameterError
+from flight_core.vectors import FloatArray
+from flight_design.gains import gain_selection, ideal_control
+from flight_design.gains.gain_design import select_gains
+from flight_design.gains.ideal_control import Manoeuvre
+from flight_design.gains.requirement import NAMES, Requirement, above_zeros, conditions, least_fraction, requirement
+from flight_design.gains.trade import linear_error, trade
+from reference_model.params import ReferenceModelConfig
+from rise_di_controller.linear_loop import LinearLaw, LinearPlant, Loop
+from rise_di_controller.rise_di_config import RiseDiConfig
+
+pytestmark = pytest.mark.slow
+
+SERVO = find_scenario("osprey_servo")
+T = 0.01  # s, of the law
+LAG = {"elevator": 0.05, "throttle": 0.3}  # s
+RESPONSE = {"elevator": -8.0, "throttle": 3.0}  # abs(Omega_ii)
+
+
+def integrators() -> Airframe:
+    """q_dot = -8 elevator, V_dot = 3 throttle: a loop that python-control has channel by channel."""
+    return Airframe.validate_mapping(
+        {
+            "name": "integrators",
+            "source": "none",
+            "speed": 50.0,
+            "states": {"q": "rad/s", "V": "m/s"},
+            "inputs": {name: {"unit": "1", "positive": "none"} for name in LAG},
+            "outputs": ["q", "V"],
+            "A": [[0.0, 0.0], [0.0, 0.0]],
+            "B": np.diag(list(RESPONSE.values())).tolist(),
+        },
+        "airframe",
+    )
+
+
+@cache
+def selected(phase_margin: float) -> RiseDiConfig:
+    whole = find_scenario("osprey_servo").reference_model.model_dump(exclude_none=True)
+    commands = {
+        "rate": 100.0,
+        "outputs": ["q", "V"],
+        "second_order": {"natural_frequency": [4.0, 1.2], "damping": [0.9, 1.0]},
+        "rise": 0.1,
+        "pulses": {"q": whole["pulses"]["q"]},
+    }
+    manoeuvre = Manoeuvre(ReferenceModelConfig.validate_mapping(commands, "reference_model"), {}, 4.0)
+    studied = ideal_control.study_airframe(integrators(), manoeuvre, samples=3)
+    setting = gain_selection.loop_setting(SERVO)._replace(
+        lag=LAG, delay=0.0, rate_limit={}, requirement=requirement(phase_margin, accept=True)
+    )
+    return gain_selection.select_gains(studied, setting).chosen
+
+
+def of_python_control(controller: RiseDiConfig, channel: int) -> tuple[float, float]:
+    """Phase margin, deg, and largest sensitivity of K (1 + integral dt z / (z - 1)) and the sampled lag and integrator."""
+    params, name = controller.law_params(), controller.inputs[channel]
+    integral = params.Lambda[channel] + params.beta[channel] / params.eps[channel] / params.K[channel]
+    z = control.tf([1.0, 0.0], [1.0], T)
+    K = params.K[channel] * params.input_scale[channel] * (1.0 + integral * T * z / (z - 1.0))
+    P = control.sample_system(control.tf([abs(RESPONSE[name])], [LAG[name], 1.0, 0.0]), T, "zoh")
+    L = K * P
+    w = np.geomspace(1e-2, math.pi / T * 0.999, 4000)
+    _, phase, modulus, *_ = control.stability_margins(control.frd(L, w, smooth=True))
+    return float(phase), 1.0 / float(modulus)
+
+
+@pytest.mark.parametrize("phase_margin", [30.0, 45.0, 60.0])
+def test_selected_gains_have_the_phase_margin(phase_margin: float) -> None:
+    # The law integrates by a trapezoid, python-control's K backward: half a tick of the integral, 0.5 degrees here. A step of
+    # the search is 5 % of the integral, at most 1.5 degrees, and a sensitivity of 2 asks for more than 30 degrees.
+    controller = selected(phase_margin)
+    found = [of_python_control(controller, i) for i in range(2)]
+    for phase, sensitivity in found:
+        assert phase > phase_margin - 0.5
+        assert sensitivity < 2.0 * 1.02
+    if phase_margin > 40.0:
+        assert min(phase for phase, _ in found) < phase_margin + 2.0
+
+
+def test_a_larger_margin_costs_integral_gain() -> None:
+    def integral(controller: RiseDiConfig) -> FloatArray:
+        params = controller.law_params()
+        return np.asarray(params.K * params.input_scale * (params.Lambda + params.beta / params.eps / params.K))
+
+    each = [integral(selected(phase_margin)) for phase_margin in (30.0, 45.0, 60.0)]
+    assert (np.diff(each, axis=0) < 0.0).all()
+
+
+def test_gains_of_osprey_meet_the_requirement() -> None:
+    chosen = select_gains("osprey", "osprey_servo", samples=20).engineering
+    assert not chosen.unmet
+    assert {condition.name for condition in chosen.loop} >= set(NAMES)
+    of = margins(SERVO.vary(controller=chosen.controller), aircraft=50, seed=9)  # other aircraft than those of the selection
+    assert of.worst is not None
+    assert math.degrees(of.nominal.phase.min()) >= 45.0 - 0.01
+    assert math.degrees(of.worst.phase.min()) >= 30.0
+    assert of.nominal.sensitivity.max() <= 2.0
+    assert of.nominal.damping >= 0.4
+
+
+def test_conditions_say_what_is_missing() -> None:
+    of = margins(SERVO.vary(controller={"softening": 2.75, "Lambda": [5.0, 5.0, 3.0, 0.5]}))
+    failing = [condition.name for condition in conditions(of, Requirement(phase=math.radians(80.0))) if not condition.holds]
+    assert failing[:1] == ["phase margin (deg)"]
+    assert least_fraction(of.nominal, Requirement(phase=math.radians(80.0))) == pytest.approx(
+        math.degrees(of.nominal.phase.min()) / 80.0
+    )
+
+
+def test_margin_below_40_deg_has_to_be_accepted() -> None:
+    with pytest.raises(ParameterError, match=r"^phase_margin: found 30\.0, expected at least 40 deg, or accept beside it$"):
+        requirement(30.0)
+    assert math.degrees(requirement(30.0, accept=True).phase) == pytest.approx(30.0)
+    with pytest.raises(ParameterError, match=r"^phase_margin: found 90\.0, expected 5 to 80 deg$"):
+        requirement(90.0)
+
+
+def test_linear_error_of_a_ramp_is_the_closed_form() -> None:
+    # e_dot = -k e - a t: e = -(a / k) (t - (1 - exp(-k t)) / k), from trim on. Sampling at 1 ms: 1 %
+    k, a, period, duration = 5.0, 2.0, 0.001, 4.0
+    law = LinearLaw(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[-k]]))
+    plant = LinearPlant(np.zeros((1, 1, 1)), np.ones((1, 1, 1)), np.eye(1))
+    of = LinearLoop("", ("u",), plant, law, Loop(np.zeros(1), 0.0, period))
+    u_dot = np.full((round(duration / ideal_control.STEP) + 1, 1), a)
+    t = np.arange(0.0, duration, period)
+    expected = a / k * (t - (1.0 - np.exp(-k * t)) / k)
+    assert linear_error(of, u_dot)[0] == pytest.approx(np.sqrt(np.mean(expected**2)), rel=0.01)
+
+
+def test_trade_predicts_the_flight() -> None:
+    # Linear, without noise, and u* of the nominal airframe: within 5 % of the rms of a flight without noise
+    selection = select_gains("osprey", "osprey_servo", samples=2)
+    (row,) = trade(selection, (45.0,))
+    flown = simulate(SERVO.vary(aircraft={"sensors": {}}, controller=selection.chosen))
+    _, error = best_error(flown)
+    rms = [error_metrics(error[name]).rms for name in selection.chosen.outputs]
+    np.testing.assert_allclose(row.rms, rms, rtol=0.05)
+    assert row.reached >= row.phase_margin
+
+
+def test_damping_of_a_zero_bounds_what_is_asked_for() -> None:
+    # y_dot = eta_1 + u beside an oscillator of 5 rad/s that y does not drive: its damping is that of the zeros
+    def asked(damping: float) -> float:
+        A = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, -25.0, -10.0 * damping]])
+        return above_zeros(Requirement(), LinearPlant(A, np.eye(3)[:, :1], np.eye(3)[:1])).damping
+
+    assert asked(0.9) == Requirement().damping
+    assert 0.19 < asked(0.2) < 0.2
+
+
+def rise_di(*arguments: str) -> Result:
+    app = typer.Typer(pretty_exceptions_enable=False)
+    app.command("gains", cls=Command)(gains_command)
+    return CliRunner(env={"COLUMNS": "150"}).invoke(app, arguments)
+
+
+def test_command_shows_trade_and_writes_margins(tmp_path: Path) -> None:
+    path = tmp_path / "gains.yaml"
+    page = tmp_path / "loop.html"
+    result = rise_di("osprey", "--set", "samples=2", "--set", "phase-margin=50", "--write", str(path), "--page", str(page))
+    assert result.exit_code == 0, result.output
+    assert {"Bode plot of the loop", "Nyquist plot of the loop", "all inputs"} <= set(
+        re.findall(r">([^<>]+)<", page.read_text())
+    )
+    assert "Trade" in result.stdout
+    text = path.read_text(encoding="utf-8")
+    assert "# Phase margins elevator " in text
+    section = yaml.safe_load(text)["/**/controller"]["ros__parameters"]
+    of = margins(SERVO.vary(controller=RiseDiConfig.validate_mapping(section, "controller")))
+    assert 50.0 - 0.01 <= math.degrees(of.nominal.phase.min()) < 53.0

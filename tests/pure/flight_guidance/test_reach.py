@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Guidance asks for no more than the inputs can do, by a model that was learned in flight."""
+
+import math
+
+import numpy as np
+import pytest
+
+from flight_core.channels import POSE
+from flight_core.units import GRAVITY
+from flight_core.vectors import StampedVector
+from flight_guidance import modes
+from flight_guidance.guidance import Guidance
+from flight_guidance.guidance_state import (
+    Begin,
+    Commands,
+    GuidanceState,
+    Inputs,
+)
+from flight_guidance.notices import LEARNED, Notices
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.reach import AUTHORITY, Authority
+from flight_guidance.targets import reach_sentence, within_reach
+
+SPEED = 25.0  # m/s
+FREQUENCY = 5.0  # of p, rad/s
+CONFIG = GuidanceConfig.validate_mapping(
+    {
+        "natural_frequency": [4.0, 1.2, FREQUENCY, 4.0],
+        "speed": SPEED,
+        "throttle_authority": [3.0, 3.0],
+        "fence": {"field": {"north": [0.0], "east": [0.0], "radius": 5000.0}},
+    },
+    "guidance",
+)
+OWN = CONFIG.params()
+
+
+def flown(target: dict[str, float], authority: Authority, **pose: float) -> tuple[GuidanceState, Commands]:
+    """The commands after 10 s at a constant pose, level but for `pose`."""
+    values = dict.fromkeys(POSE, 0.0) | {"v_north": SPEED} | pose
+    state = None
+    for k in range(500):
+        begin, given = (Begin.HOLD, target) if k == 0 else (Begin.NO, {})
+        inputs = Inputs(k * OWN.period_ns, begin, tuple(values[name] for name in POSE), 0, (0.0,) * 4, given, authority)
+        state, commands = modes.step(state, inputs, None, OWN)
+    assert state is not None
+    return state, commands
+
+
+def test_inputs_that_are_as_strong_as_known_change_no_limit() -> None:
+    assert within_reach(OWN, Authority()) == OWN
+    assert within_reach(OWN, Authority(q=29.0, p=40.0, down=6.0, up=6.0)) == OWN
+
+
+def test_weak_throttle_limits_climb_and_sink_to_what_it_can_do() -> None:
+    # In a steady climb the weight along the path is g h_dot / V: what is left of the throttle holds the airspeed.
+    vertical = within_reach(OWN, Authority(down=0.6, up=0.5)).vertical
+    assert GRAVITY * vertical.climb / SPEED == pytest.approx(0.7 * 0.5)
+    assert GRAVITY * vertical.sink / SPEED == pytest.approx(0.5 * 0.6)
+    assert flown({"climb": 2.5}, Authority(up=0.5))[0].climb_c == vertical.climb
+
+
+def test_weak_aileron_limits_roll_rate_and_the_bank_that_can_be_reversed() -> None:
+    now = within_reach(OWN, Authority(p=1.2))
+    # 0.37 is the largest w y_dot of a second-order step of damping 1, as of the rule, which counts 0.4
+    assert 0.37 * FREQUENCY * now.attitude.roll_rate < 1.2 / 3.0
+    assert 11.0 * now.limits.bank / now.attitude.roll_rate == pytest.approx(now.path.period)
+    assert now.limits.bank < OWN.limits.bank
+    # An orbit at this bank needs V^2 / (g tan(0.8 bank))
+    assert now.limits.radius == pytest.approx(SPEED**2 / (GRAVITY * math.tan(0.8 * now.limits.bank)))
+
+
+def test_rudder_flies_the_bank_where_the_aileron_has_no_effect() -> None:
+    state, commands = flown({"phi": 0.3}, Authority(p=0.0), phi=-0.05)
+    u_m = dict(zip(OWN.outputs, state.u_m, strict=True))
+    assert u_m["p"] == 0.0
+    assert commands.bank_limited
+    bank = math.radians(10.0)
+    assert u_m["r"] == pytest.approx(GRAVITY * math.tan(2.0 * bank) / SPEED)  # at its limit
+    held, _ = flown({"phi": 0.3}, Authority(p=0.0), phi=bank)
+    assert held.u_m[OWN.outputs.index("r")] == pytest.approx(GRAVITY * math.tan(bank) / SPEED)  # of a turn at this bank
+    # The fence, 5 km away, asks for a turn of the radius V^2 / (g tan(10 deg)), 361 m, which a bank of 30 deg need not.
+    assert [flown({"phi": 0.0}, able, north=4800.0)[0].fence != 0.0 for able in (Authority(), Authority(p=0.0))] == [
+        False,
+        True,
+    ]
+
+
+def test_airspeed_flies_the_climb_where_the_elevator_has_no_effect() -> None:
+    # At a constant angle of attack the lift goes with V^2, so that 1 m/s more of V accelerates upwards with 2 g / V.
+    sinks, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=-1.0)
+    assert sinks.u_m[OWN.outputs.index("q")] == 0.0
+    assert 2.0 * GRAVITY / SPEED * (sinks.V_c - SPEED) == pytest.approx(0.4 * 1.0)
+    climbs, _ = flown({"altitude": 0.0, "V": SPEED}, Authority(q=0.0), climb=1.0)
+    assert climbs.V_c - SPEED == pytest.approx(SPEED - sinks.V_c)
+    assert within_reach(OWN, Authority(q=0.0)).slew[OWN.outputs.index("V")] == pytest.approx(1.2)  # m/s^2, of 1.2 rad/s
+
+
+def test_limits_are_said_once_and_end_with_the_model() -> None:
+    def of(authority: Authority) -> str:
+        return reach_sentence(OWN, authority)
+
+    assert of(Authority(q=29.0, p=40.0, down=6.0, up=6.0)) == ""
+    dead = "no roll rate: p has no input with an effect, bank at most 10 deg"
+    assert of(Authority(p=0.0)) == dead
+    assert of(Authority(up=0.5)) == "climb at most 0.89 m/s"
+    assert of(Authority(down=0.0, up=0.0)) == "no climb: V has no input with an effect"
+    quiet = dict.fromkeys((*Notices.CHANNELS, *LEARNED), 0.0)
+    notices, told = Notices(0.0, 0.2, lambda speed: 99.0, reach=of), []
+    for t, authority in enumerate([Authority(), Authority(p=0.0), Authority(p=0.0), Authority()]):
+        told += notices.take(float(t), quiet | dict(zip(LEARNED, authority, strict=True)))
+    assert [notice.text for notice in told] == [f"by the learned model {dead}", "own limits again"]
+
+
+def test_authority_acts_from_the_next_step_on_and_is_logged() -> None:
+    guidance = Guidance(CONFIG)
+    channels = dict.fromkeys(AUTHORITY, 9.0) | {"up.p": 1.0, "up.V": 2.0}
+    for k in range(2):
+        now_ns = k * OWN.period_ns
+        guidance.take_y(StampedVector(now_ns, np.zeros(4)), now_ns)
+        pose = dict.fromkeys(POSE, 0.0) | {"v_north": SPEED, "north": float(k)}
+        guidance.take_pose(StampedVector(now_ns, np.array([pose[name] for name in POSE])), now_ns)
+        output = guidance.step(now_ns, now_ns)
+        assert output is not None
+        logged = dict(zip(guidance.names, output.log.tolist(), strict=True))
+        assert tuple(logged[name] for name in LEARNED) == ((9.0, 1.0, 9.0, 2.0) if k else Authority())
+        guidance.take_authority(channels)

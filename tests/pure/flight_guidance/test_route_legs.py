@@ -1,0 +1,336 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Legs of a route are flown or said to be missed: joining circles, tangents, the wind, against closed forms of geometry."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+
+from flight_analysis.report.account import account, final_outcome
+from flight_analysis.report.guided import FlownLeg, flown_legs, guidance_notices, leg_results
+from flight_core.outcome import COMPLETED, STATUS_INCOMPLETE, exit_status
+from flight_core.parameters import ParameterError
+from flight_core.rates import nanoseconds
+from flight_core.tape import Signal, Tape
+from flight_core.units import GRAVITY
+from flight_core.vectors import ChannelError, StampedVector
+from flight_guidance import guidance, path
+from flight_guidance.guidance import Guidance
+from flight_guidance.guidance_state import Lateral, Mode
+from flight_guidance.lateral import PathParams, largest_wind, least_radius, path_acceleration
+from flight_guidance.notices import LEARNED
+from flight_guidance.params import GuidanceConfig
+from flight_guidance.path import Arc, Line
+from flight_guidance.reach import Authority
+from flight_guidance.route_file import Waypoint
+from flight_guidance.wind import WIND_TIME, wind_estimate, wind_of
+
+SPEED, R = 25.0, 144.0  # m/s and m, of the osprey by rule
+FOLLOW = PathParams(period=16.5, damping=0.75, capture=math.radians(30.0))
+SECTION: dict[str, Any] = {"natural_frequency": [4.0, 1.2, 5.0, 4.0], "speed": SPEED, "throttle_authority": [3.0, 3.0]}
+CONFIG = GuidanceConfig.validate_mapping(SECTION, "guidance")
+MS = 1_000_000  # ns
+
+
+@pytest.mark.parametrize(("distance", "radius"), [(2000.0, 150.0), (2000.0, -150.0), (20e3, 150.0)])
+def test_circle_from_afar_joined_on_its_tangent(distance: float, radius: float) -> None:
+    """The way to a circle is the tangent and an arc, with a turn to the tangent at the start."""
+
+    def derivative(_: float, z: Any) -> list[float]:
+        north, east, course = map(float, z)
+        a = path_acceleration(path.error(Arc((distance, 0.0), radius), (north, east)), course, SPEED, FOLLOW)
+        limit = GRAVITY * math.tan(math.radians(30.0))
+        return [SPEED * math.cos(course), SPEED * math.sin(course), min(max(a, -limit), limit) / SPEED]
+
+    times = np.arange(0.0, distance / SPEED + 60.0, 0.25)
+    north, east, course = solve_ivp(derivative, (0.0, times[-1]), [0.0, 0.0, 0.0], t_eval=times, max_step=0.25).y
+    off = np.hypot(north - distance, east) - abs(radius)
+    joined = int(np.flatnonzero(np.abs(off) < 0.05 * abs(radius))[0])
+    tangent = math.sqrt(distance**2 - radius**2)
+    # 2 s for the turn by asin(R / d), and the last metres of an exponential approach.
+    assert times[joined] == pytest.approx(tangent / SPEED, abs=4.0)
+    bearings = np.unwrap(np.arctan2(east, north - distance))[: joined + 1]
+    assert math.degrees(abs(bearings[-1] - bearings[0])) < 90.0  # acos(R / d) of the tangent
+    assert off[joined:].max() < 0.05 * abs(radius)
+    assert off[joined:].min() > -0.02 * abs(radius)  # no overshoot
+    assert math.sin(course[-1] - math.atan2(east[-1], north[-1] - distance)) == pytest.approx(
+        math.copysign(1.0, radius), abs=1e-3
+    )
+
+
+@pytest.mark.parametrize("last", [(2000.0, 1500.0), (-700.0, 400.0), (1000.0, -600.0)])
+def test_last_line_touches_orbit(last: path.Point) -> None:
+    before = (1000.0, 0.0)
+    legs = path.route([(0.0, 0.0), before, last] if last[0] > 0.0 else [before, last], 200.0, 100.0)
+    line, orbit = legs[-2:]
+    assert isinstance(line, Line)
+    assert isinstance(orbit, Arc)
+    error = path.error(line, orbit.centre)
+    assert error.e == pytest.approx(200.0)  # the centre is one radius to the right of the line: a clockwise orbit
+    touching = path.error(orbit, line.end)
+    assert touching.e == pytest.approx(0.0, abs=1e-9)
+    assert math.cos(touching.track - error.track) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_way_onto_leg_is_tangent_and_arc(side: float) -> None:
+    """Lengths of the way onto a course to the north at the origin."""
+    at, north = (0.0, 0.0), 0.0
+
+    def length(position: path.Point, flown: float) -> float:
+        return float(path.joining_length(at, north, side * R, position, flown))
+
+    assert length((-1000.0, 0.0), 0.0) == pytest.approx(1000.0)  # straight behind
+    # On the opposite course beside the circle: down the tangent, and half of the circle.
+    assert length((1000.0, side * 2.0 * R), math.pi) == pytest.approx(1000.0 + math.pi * R)
+    # Across: the circle is touched at the point behind the centre, and a quarter of it is left.
+    assert length((-R, side * (R + 1000.0)), -side * math.pi / 2.0) == pytest.approx(1000.0 + R * math.pi / 2.0)
+    # A turn to the tangent costs R times the angle.
+    assert length((-1000.0, 0.0), 0.5) == pytest.approx(1000.0 + 0.5 * R)
+
+
+def test_wind_is_velocity_over_ground_less_through_air() -> None:
+    # 3-4-5: climbing at 3 m/s of 5 m/s, 4 m/s remain level, to the east.
+    assert wind_of(1.0, -2.0, 3.0, math.pi / 2.0, 5.0) == pytest.approx((1.0, -6.0))
+    wind = (0.0, 0.0)
+    for _ in range(250):  # a time constant of a step of 20 ms
+        wind = wind_estimate(wind, (10.0, -5.0), WIND_TIME / 250)
+    assert wind == pytest.approx((10.0 * (1.0 - math.exp(-1.0)), -5.0 * (1.0 - math.exp(-1.0))))
+
+
+def test_largest_wind_takes_whole_bank() -> None:
+    bank, wind = math.radians(30.0), 3.0
+    largest = largest_wind(SPEED, wind, bank)
+    assert (SPEED + largest) ** 2 / least_radius(SPEED, wind, bank) == pytest.approx(GRAVITY * math.tan(bank))
+
+
+@pytest.mark.parametrize(
+    ("wind", "V", "sentence"),
+    [
+        (
+            30.0,
+            (),
+            r"route\[0\].V: found 25 m/s in a wind of 30 m/s, expected more than 36 m/s, or a guidance.wind below 20.8 m/s",
+        ),
+        (22.0, (30.0, 25.0), r"route\[1\].V: found 25 m/s in a wind of 22 m/s, expected more than 26.4 m/s"),
+    ],
+)
+def test_wind_that_airspeed_cannot_beat_refused(wind: float, V: tuple[float, ...], sentence: str) -> None:
+    route = {"north": [0.0, 9e3], "east": [0.0, 0.0], "altitude": [0.0, 0.0], "V": V}
+    with pytest.raises(ParameterError, match=sentence):
+        GuidanceConfig.validate_mapping(SECTION | {"wind": wind, "route": route}, "guidance")
+
+
+class Flown:
+    """Guidance on a route, with poses as given."""
+
+    def __init__(self, *waypoints: tuple[Any, ...], start: path.Point = (0.0, 0.0), config: GuidanceConfig = CONFIG) -> None:
+        self.made, self._k = Guidance(config), 0
+        self.made.take_route(config.plan([Waypoint(*waypoint) for waypoint in waypoints]))
+        self.at(*start)
+
+    def at(self, north: float, east: float, course: float = 0.0, altitude: float = 100.0) -> dict[str, float]:
+        """The log of a step at a position, on a course through calm air, rad."""
+        now, v = 20 * MS * self._k, (SPEED * math.cos(course), SPEED * math.sin(course))
+        self.made.take_pose(StampedVector(now, np.array([0.0, 0.0, course, north, east, altitude, *v, 0.0, 0.0])), now)
+        self.made.take_y(StampedVector(now, np.zeros(4)), now)
+        output = self.made.step(now, now)
+        assert output is not None
+        self._k, self.notices = self._k + 1, output.notices
+        return dict(zip(self.made.names, output.log.tolist(), strict=True))
+
+
+def test_first_waypoint_has_to_be_reached() -> None:
+    """A route behind the aircraft is not passed at the start: the aircraft joins the first leg."""
+    flown = Flown((2500.0, 0.0, 150.0), (1200.0, 0.0, 100.0), (1200.0, 1200.0, 100.0))
+    log = flown.at(10.0, 0.0)
+    assert (log["leg"], log["missed"], abs(log["joining"])) == (0.0, 0.0, 1.0)
+    assert log["target.altitude"] == 150.0  # of the first waypoint
+    # The centre lies (2490, -R) ahead: a turn by 2 b to the tangent, b = atan(R / 2490), the tangent, and an arc of pi + 2 b.
+    assert log["to_go"] == pytest.approx(2490.0 + R * (math.pi + 4.0 * math.atan(R / 2490.0)))
+    log = flown.at(2499.0, 3.0, math.pi)
+    assert (log["leg"], log["joining"]) == (0.0, 0.0)
+    assert log["target.altitude"] == pytest.approx(150.0, abs=0.1)  # at the begin of the slope
+
+
+def test_leg_after_sharp_corner_is_joined() -> None:
+    """A turn of 174 deg has no fillet: the aircraft passes the waypoint, and a circle leads it onto the leg back."""
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (-600.0, 160.0, 100.0), (-600.0, 2000.0, 100.0))
+    assert flown.at(990.0, 3.0)["leg"] == 0.0
+    log = flown.at(1001.0, 3.0)
+    assert (log["leg"], log["missed"], abs(log["joining"])) == (1.0, 0.0, 1.0)
+    back = math.atan2(160.0, -1600.0)
+    assert flown.at(1000.0 + 5.0 * math.cos(back), 5.0 * math.sin(back), back)["joining"] == 0.0
+
+
+def test_leg_passed_far_away_is_missed() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (3000.0, 50.0, 100.0), (5000.0, 0.0, 100.0))
+    assert flown.at(990.0, 600.0)["leg"] == 0.0
+    log = flown.at(1010.0, 600.0)
+    end = flown.made.route.legs[0].end if flown.made.route else None
+    assert end is not None
+    assert log["missed"] == pytest.approx(math.dist(end, (1010.0, 600.0)))
+    assert (log["leg"], abs(log["joining"])) == (1.0, 1.0)
+    assert flown.notices == (f"leg 0 missed by {log['missed']:.0f} m",)
+    assert flown.at(1011.0, 600.0)["missed"] == 0.0
+
+
+def test_leg_passed_near_is_flown() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1000.0, 0.0, 100.0), (1000.0, 2000.0, 100.0))
+    flown.at(5.0, 0.0)
+    route = flown.made.route
+    assert route is not None
+    end = route.legs[0].end
+    assert end is not None
+    log = flown.at(end[0] + 1.0, 0.9 * R)
+    assert (log["leg"], log["missed"], log["joining"]) == (1.0, 0.0, 0.0)
+
+
+def test_leg_joined_at_a_point_along_it() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    flown.made.take_target({"leg": 0.0, "along": 900.0})
+    log = flown.at(0.0, 500.0)
+    assert (log["target.along"], abs(log["joining"])) == (900.0, 1.0)
+    assert flown.at(905.0, 10.0)["joining"] == 0.0
+    for values, sentence in (
+        ({"leg": 0.0, "along": 2500.0}, "target.along: found 2500 m, expected 0 to 1[0-9.]* m, the length of the leg"),
+        ({"along": 10.0}, "found along without leg"),
+    ):
+        with pytest.raises(ChannelError, match=sentence):
+            flown.made.take_target(values)
+
+
+def test_skip_leaves_waypoint_ahead_out() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0), (0.0, 3000.0, 100.0))
+    assert flown.made.skip()
+    log, route = flown.at(100.0, 0.0), flown.made.route
+    assert route is not None
+    assert log["leg"] == 2.0  # the line after the fillet
+    assert log["target.along"] == pytest.approx(path.length(route.legs[2]))
+
+
+def test_resume_flies_last_leg_from_nearest_point() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 100.0), (2000.0, 3000.0, 100.0))
+    assert not flown.made.resume()  # the route is flown
+    assert flown.made.hold()
+    assert flown.at(700.0, 400.0)["mode.lateral"] == Lateral.HEADING
+    assert flown.made.resume()
+    log = flown.at(701.0, 400.0)
+    assert (log["mode.lateral"], log["leg"], log["target.along"]) == (Lateral.ROUTE, 0.0, 700.0)
+
+
+@pytest.mark.parametrize("profile", ["slope", "step"])
+def test_altitude_changes_along_leg_or_at_its_begin(profile: str) -> None:
+    config = GuidanceConfig.validate_mapping(SECTION | {"profile": profile}, "guidance")
+    flown = Flown((0.0, 0.0, 100.0), (2000.0, 0.0, 140.0), (4000.0, 0.0, 140.0), config=config)
+    log = flown.at(500.0, 5.0)
+    if profile == "step":
+        assert (log["target.altitude"], log["target.climb"]) == (140.0, 0.0)
+    else:  # the last line touches the orbit: the legs meet at an angle of 4 deg
+        assert log["target.altitude"] == pytest.approx(110.0, abs=0.1)
+        assert log["target.climb"] == pytest.approx(40.0 / 2000.0 * SPEED, abs=0.01)
+    assert flown.made.hold()
+    assert flown.at(520.0, 5.0)["target.altitude"] == 100.0
+    flown.made.take_target({"leg": 0.0, "altitude": 120.0})
+    assert flown.at(540.0, 5.0)["target.altitude"] == 120.0  # a command of the user holds on the leg
+    assert flown.at(560.0, 5.0)["target.altitude"] == 120.0
+
+
+def circling(flown: Flown, centre: path.Point, turns: float, altitude: float = 100.0, first: float = -90.0) -> dict[str, float]:
+    """The log after steps of flight clockwise round a centre, from a bearing of the centre in deg."""
+    log: dict[str, float] = {}
+    step = SPEED * 0.02 / R
+    for k in range(1, int(turns * 2.0 * math.pi / step) + 1):
+        bearing = math.radians(first) + k * step
+        place = (centre[0] + R * math.cos(bearing), centre[1] + R * math.sin(bearing))
+        log = flown.at(*place, bearing + math.pi / 2.0, altitude)
+        if log["leg"] != 1.0:
+            break
+    return log
+
+
+@pytest.mark.parametrize(("turns", "wait"), [(2.0, 0.0), (0.0, 60.0), (2.0, 1.0), (0.5, 60.0)])
+def test_loiter_ends_after_its_turns_or_wait(turns: float, wait: float) -> None:
+    """The route goes on to the north. A circle takes 2 pi R / V = 36 s; the aircraft leaves it in the west."""
+    centre = (2000.0, 0.0)
+    flown = Flown((0.0, 0.0, 100.0), (*centre, 100.0, None, turns, wait), (5000.0, -R, 100.0))
+    route = flown.made.route
+    assert route is not None
+    circle = route.legs[1]
+    assert circle.end == pytest.approx((2000.0, -R), abs=10.0)  # the last line touches the orbit round the last waypoint
+    end = route.legs[0].end
+    assert end is not None
+    assert flown.at(end[0] + 0.5, end[1], path.end_course(route.legs[0]))["leg"] == 1.0
+    half = circling(flown, centre, max(turns, wait / 36.2) - 0.5)
+    assert 0.5 < half["loitered"] < 1.0
+    flown.at(*end, path.end_course(route.legs[0]))
+    log = circling(flown, centre, 2.0, first=math.degrees(path.course_of(centre, end)))
+    assert log["leg"] == 2.0
+
+
+def test_steep_leg_begins_with_circle_that_is_left_at_altitude() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (1500.0, 0.0, 400.0), (1500.0, 2500.0, 400.0), start=(0.0, -R))
+    assert flown.made.route is not None
+    assert "flown on circles round the waypoint before" in flown.notices[0]
+    circle = flown.made.route.legs[0]
+    assert (isinstance(circle, Arc), flown.at(0.0, -R + 1.0)["target.altitude"]) == (True, 400.0)
+    assert circle.end is not None
+    course = path.end_course(circle)
+    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 300.0)["leg"] == 0.0
+    beyond = (circle.end[0] + 25.0 * math.cos(course), circle.end[1] + 25.0 * math.sin(course))
+    assert flown.at(*beyond, course, 396.0)["leg"] == 0.0  # too late to leave: another turn
+    assert flown.at(circle.end[0] + 1.0, circle.end[1], course, 396.0)["leg"] == 1.0
+
+
+def test_yaw_rate_beside_bank() -> None:
+    flown = Flown((0.0, 0.0, 100.0), (5000.0, 0.0, 100.0))
+    flown.made.take_target({"phi": 0.0, "r": 0.05})
+    for k in range(50):
+        log = flown.at(10.0 + k, 0.0)
+    assert log["u_m.r"] == pytest.approx(0.05)
+    flown.made.take_target({"heading": 0.0})
+    assert flown.at(70.0, 0.0)["target.r"] == 0.0
+    for values, sentence in (
+        ({"r": 0.1}, "found r without phi"),
+        ({"phi": 0.0, "r": 0.5}, "expected -12.9[0-9]* to 12.9[0-9]* deg/s"),
+    ):
+        with pytest.raises(ChannelError, match=sentence):
+            flown.made.take_target(values)
+
+
+def log_of(count: int, **channels: ArrayLike) -> Tape:
+    """A log of guidance on a route to the north, a sample a second; `_` stands for a dot."""
+    names = guidance.names(CONFIG.outputs)
+    level: dict[str, Any] = (
+        dict.fromkeys(names, 0.0)
+        | dict(zip(LEARNED, Authority(), strict=True))
+        | {
+            "mode": Mode.ENGAGED,
+            "mode.lateral": Lateral.ROUTE,
+            "V_c": SPEED,
+            "pose.v_north": SPEED,
+        }
+    )
+    level |= {name.replace("__", "."): value for name, value in channels.items()}
+    values = np.column_stack([np.broadcast_to(np.asarray(level[name], dtype=float), count) for name in names])
+    return Tape({"guidance": Signal(np.arange(count) * nanoseconds(1.0), names, values)}, 0)
+
+
+def test_summary_says_which_legs_were_flown() -> None:
+    tape = log_of(
+        10, leg=[0, 0, 0, 1, 1, 2, 2, 2, 2, 2], joining=[1, 1, 0, 0, 0, 0, 0, 0, 0, 0], missed=[0] * 5 + [321.0] + [0] * 4
+    )
+    assert flown_legs(tape) == [
+        FlownLeg(0, 0.0, 2.0, 3.0, "flown", 0.0),
+        FlownLeg(1, 3.0, 3.0, 5.0, "missed", 321.0),
+        FlownLeg(2, 5.0, 5.0, 9.0, "not ended", 0.0),
+    ]
+    assert guidance_notices(tape, CONFIG) == ["guidance at t = 5.0 s: leg 1 missed by 321 m"]
+    assert leg_results([leg._asdict() for leg in flown_legs(tape)]) == "legs: 0 flown, 1 missed by 321 m, 2 not ended"
+    outcome = final_outcome(COMPLETED, account(tape, None))
+    assert (outcome, exit_status(outcome)) == ("completed, missed leg 1 by 321 m", STATUS_INCOMPLETE)
+    assert final_outcome(outcome, account(tape, None)) == outcome

@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The end of a flight over topics: by Ctrl-C, with its command, with one of its nodes."""
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+from rosbags.highlevel import AnyReader
+from tests.ros.conftest import DEFAULT_SIGHUP, Process, Start
+from tests.ros.waiting import HANG, until
+
+from flight_log.tape_reader import read_run
+
+ENDED = 10.0  # s, until no process of a flight is left: about one on an idle host
+
+Engaged = tuple[Process, list[psutil.Process]]
+
+
+@pytest.fixture
+def engaged(start: Start, tmp_path: Path) -> Engaged:
+    """A flight whose controller has engaged, and its four processes."""
+    flight = start("flight_cli.cli", "fly", "osprey_gust")
+    flight.until(lambda: is_engaged(tmp_path), "a flight that has engaged")
+    return flight, flight.children()
+
+
+def is_engaged(folder: Path) -> bool:
+    """Whether the controller of a flight below a folder has engaged."""
+    return any("ENGAGED" in log.read_text(encoding="utf-8") for log in folder.glob("runs/*/log/controller.log"))
+
+
+def test_flights_in_two_namespaces_do_not_mix_and_end_by_interrupts(start: Start, engaged: Engaged, tmp_path: Path) -> None:
+    """The first by one interrupt, the one beside it by three: the further ones do not interrupt its shutdown."""
+    flight, nodes = engaged
+    assert len(nodes) == 4
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
+    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
+    nodes_beside = beside.children()
+    flight.interrupt()
+    beside.interrupt()
+    beside.interrupt()
+    psutil.wait_procs(nodes_beside[:1], timeout=ENDED)
+    beside.interrupt()
+    assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
+    assert flight.end() == 130, flight.output
+    beside.end()
+    assert "Traceback" not in flight.output + beside.output
+    assert "outcome: interrupted" in flight.output
+    assert "q (mrad/s)" in flight.output
+    run = (tmp_path / "runs" / "latest").resolve()
+    assert (run / "metadata.yaml").is_file()
+    assert read_run(run).tape.notes == ()  # the file is not truncated
+    with AnyReader([run]) as reader:
+        assert reader.message_count > 0
+    for log in (run / "log").glob("*.log"):
+        assert "Traceback" not in log.read_text(encoding="utf-8")
+    log_beside = read_run(next((tmp_path / "beside" / "runs").glob("*-osprey_gust")))
+    assert log_beside.tape.notes == ()  # the recorder closed its file
+    vectors = {name for name in log_beside.topics if name.endswith(("/y", "/y_m", "/u"))}
+    assert vectors == {"/uav2/y", "/uav2/y_m", "/uav2/u"}
+
+
+def test_lost_terminal_ends_flight_with_log_and_report(tmp_path: Path) -> None:
+    terminal, of_flight = pty.openpty()
+    words = [*DEFAULT_SIGHUP, "setsid", "--ctty", sys.executable, "-m", "flight_cli.cli", "fly", "osprey_gust"]
+    flight = subprocess.Popen(words, cwd=tmp_path, stdin=of_flight, stdout=of_flight, stderr=of_flight)
+    os.close(of_flight)
+    try:
+        until(lambda: is_engaged(tmp_path), "a flight that has engaged")
+        os.close(terminal)
+        assert flight.wait(HANG) == 130
+    finally:
+        flight.kill()
+        flight.wait()
+    run = (tmp_path / "runs" / "latest").resolve()
+    assert read_run(run).tape.notes == ()
+    assert (run / "report.html").is_file()
+
+
+def test_an_early_interrupt_causes_no_traceback(start: Start) -> None:
+    for seconds in (0.3, 0.6):  # of processor time; an earlier interrupt stops the interpreter itself
+        flight = start("flight_cli.cli", "fly", "osprey_gust")
+        used = psutil.Process(flight.popen.pid).cpu_times
+        flight.until(lambda: used().user + used().system >= seconds, "the processor time of the interrupt")  # noqa: B023
+        nodes = flight.children()
+        flight.interrupt()
+        assert flight.end() in {130, -signal.SIGINT}, flight.output
+        assert "Traceback" not in flight.output
+        assert not psutil.wait_procs(nodes, timeout=ENDED)[1]
+
+
+def test_second_flight_is_refused_and_killed_node_ends_flight_and_killed_command_its_nodes(
+    start: Start, engaged: Engaged, tmp_path: Path
+) -> None:
+    flight, nodes = engaged
+    beside = start("flight_cli.cli", "fly", "osprey_gust", "--namespace", "uav2", "--set", "runs=beside/runs")
+    beside.until(lambda: is_engaged(tmp_path / "beside"), "a flight beside it that has engaged")
+    nodes_beside = beside.children()
+    refused = start("flight_cli.cli", "fly", "osprey_gust")
+    assert refused.end() == 2
+    assert "a domain of its own for each flight: set ROS_DOMAIN_ID, or a namespace of its own" in refused.output
+    flight.child("rise_di_controller.main").kill()
+    beside.popen.kill()
+    assert not psutil.wait_procs(nodes + nodes_beside, timeout=ENDED)[1]
+    assert flight.end() == 3
+    assert "controller was killed by SIGKILL" in flight.output
+    # and the recorder closed its file
+    assert read_run(next((tmp_path / "beside" / "runs").glob("*-osprey_gust"))).tape.notes == ()

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The shells of docs/ros.md that start single nodes run as they stand, each in a shell of its own, to their last command."""
+
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.conftest import REPOSITORY
+from tests.ros.waiting import until
+
+from flight_bringup.processes import end_with_parent
+from flight_log.tape_reader import read_run
+
+pytestmark = pytest.mark.timeout(240)
+
+PAGE = (REPOSITORY / "docs" / "ros.md").read_text(encoding="utf-8")
+SAMPLES = 400  # of y: 4 s at 100 Hz
+FIRST_CHUNKS = 100_000  # bytes of a log; the readers need a whole chunk
+
+
+def shells(section: str) -> tuple[list[str], list[str]]:
+    """The lines of a section that each shell begins with, and the commands, each of a shell of its own."""
+    text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    text = re.sub(r"^```python\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = re.findall(r"^    (\S.*)$", text, re.MULTILINE)
+    common = [line for line in lines if re.match(r"export |\w+=", line)]
+    return common, [line for line in lines if line not in common]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with what the commands of a page need of a checkout, and the programs of the page."""
+    for name in (".venv", "ros_ws"):
+        (tmp_path / name).symlink_to(REPOSITORY / name)
+    (program,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    (tmp_path / "my_aircraft.py").write_text(program, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def shell(checkout: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """The processes of a page; those that still run at the end of the test are killed."""
+    processes: list[subprocess.Popen[bytes]] = []
+    yield processes
+    for process in processes:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.parametrize("section", ["Nodes one by one", "Your own aircraft"])
+def test_shells_of_page_run_to_the_last_command(section: str, checkout: Path, shell: list[subprocess.Popen[bytes]]) -> None:
+    common, commands = shells(section)
+    nodes = [command for command in commands if "rise-di " not in command]
+    after = [command for command in commands if command not in nodes]
+    assert "recorder" in nodes[-1]
+    assert after
+    for number, command in enumerate(nodes):
+        with (checkout / f"{number}.txt").open("wb") as output:
+            script = "\n".join([*common, f"exec {command}"])
+            shell.append(
+                subprocess.Popen(
+                    [*end_with_parent(), "bash", "-c", script], cwd=checkout, stdout=output, stderr=subprocess.STDOUT
+                )
+            )
+    recorder = shell[-1]
+
+    def texts() -> str:
+        return "\n".join(path.read_text(encoding="utf-8") for path in sorted(checkout.glob("*.txt")))
+
+    def flies() -> bool:
+        assert [process.poll() for process in shell] == [None] * len(shell), texts()
+        return "WAITING -> ENGAGED" in texts() and "[recorder]: ready" in texts()
+
+    until(flies, "a controller that tracks, and a log")
+    log = checkout / "runs" / "latest"
+
+    def commanded() -> bool:
+        if sum(file.stat().st_size for file in log.glob("*.mcap")) < FIRST_CHUNKS:
+            return False
+        recorded = read_run(log).tape
+        return len(recorded["y"]["q"]) > SAMPLES and bool(recorded["y_m"]["q"].any())
+
+    until(commanded, "a log with a command")
+    recorder.send_signal(signal.SIGINT)
+    assert recorder.wait(timeout=60) == 0
+    assert "[ERROR]" not in (checkout / f"{len(nodes) - 1}.txt").read_text(encoding="utf-8")  # of the recorder
+    for command in after:
+        done = subprocess.run(
+            ["/bin/bash", "-c", "\n".join([*common, command])],
+            cwd=checkout,
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+        assert done.returncode in {0, 4}, done.stdout + done.stderr  # 4: the recorder began after the controller
+    tape = read_run(checkout / "runs" / "latest").tape
+    q, reference = (abs(tape[topic]["q"]) for topic in ("y", "y_m"))
+    assert len(q) > SAMPLES
+    assert max(q) > 0.7 * max(reference) > 0.0  # without control q of the page's aircraft would stay 0

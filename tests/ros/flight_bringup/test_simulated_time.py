@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: RISE-DI contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The example simulator with its own /clock over real DDS: slow, fast and in lockstep the aircraft tracks alike."""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import JointState
+from tests.conftest import REPOSITORY
+from tests.ros.conftest import Process, Recorder, Start
+from tests.ros.peer import Peer
+from tests.ros.waiting import until
+
+from flight_analysis.closed_loop.scenario_library import find_scenario
+from flight_core.rates import nanoseconds
+from flight_log.tape_reader import read_run
+
+PEER_TOPICS = ("y_m", "u")
+BY_CLOCK = ("-p", "use_sim_time:=true")
+IN_LOCKSTEP = ("-p", "lockstep:=true")
+
+
+def pitch_rate(message: JointState | None) -> float:
+    """Q of a named vector, rad/s; 0 before the first."""
+    return 0.0 if message is None else float(message.position[message.name.index("q")])
+
+
+def error(run: Path) -> float:
+    """The rms of the error of q from the first command on, rad/s, of a flight whose ticks are computed again to the bit."""
+    internals = read_run(run).tape.signals["internals"]
+    command = int(np.argmax(np.abs(internals["y_m.q"]) > 0.0))
+    begin_ns = internals.stamp_ns[command]
+    part = (internals.stamp_ns >= begin_ns) & (internals.stamp_ns < begin_ns + nanoseconds(0.8))
+    assert part.sum() >= 77  # of 80 ticks
+    return float(np.sqrt(np.mean(internals["e.q"][part] ** 2)))
+
+
+@pytest.mark.longest_pause(0.03)  # s: at 3 times real time near the age limit
+@pytest.mark.parametrize("order", ["nodes first", "simulator first"])
+def test_same_errors_at_any_speed_and_in_lockstep(order: str, start: Start, peer_node: Peer, tmp_path: Path) -> None:
+    shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
+    scenario = str(find_scenario("osprey_servo").path)
+    errors: dict[float, float] = {}
+    for speed in (0.3, 1.0, 3.0, 0.0) if order == "nodes first" else (1.0,):
+        mode = BY_CLOCK if speed else IN_LOCKSTEP
+        run = tmp_path / f"run-{speed}"
+        first = [start("simulator", str(speed))] if order == "simulator first" else []
+        further: dict[str, Sequence[str]] = {
+            "flight_recorder": ("-p", f"directory:={run}", "-p", f"scenario_file:={scenario}"),
+            "reference_model": (),
+            "rise_di_controller": () if speed else ("-p", "y_rate:=100.0"),
+        }
+        nodes: list[Process] = [
+            start(f"{package}.main", "--ros-args", "--params-file", scenario, *mode, *arguments)
+            for package, arguments in further.items()
+        ]
+        for node in nodes:
+            node.wait_for("ready")
+        if not first and speed == 1.0:
+            nodes[-1].wait_for("waiting for /clock: no publisher")
+        simulator = first[0] if first else start("simulator", str(speed))
+        peer_node.received["y_m"].clear()
+        peer_node.until(lambda: pitch_rate(peer_node.last("y_m")) > 0.095, "a command that was followed")
+        simulator.interrupt().succeed()
+        for node in reversed(nodes):  # the recorder last
+            node.interrupt()
+            until(lambda ended=node: ended.popen.poll() is not None, "the end")  # type: ignore[misc]
+        start("flight_cli.cli", "replay", str(run)).wait_for("every bit equal")
+        errors[speed] = error(run)
+    assert all(rms == pytest.approx(errors[1.0], rel=0.02) for rms in errors.values()), errors
+    assert errors[1.0] > 0.0
+
+
+def test_nodes_begin_again_with_a_new_simulation(start: Start, start_node: Start, recorder: Recorder, tmp_path: Path) -> None:
+    shutil.copy(REPOSITORY / "examples" / "simulator" / "simulator.py", tmp_path)
+    controller = start_node("rise_di_controller", *BY_CLOCK)
+    nodes = [controller, start_node("reference_model", *BY_CLOCK), recorder(tmp_path / "run", BY_CLOCK[1])]
+    simulator = start("simulator", "1")
+    controller.wait_for("WAITING -> ENGAGED")
+    nodes[-1].wait_for_log(tmp_path / "run", 30_000)
+    simulator.interrupt().succeed()
+    start("simulator", "1")
+    for node in nodes:
+        node.wait_for("another simulation begins; this node begins again")
+    until(lambda: sum("WAITING -> ENGAGED" in line for line in controller.lines) == 2, "engaged again")
+    nodes[-1].wait_for("run-2_0.mcap")
+    assert not [line for line in controller.lines if "already registered" in line]
+    for node in nodes:
+        node.interrupt().succeed()
